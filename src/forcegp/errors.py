@@ -1,0 +1,97 @@
+"""One tree of errors. Every message says what was given, what is allowed and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ForceGPError(Exception):
+    """Base of every error that forcegp raises on purpose; the command line turns it into one line and exit code 2."""
+
+
+class InvalidInput(ForceGPError, ValueError):
+    """An argument has a wrong shape, type or value."""
+
+
+class RobotModelError(ForceGPError):
+    """The robot description cannot be used; subclasses say why."""
+
+
+class MalformedUrdf(RobotModelError):
+    """Not well-formed XML, or XML that is not a URDF."""
+
+
+class UnsafeXml(RobotModelError):
+    """XML with entities, a DTD or external references."""
+
+
+class UnsupportedJoint(RobotModelError):
+    """Mimic, floating, planar or otherwise unsupported joint."""
+
+
+class MissingInertia(RobotModelError):
+    """A body that moves has no mass."""
+
+
+class NonPhysicalInertia(RobotModelError):
+    """Inertial parameters that no mass distribution can have."""
+
+
+class KinematicLoop(RobotModelError):
+    """The joints do not form a tree rooted in one link."""
+
+
+class UnknownName(ForceGPError, KeyError):
+    """A frame, link or joint name that the robot does not have."""
+
+    def __str__(self) -> str:  # KeyError would print the repr, quotes and all
+        return str(self.args[0])
+
+
+class UnknownFrame(UnknownName):
+    """No frame of that name."""
+
+
+class UnknownLink(UnknownName):
+    """No link of that name."""
+
+
+class UnknownJoint(UnknownName):
+    """No joint of that name."""
+
+
+class ContactError(ForceGPError):
+    """A contact that cannot constrain the robot, or whose surface cannot be evaluated or stored."""
+
+
+class DatasetError(ForceGPError):
+    """Data that break the Dataset's contract: row, column and remedy are named."""
+
+
+class FileFormatError(ForceGPError):
+    """A file that is not what its name promises, or is from an unknown version."""
+
+
+class NumericalError(ForceGPError):
+    """A factorisation or optimisation failed, with the cause and the remedy."""
+
+
+class FitError(NumericalError):
+    """No restart of the optimisation gave a usable model."""
+
+
+class MissingExtra(ForceGPError, ImportError):
+    """An optional dependency is not installed; the message holds the pip command."""
+
+
+class NumericalWarning(UserWarning):
+    """Something was repaired (jitter added, say) and the result is still usable."""
+
+
+def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str]) -> str:
+    """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Frames: ...`."""
+    names = sorted(valid)
+    close = difflib.get_close_matches(given, names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    return f"no {kind} {given!r} in {owner}{hint} Valid {kind}s: {', '.join(names) or '(none)'}"
