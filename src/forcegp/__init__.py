@@ -1,6 +1,6 @@
 """Probabilistic forward dynamics of robots: Gaussian processes on the forces that nobody modelled.
 
-This page is the whole public API. A name is imported from its room at first use, so that `import forcegp` costs nothing.
+This page is the whole public API. Each name is imported from its room at first use, so `import forcegp` costs nothing.
 """
 
 from importlib import import_module
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from forcegp.priors import JointForces
     from forcegp.robots import Robot
 
-__version__ = "0.1.0"
+    __version__: str
 
 __all__ = [
     # the robot
     "Robot",
-    # what is known: what it touches and which forces act
+    # what is known about it: contacts and forces
     "MechanicalSystem",
     "Contact",
     "Plane",
@@ -52,35 +52,30 @@ __all__ = [
     "StructuredGP",
 ]
 
-_ROOM_OF = {
-    "Robot": "robots",
-    "MechanicalSystem": "mechanics",
-    "Contact": "mechanics",
-    "Plane": "mechanics",
-    "Sphere": "mechanics",
-    "Cylinder": "mechanics",
-    "ImplicitSurface": "mechanics",
-    "Baumgarte": "mechanics",
-    "Actuation": "mechanics",
-    "RigidBodyBias": "mechanics",
-    "ViscousJointFriction": "mechanics",
-    "CoulombJointFriction": "mechanics",
-    "Armature": "mechanics",
-    "Dataset": "data",
-    "JointForces": "priors",
-    "Noise": "models",
-    "StructuredGP": "models",
+_ROOMS = {
+    "robots": {"Robot"},
+    "mechanics": {"MechanicalSystem", "Contact", "Plane", "Sphere", "Cylinder", "ImplicitSurface", "Baumgarte"}
+    | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"},
+    "data": {"Dataset"},
+    "priors": {"JointForces"},
+    "models": {"StructuredGP", "Noise"},
 }
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name at first use (PEP 562)."""
-    if name not in _ROOM_OF:
-        raise AttributeError(f"module 'forcegp' has no attribute {name!r}; public names: {', '.join(__all__)}")
-    value = getattr(import_module(f"forcegp.{_ROOM_OF[name]}"), name)
+    """Import a public name at its first use (PEP 562)."""
+    if name == "__version__":
+        from importlib import metadata
+
+        value = metadata.version("forcegp")
+    else:
+        room = next((room for room, names in _ROOMS.items() if name in names), None)
+        if room is None:
+            raise AttributeError(f"module 'forcegp' has no attribute {name!r}; it has {', '.join(__all__)}")
+        value = getattr(import_module(f"forcegp.{room}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return sorted({*globals(), *__all__, "__version__"})

@@ -1,0 +1,60 @@
+# Each target makes .venv where there is none, installs what it needs with the pins of constraints.txt, and runs.
+# Stamp files in .venv remember what is installed; a change of pyproject.toml or constraints.txt installs again.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PYTHON ?= $(shell for python in python3.11 python3.12 python3.13 python3.14 python3 python; do \
+	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && command -v $$python && break; done)
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# More arguments for the command that a target runs: make test ARGS="tests/robots -x"
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: demo test check format bench clean help
+
+demo: $(VENV)/.demo  ## simulate, learn and evaluate; prints the table and writes the pictures
+	$(BIN)/forcegp demo $(ARGS)
+
+test: $(VENV)/.test  ## run the test suite
+	$(BIN)/python -m pytest -n 2 $(ARGS)
+
+check: $(VENV)/.check  ## lint, format, types and the rule of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+format: $(VENV)/.check  ## mend what ruff can mend by itself
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.test  ## measure; benchmarks/README.md says what
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
+
+clean:  ## remove .venv, caches and builds; keeps what runs and demos wrote
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 10
+
+# A larger installation contains the smaller ones, so it stamps them too.
+$(VENV)/.demo: EXTRAS := sim
+$(VENV)/.demo: STAMPS := $(VENV)/.demo
+$(VENV)/.test: EXTRAS := sim,test
+$(VENV)/.test: STAMPS := $(VENV)/.demo $(VENV)/.test
+$(VENV)/.check: EXTRAS := sim,test,dev
+$(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
+
+# torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
+$(VENV)/.demo $(VENV)/.test $(VENV)/.check: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+	@echo "Installing forcegp[$(EXTRAS)] in $(VENV): one to two minutes the first time."
+	$(BIN)/python -m pip install --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	@touch $(STAMPS)
+
+$(VENV)/pyvenv.cfg:
+	@test -n "$(PYTHON)" || { echo "forcegp needs Python 3.11 or newer and found none; say: make PYTHON=/path/to/python3.11"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
