@@ -1,0 +1,178 @@
+"""The rules of docs/architecture.md, kept: which room imports which, and what an import may cost."""
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGE = REPOSITORY / "src" / "forcegp"
+
+# The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
+ROOMS = {
+    "errors": set(),
+    "robots": {"errors"},
+    "mechanics": {"errors", "robots"},
+    "data": {"errors", "robots", "mechanics"},
+    "priors": {"errors", "robots", "mechanics"},
+    "inference": {"errors"},
+    "models": {"errors", "robots", "mechanics", "data", "priors", "inference"},
+    "simulation": {"errors", "robots", "mechanics", "data"},
+    "evaluation": {"errors", "robots", "mechanics", "data", "priors", "inference", "models"},
+    "cli": {"errors", "robots", "mechanics", "data", "priors", "inference", "models", "simulation", "evaluation"},
+}
+
+# Optional or slow to import: imported inside the function that uses them. The rooms named here may import them at once.
+IMPORTED_WHERE_USED = {"pybullet": set(), "matplotlib": set(), "joblib": set(), "tyro": {"cli"}, "rich": {"cli"}}
+
+LONGEST_MODULE = 350  # lines
+NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported name, `forcegp.robots.inertia` or `numpy`, and when Python carries it out."""
+
+    name: str
+    line: int
+    at_module_import: bool
+    for_types_only: bool
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room(module: str) -> str:
+    """The room of a module of forcegp; the public page `forcegp/__init__.py` stands above all rooms and has none."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def imports(path: Path) -> Iterator[Import]:
+    package = module_name(path) if path.stem == "__init__" else module_name(path).rpartition(".")[0]
+
+    def visit(node: ast.AST, at_import: bool, types_only: bool) -> Iterator[Import]:
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            source = ".".join([*parents, *([node.module] if node.module else [])])
+            names = [f"{source}.{alias.name}" for alias in node.names]
+        else:
+            names = []
+        for name in names:
+            yield Import(name, node.lineno, at_import and not types_only, types_only)
+        in_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for child in ast.iter_child_nodes(node):
+            guarded = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and child in node.body
+            yield from visit(child, at_import and not in_function, types_only or guarded)
+
+    yield from visit(ast.parse(path.read_text(encoding="utf-8")), True, False)
+
+
+MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+IMPORTS = {module: tuple(imports(path)) for module, path in MODULES.items()}
+
+
+def modules_loaded_by(code: str) -> set[str]:
+    """Top-level packages in `sys.modules` after `code` ran in a fresh interpreter."""
+    report = (
+        "import atexit, sys; atexit.register(lambda: print('LOADED', *{name.split('.')[0] for name in sys.modules}))"
+    )
+    run = subprocess.run([sys.executable, "-c", f"{report}\n{code}"], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    return set(run.stdout.rpartition("LOADED")[2].split())
+
+
+def test_the_table_in_the_docs_is_the_one_kept_here():
+    rows = re.findall(
+        r"^\| `(\w+)(?:/|\.py)` \|.*\| ([^|]+) \|$", (REPOSITORY / "docs/architecture.md").read_text(), re.M
+    )
+    above: list[str] = []
+    table = {}
+    for name, allowed in rows:
+        named = set(re.findall(r"`(\w+)`", allowed))
+        if allowed.startswith(("all of the above", "everything")):
+            table[name] = set(above) - named  # "all of the above but `simulation`"
+        else:
+            assert named or allowed == "nothing", f"docs/architecture.md, row {name}: cannot read {allowed!r}"
+            table[name] = named
+        above.append(name)
+    assert table == ROOMS
+
+
+def test_every_module_belongs_to_a_room():
+    strangers = sorted({room(module) for module in MODULES} - ROOMS.keys() - {""})
+    assert not strangers, f"rooms that docs/architecture.md does not list: {strangers}"
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if module != "forcegp"])
+def test_imports_go_only_to_allowed_rooms(module):
+    allowed = ROOMS[room(module)]
+    offences = [
+        f"{MODULES[module].relative_to(REPOSITORY)}:{item.line} imports {item.name}"
+        for item in IMPORTS[module]
+        if item.name.split(".")[0] == "forcegp"
+        and room(item.name) not in allowed | {room(module)}
+        and item.name != "forcegp.__version__"
+    ]
+    assert not offences, "\n".join([*offences, f"{room(module)} may import {sorted(allowed) or 'no room'}"])
+
+
+def test_no_module_imports_itself_through_others():
+    graph: dict[str, set[str]] = {}
+    for module in MODULES.keys() - {"forcegp"}:
+        needed = [item.name for item in IMPORTS[module] if not item.for_types_only]
+        sources = {
+            name if name in MODULES else name.rpartition(".")[0] for name in needed
+        }  # a module, or a name in one
+        graph[module] = (sources & MODULES.keys()) - {module}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"cycle of imports: {' <- '.join(error.args[1])}")
+
+
+@pytest.mark.parametrize("package", IMPORTED_WHERE_USED)
+def test_slow_and_optional_packages_are_imported_where_they_are_used(package):
+    offences = [
+        f"{MODULES[module].relative_to(REPOSITORY)}:{item.line}"
+        for module in MODULES
+        for item in IMPORTS[module]
+        if item.at_module_import
+        and item.name.split(".")[0] == package
+        and room(module) not in IMPORTED_WHERE_USED[package]
+    ]
+    assert not offences, f"import {package} inside the function that needs it: {', '.join(offences)}"
+
+
+def test_import_forcegp_loads_no_library():
+    loaded = modules_loaded_by("import forcegp; forcegp.__version__")
+    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", *IMPORTED_WHERE_USED}
+
+
+def test_the_whole_public_api_loads_neither_simulator_nor_plots_nor_command_line():
+    loaded = modules_loaded_by("from forcegp import *")
+    assert "torch" in loaded
+    assert not loaded & IMPORTED_WHERE_USED.keys()
+
+
+def test_help_needs_neither_torch_nor_numpy():
+    loaded = modules_loaded_by(
+        "import sys; sys.argv = ['forcegp', '--help']; from forcegp.cli.main import main; main()"
+    )
+    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_one_idea_per_module(module):
+    lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
+    assert lines <= LONGEST_MODULE, f"{module} has {lines} lines, more than {LONGEST_MODULE}: split it by idea"
+    assert not NAMES_THAT_SAY_NOTHING & set(module.split(".")), f"{module}: name it by what it owns"
