@@ -22,6 +22,30 @@ class MalformedUrdf(RobotModelError):
     """Not well-formed XML, or XML that is not a URDF."""
 
 
+class MissingElement(MalformedUrdf):
+    """A link or joint lacks an element or attribute that has no default."""
+
+
+class InvalidNumber(MalformedUrdf):
+    """Text where a number belongs, too few or too many numbers, or a number that makes no sense there."""
+
+
+class DuplicateName(MalformedUrdf):
+    """Two links or two joints of the same name."""
+
+
+class DanglingJoint(MalformedUrdf):
+    """A joint names a link that the file does not define."""
+
+
+class UnexpandedXacro(MalformedUrdf):
+    """A xacro macro file that was not expanded to a URDF."""
+
+
+class UnreadableRobotFile(RobotModelError):
+    """The robot description does not exist, is a directory, or is not text."""
+
+
 class UnsafeXml(RobotModelError):
     """XML with entities, a DTD or external references."""
 

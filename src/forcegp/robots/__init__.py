@@ -1,0 +1,19 @@
+"""URDF text -> `Robot`: joints, links, frames, inertial parameters and differentiable rigid-body algorithms."""
+
+from forcegp.robots.inertia import (
+    parameters_from_physical,
+    physical_from_parameters,
+    pseudo_inertia_from_parameters,
+)
+from forcegp.robots.kinematics import Kinematics
+from forcegp.robots.robot import Joint, Link, Robot
+
+__all__ = [
+    "Joint",
+    "Kinematics",
+    "Link",
+    "Robot",
+    "parameters_from_physical",
+    "physical_from_parameters",
+    "pseudo_inertia_from_parameters",
+]

@@ -1,0 +1,132 @@
+"""Inertial parameters of a rigid body: mass, centre of mass, inertia <-> pseudo-inertia <-> log-Cholesky.
+
+The 4x4 pseudo-inertia of a body (Wensing, Kim & Slotine, "Linear matrix inequalities for physically consistent inertial
+parameter identification", RA-L 2018) in the axes of its link frame is
+
+    P = [[Sigma + m c c^T, m c], [m c^T, m]],    Sigma = tr(I)/2 1 - I,
+
+with mass ``m`` (kg), centre of mass ``c`` (m) and inertia ``I`` about the centre of mass (kg m^2). A mass distribution
+with these parameters exists if and only if P is positive semi-definite, which includes the triangle inequality of I.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, NonPhysicalInertia
+
+# relative to the trace of Sigma: what printing an ideal rod or plate with six digits costs
+ROUNDING = 1e-6
+# below this, log-Cholesky parameters (whose diagonal is a logarithm) say nothing any more
+SINGULAR = 1e-12
+
+# e^(d1, d2, d3), s12, s23, s13, t1, t2, t3, 1 -> row-major 4x4 upper triangle
+_PLACE = np.zeros((10, 16))
+_PLACE[np.arange(10), [0, 5, 10, 1, 6, 2, 3, 7, 11, 15]] = 1.0
+
+
+def pseudo_inertia_factor(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
+    """Upper-triangular ``U`` with ``P = U U^T`` from log-Cholesky parameters, differentiable.
+
+    ``U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]`` for parameters in the order
+    ``alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3`` (Rucker & Wensing, "Smooth parameterization of rigid-body inertia",
+    RA-L 2022). Mass is ``e^(2 alpha)`` and the centre of mass is ``t``.
+    """
+    place = torch.as_tensor(_PLACE, dtype=parameters.dtype, device=parameters.device)
+    scale = parameters[..., :1].exp()
+    entries = torch.cat([parameters[..., 1:4].exp(), parameters[..., 4:], torch.ones_like(scale)], dim=-1)
+    return ((scale * entries) @ place).unflatten(-1, (4, 4))
+
+
+def pseudo_inertia_from_parameters(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
+    """Pseudo-inertia ``P = U U^T`` of log-Cholesky parameters; positive definite by construction."""
+    factor = pseudo_inertia_factor(parameters)
+    return factor @ factor.mT
+
+
+def physical_from_parameters(
+    parameters: Float[Tensor, "*batch 10"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
+    """Mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes) from log-Cholesky parameters, differentiable."""
+    factor = pseudo_inertia_factor(parameters)
+    mass = factor[..., 3, 3].square()
+    upper = factor[..., :3, :3]
+    # U U^T - m c c^T without the cancellation: the last column of U carries the centre of mass alone
+    second_moment = upper @ upper.mT
+    trace = second_moment.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    identity = torch.eye(3, dtype=parameters.dtype, device=parameters.device)
+    return mass, parameters[..., 7:10], trace * identity - second_moment
+
+
+def parameters_from_physical(
+    mass: Float[Tensor, "*batch"], center_of_mass: Float[Tensor, "*batch 3"], inertia: Float[Tensor, "*batch 3 3"]
+) -> Float[Tensor, "*batch 10"]:
+    """Log-Cholesky parameters of a mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes).
+
+    The inverse of :func:`physical_from_parameters`. Raises :class:`~forcegp.errors.InvalidInput` for a non-positive mass or
+    a pseudo-inertia that is not positive definite, for which no logarithm exists.
+    """
+    trace = inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    identity = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
+    second_moment = (0.5 * trace * identity - 0.5 * (inertia + inertia.mT)) / mass[..., None, None]
+    # reversing rows and columns turns the lower Cholesky factor into the upper one
+    lower, failed = torch.linalg.cholesky_ex(second_moment.flip(-2, -1))
+    if bool((failed != 0).any()) or not bool((mass > 0).all()):
+        raise InvalidInput(
+            "log-Cholesky parameters exist only for a positive mass and an inertia that satisfies the triangle inequality "
+            "strictly; give the body some thickness in every direction."
+        )
+    upper = lower.flip(-2, -1)
+    logs = upper.diagonal(dim1=-2, dim2=-1).log()
+    off_diagonal = torch.stack([upper[..., 0, 1], upper[..., 1, 2], upper[..., 0, 2]], dim=-1)
+    return torch.cat([0.5 * mass.log()[..., None], logs, off_diagonal, center_of_mass], dim=-1)
+
+
+def pseudo_inertia(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """Pseudo-inertia (4, 4) of a mass (kg), centre of mass (m) and inertia about it (kg m^2), NumPy."""
+    homogeneous = np.append(center_of_mass, 1.0)
+    out = mass * np.outer(homogeneous, homogeneous)
+    out[:3, :3] += 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    return out
+
+
+def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> str | None:
+    """What makes these inertial parameters physically impossible, or ``None`` if a body can have them.
+
+    Ideal rods, plates and points (singular pseudo-inertia) are possible; a violation within rounding is forgiven.
+    """
+    if not (np.isfinite(mass) and np.isfinite(center_of_mass).all() and np.isfinite(inertia).all()):
+        return "it holds values that are not finite"
+    if mass < 0.0:
+        return f"its mass {mass:g} kg is negative"
+    if mass == 0.0:
+        return "its mass is zero but its inertia is not" if inertia.any() else None
+    moments = np.linalg.eigvalsh(inertia)
+    listed = ", ".join(f"{moment:.6g}" for moment in moments)
+    slack = ROUNDING * max(abs(moments).max(), np.finfo(np.float64).tiny)
+    if moments[0] < -slack:
+        return f"its inertia is not positive definite (principal moments {listed} kg m^2)"
+    if moments[0] + moments[1] < moments[2] - slack:
+        return (
+            f"its principal moments {listed} kg m^2 break the triangle inequality "
+            "(the two smaller must add up to the largest at least)"
+        )
+    return None
+
+
+def log_cholesky_of_body(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, link: str) -> Tensor:
+    """Log-Cholesky parameters (10,) of one link; :class:`NonPhysicalInertia` where its mass distribution is degenerate."""
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] + moments[1] - moments[2] <= SINGULAR * moments.sum():
+        raise NonPhysicalInertia(
+            f"link {link!r} has a flat, line-like or point-like mass distribution (mass {mass:g} kg, principal moments "
+            f"{', '.join(f'{moment:.6g}' for moment in moments)} kg m^2), for which log-Cholesky parameters do not exist. "
+            "Its dynamics is fine; to make its inertia a parameter, give it some thickness in every direction so that the "
+            "two smaller principal moments add up to more than the largest."
+        )
+    return parameters_from_physical(
+        torch.tensor(mass, dtype=torch.float64), torch.as_tensor(center_of_mass), torch.as_tensor(inertia)
+    )

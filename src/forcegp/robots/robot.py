@@ -1,0 +1,450 @@
+"""`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
+from forcegp.robots import urdf_writer
+from forcegp.robots.inertia import (
+    log_cholesky_of_body,
+    physical_from_parameters,
+    pseudo_inertia_factor,
+)
+from forcegp.robots.kinematics import Inertials, Kinematics, Point, broadcast_shapes
+from forcegp.robots.tree import WORLD, Layout, Tree, body_inertias, check_inertias, compile_tree, lay_out
+from forcegp.robots.urdf import RobotDescription, parse_urdf, read_text
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
+
+    name: str
+    type: str  # 'revolute' | 'continuous' | 'prismatic'
+    parent: str
+    child: str
+    axis: tuple[float, float, float]  # unit vector in the joint frame
+    lower: float
+    upper: float
+    velocity_limit: float
+    effort_limit: float
+    damping: float  # Nms/rad or Ns/m
+    friction: float  # Nm or N
+
+
+@dataclass(frozen=True)
+class Link:
+    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world)."""
+
+    name: str
+    joint: str | None
+    mass: float  # kg; 0 for a massless frame
+    center_of_mass: tuple[float, float, float]  # m, in the link frame
+    inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Robot:
+    """A fixed-base tree of revolute, continuous, prismatic and fixed joints. Make one with :meth:`from_urdf`.
+
+    Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any leading
+    batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth first, branches in
+    file order. Batch dimensions of all arguments broadcast. ``inertials`` maps names of moving links to log-Cholesky
+    parameters (..., 10) (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the URDF.
+
+    Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
+    :class:`~forcegp.errors.UnknownName`.
+    """
+
+    description: RobotDescription
+    layout: Layout
+    tree: Tree
+    urdf_text: str
+    locked: Mapping[str, float]
+    _frames: dict[str, tuple[int, Tensor]]
+    _merge_plans: dict[tuple[str, ...], tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict)
+
+    # ------------------------------------------------------------------ making one
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | Path,
+        *,
+        gravity: Sequence[float] = GRAVITY,
+        armature: Sequence[float] | Mapping[str, float] | None = None,
+        locked: Mapping[str, float] | None = None,
+    ) -> Robot:
+        """Read a URDF file.
+
+        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per joint or
+        by joint name; ``locked`` maps joint names to positions at which movable joints become fixed.
+
+        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, the link or joint, and the remedy.
+        """
+        return cls.from_urdf_text(read_text(path), source=str(path), gravity=gravity, armature=armature, locked=locked)
+
+    @classmethod
+    def from_urdf_text(
+        cls,
+        text: str,
+        *,
+        source: str = "<text>",
+        gravity: Sequence[float] = GRAVITY,
+        armature: Sequence[float] | Mapping[str, float] | None = None,
+        locked: Mapping[str, float] | None = None,
+    ) -> Robot:
+        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
+        description = parse_urdf(text, source=source)
+        locked = {name: float(position) for name, position in (locked or {}).items()}
+        layout = lay_out(description, locked)
+        check_inertias(description, layout)
+        names = tuple(joint.name for joint in layout.joints)
+        tree = compile_tree(
+            description,
+            layout,
+            gravity=_finite_vector("gravity", gravity, 3),
+            armature=_armature(armature, names, description.name),
+            device=torch.device("cpu"),
+        )
+        frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
+        return cls(description, layout, tree, text, locked, frames)
+
+    def with_inertials(self, inertials: Inertials) -> Robot:
+        """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values only, no gradient)."""
+        text = self.urdf_text
+        for name, parameters in inertials.items():
+            self._require_moving(name)
+            self._check_parameters(name, parameters)
+            if parameters.dim() != 1:
+                raise InvalidInput(
+                    f"inertials[{name!r}] has shape {tuple(parameters.shape)}; a robot holds one set, give shape (10,)."
+                )
+            mass, center, inertia = (value.detach().cpu().numpy() for value in physical_from_parameters(parameters))
+            text = urdf_writer.replace_inertial(text, name, float(mass), center, inertia, source=self.source)
+        return self._rebuilt(text, self.armature)
+
+    def with_armature(self, armature: Sequence[float] | Mapping[str, float]) -> Robot:
+        """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
+        if isinstance(armature, Mapping):
+            armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True)) | dict(armature)
+        return self._rebuilt(self.urdf_text, armature)
+
+    def to(self, device: torch.device | str) -> Robot:
+        """The same robot with its constants on ``device``."""
+        device = torch.device(device)
+        frames = {name: (body, offset.to(device)) for name, (body, offset) in self._frames.items()}
+        return replace(self, tree=self.tree.to(device), _frames=frames, _merge_plans={})
+
+    def _rebuilt(self, text: str, armature: Sequence[float] | Mapping[str, float] | Tensor) -> Robot:
+        robot = Robot.from_urdf_text(
+            text,
+            source=self.source,
+            gravity=self.gravity.tolist(),
+            armature=armature.tolist() if isinstance(armature, Tensor) else armature,
+            locked=self.locked,
+        )
+        return robot if self.device.type == "cpu" else robot.to(self.device)
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def name(self) -> str:
+        """Name of the robot in the URDF."""
+        return self.description.name
+
+    @property
+    def source(self) -> str:
+        """Where the URDF came from, as error messages name it."""
+        return self.description.source
+
+    @property
+    def nv(self) -> int:
+        """Number of movable joints."""
+        return len(self.layout.joints)
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """Movable joints in the order of q."""
+        shown = Joint.__dataclass_fields__
+        return tuple(Joint(**{key: getattr(joint, key) for key in shown}) for joint in self.layout.joints)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the movable joints in the order of q."""
+        return tuple(joint.name for joint in self.layout.joints)
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of all links in file order."""
+        return tuple(self.description.links)
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of all frames: those of the links."""
+        return self.link_names
+
+    @property
+    def gravity(self) -> Float[Tensor, "3"]:
+        """Gravitational acceleration in m/s^2."""
+        return self.tree.gravity
+
+    @property
+    def armature(self) -> Float[Tensor, "nv"]:
+        """Rotor inertia per joint in kg m^2 or kg."""
+        return self.tree.armature
+
+    @property
+    def device(self) -> torch.device:
+        """Device that inputs must be on."""
+        return self.tree.rest.device
+
+    def link(self, name: str) -> Link:
+        """One link by name."""
+        placement = self.layout.links.get(name)
+        if placement is None:
+            raise UnknownLink(unknown_name_message("link", name, self.name, self.layout.links))
+        joint = None if placement.body == WORLD else self.joint_names[placement.body]
+        inertial = self.description.links[name]
+        if inertial is None:
+            return Link(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
+        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
+        return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
+
+    def joint(self, name: str) -> Joint:
+        """One movable joint by name."""
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise UnknownJoint(unknown_name_message("joint", name, self.name, self.joint_names))
+
+    def inertial_parameters(self, *links: str) -> dict[str, Float[Tensor, "10"]]:
+        """Log-Cholesky parameters (10,) of the named links, to start an identification from.
+
+        Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
+        :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points, whose parameters would be infinite.
+        """
+        out = {}
+        for name in links:
+            self._require_moving(name)
+            inertial = self.description.links[name]
+            if inertial is None or inertial.mass == 0.0:
+                raise InvalidInput(
+                    f"link {name!r} of {self.name} is a massless frame, so it has no inertial parameters; name the link that "
+                    "carries the mass, or give this one an <inertial> element."
+                )
+            parameters = log_cholesky_of_body(inertial.mass, inertial.center_of_mass, inertial.inertia, link=name)
+            out[name] = parameters.to(self.device)
+        return out
+
+    def to_urdf(self, path: str | Path | None = None) -> str:
+        """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given."""
+        if path is not None:
+            urdf_writer.write_text(self.urdf_text, Path(path))
+        return self.urdf_text
+
+    def __repr__(self) -> str:
+        kinds = ", ".join(f"{joint.name} ({joint.type})" for joint in self.layout.joints)
+        return f"Robot({self.name!r}, nv={self.nv}, links={len(self.layout.links)}, joints=[{kinds}])"
+
+    # ------------------------------------------------------------------ dynamics
+
+    def kinematics(self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"] | None = None) -> Kinematics:
+        """One kinematics pass; ask the result for several quantities at the same states. ``v`` may be left out if unused."""
+        self.check_input("q", q)
+        if v is None:
+            return Kinematics.of(self, q, None)
+        self.check_input("v", v)
+        if q.shape != v.shape:
+            batch = broadcast_shapes(q=q, v=v)
+            q, v = q.expand(*batch, -1), v.expand(*batch, -1)
+        return Kinematics.of(self, q, v)
+
+    def mass_matrix(
+        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> Float[Tensor, "... nv nv"]:
+        """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
+        return self.kinematics(q).mass_matrix(inertials)
+
+    def bias_forces(
+        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> Float[Tensor, "... nv"]:
+        """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
+        return self.kinematics(q, v).bias_forces(inertials)
+
+    def mass_matrix_and_bias(
+        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+        """:meth:`mass_matrix` and :meth:`bias_forces` from one kinematics pass."""
+        return self.kinematics(q, v).mass_matrix_and_bias(inertials)
+
+    def gravity_forces(
+        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> Float[Tensor, "... nv"]:
+        """Joint forces (..., nv) in Nm or N that hold the robot still."""
+        return self.kinematics(q).gravity_forces(inertials)
+
+    def inverse_dynamics(
+        self,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        a: Float[Tensor, "*#batch nv"],
+        inertials: Inertials | None = None,
+    ) -> Float[Tensor, "... nv"]:
+        """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
+        return self.kinematics(q, v).inverse_dynamics(a, inertials)
+
+    def forward_dynamics(
+        self,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        tau: Float[Tensor, "*#batch nv"],
+        inertials: Inertials | None = None,
+    ) -> Float[Tensor, "... nv"]:
+        """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``, by Cholesky.
+
+        Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
+        """
+        return self.kinematics(q, v).forward_dynamics(tau, inertials)
+
+    # ------------------------------------------------------------------ frames
+
+    def frame_pose(self, q: Float[Tensor, "*batch nv"], frame: str) -> Float[Tensor, "*batch 4 4"]:
+        """Pose (..., 4, 4) of a link frame in the world, position in m."""
+        return self.kinematics(q).frame_pose(frame)
+
+    def frame_jacobian(
+        self, q: Float[Tensor, "*#batch nv"], frame: str, point: Point | None = None
+    ) -> Float[Tensor, "... 6 nv"]:
+        """Jacobian (..., 6, nv), rows [linear; angular] in world axes, of a ``point`` (..., 3) fixed in ``frame`` (m)."""
+        return self.kinematics(q).frame_jacobian(frame, point)
+
+    def frame_bias_acceleration(
+        self,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        frame: str,
+        point: Point | None = None,
+    ) -> Float[Tensor, "... 6"]:
+        """Classical acceleration ``Jdot v`` (..., 6), [linear; angular], of a ``point`` fixed in ``frame``, without gravity."""
+        return self.kinematics(q, v).frame_bias_acceleration(frame, point)
+
+    # ------------------------------------------------------------------ checks shared with Kinematics
+
+    def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
+        """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
+        found = self._frames.get(name)
+        if found is None:
+            raise UnknownFrame(unknown_name_message("frame", name, self.name, self._frames))
+        return found
+
+    def check_input(self, name: str, value: object) -> None:
+        """:class:`~forcegp.errors.InvalidInput` unless ``value`` is a float64 tensor (..., nv) on the robot's device."""
+        self._check_tensor(name, value, self.nv, f"one value per joint of {self.name}")
+
+    def check_point(self, point: Point) -> Float[Tensor, "*batch 3"]:
+        """A point in frame coordinates as a float64 tensor (..., 3)."""
+        if not isinstance(point, Tensor):
+            point = torch.as_tensor(_finite_vector("point", point, 3), device=self.device)
+        self._check_tensor("point", point, 3, "x, y, z in m")
+        return point
+
+    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv *batch 4 4"]:
+        """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
+        names = tuple(inertials)
+        values = []
+        for name in names:
+            self._check_parameters(name, inertials[name])
+            values.append(inertials[name])
+        base, offsets, bodies = self._merge_plan(names)
+        try:
+            parameters = torch.stack(torch.broadcast_tensors(*values) if len(values) > 1 else values)
+        except RuntimeError:
+            shapes = ", ".join(f"{name!r} {tuple(value.shape)}" for name, value in inertials.items())
+            raise InvalidInput(
+                f"batch shapes of inertials do not broadcast: {shapes}; make them equal, or 1."
+            ) from None
+        batch = parameters.shape[1:-1]
+        factor = offsets.reshape(len(names), *(1 for _ in batch), 4, 4) @ pseudo_inertia_factor(parameters)
+        given = (bodies @ (factor @ factor.mT).flatten(1)).unflatten(1, (*batch, 4, 4))
+        return base.reshape(self.nv, *(1 for _ in batch), 4, 4) + given
+
+    def _merge_plan(self, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Bodies' pseudo-inertias without the named links, these links' offsets, and which body each belongs to."""
+        if names not in self._merge_plans:
+            placements = [self._require_moving(name) for name in names]
+            others = {name: place for name, place in self.layout.links.items() if name not in names}
+            bodies = np.zeros((self.nv, len(names)))
+            bodies[[place.body for place in placements], np.arange(len(names))] = 1.0
+            plan = (
+                body_inertias(self.description, self.layout, others),
+                np.stack([place.offset for place in placements]),
+                bodies,
+            )
+            self._merge_plans[names] = tuple(torch.as_tensor(part, device=self.device) for part in plan)
+        return self._merge_plans[names]
+
+    def _require_moving(self, link: str):
+        placement = self.layout.links.get(link)
+        if placement is None:
+            raise UnknownLink(unknown_name_message("link", link, self.name, self.layout.links))
+        if placement.body == WORLD:
+            moving = ", ".join(name for name, place in self.layout.links.items() if place.body != WORLD)
+            raise InvalidInput(
+                f"link {link!r} of {self.name} is fixed in the world, so its inertia never enters the dynamics and cannot be "
+                f"a parameter; name a moving link: {moving}"
+            )
+        return placement
+
+    def _check_parameters(self, link: str, parameters: object) -> None:
+        self._check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters")
+
+    def _check_tensor(self, name: str, value: object, size: int, meaning: str) -> None:
+        if not isinstance(value, Tensor):
+            raise InvalidInput(
+                f"{name} is a {type(value).__name__}; give a tensor: torch.as_tensor({name}, dtype=torch.float64)."
+            )
+        if value.dim() == 0 or value.shape[-1] != size:
+            raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
+        if value.dtype != torch.float64:
+            raise InvalidInput(f"{name} is {value.dtype}; the dynamics needs float64, pass {name}.double().")
+        if value.device != self.device:
+            raise InvalidInput(
+                f"{name} is on {value.device} but the robot on {self.device}; use robot.to({str(value.device)!r}) "
+                f"or {name}.to({str(self.device)!r})."
+            )
+
+
+def _finite_vector(name: str, values: object, size: int) -> np.ndarray:
+    try:
+        array = np.array([float(value) for value in values])  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise InvalidInput(f"{name} is {values!r}; give {size} numbers.") from None
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
+    return array
+
+
+def _armature(given: Sequence[float] | Mapping[str, float] | None, joints: tuple[str, ...], robot: str) -> np.ndarray:
+    if given is None:
+        return np.zeros(len(joints))
+    if isinstance(given, Mapping):
+        unknown = next((name for name in given if name not in joints), None)
+        if unknown is not None:
+            raise UnknownJoint(unknown_name_message("joint", unknown, robot, joints))
+        given = [given.get(name, 0.0) for name in joints]
+    values = _finite_vector("armature", given, len(joints))
+    if (values < 0.0).any():
+        joint = joints[int(np.argmin(values))]
+        raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")
+    return values

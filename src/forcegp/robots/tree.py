@@ -1,0 +1,285 @@
+"""Compile a robot description into the constants of the rigid-body algorithms.
+
+Movable joints are numbered depth first, children in the order in which their joints stand in the file. (Pinocchio visits
+children alphabetically; map by joint name when comparing.) Each movable joint i moves *body* i: its child link and every
+link fixed to it. Body i's frame is the child link's frame turned so that its z axis is the joint axis, which makes every
+joint a rotation about or a translation along z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.errors import (
+    InvalidInput,
+    KinematicLoop,
+    MissingInertia,
+    NonPhysicalInertia,
+    RobotModelError,
+    UnknownJoint,
+    UnsupportedJoint,
+    unknown_name_message,
+)
+from forcegp.robots.inertia import physical_objection, pseudo_inertia
+from forcegp.robots.spatial import inverse, rotation_about, rotation_of_z_onto, transform
+from forcegp.robots.urdf import MOVABLE, InertialDescription, JointDescription, RobotDescription
+
+WORLD = -1
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a link sits: ``offset`` (4, 4) from the frame of its ``body`` (``WORLD``: fixed in the world) to the link's."""
+
+    body: int
+    offset: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Joints of equal depth, whose poses are computed in one operation."""
+
+    joints: Tensor | slice
+    parents: Tensor | None  # positions in the previous level; None where that is the whole level, in order
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """Constants of a kinematic tree with n movable joints, on one device. Index i is joint i and the body that it moves."""
+
+    rest: Tensor  # (n, 1, 16) and
+    motion: Tensor  # (n, k, 16): local transform = rest + [sin q, cos q, (q)] @ motion
+    levels: tuple[Level, ...]
+    order: Tensor | None  # joint i's position when the levels are laid end to end; None where that is i
+    revolute: Tensor  # (n,) 1 for revolute and continuous joints, 0 for prismatic ones
+    all_revolute: bool
+    is_chain: bool
+    descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i
+    related: Tensor  # (n, n): 1 where one of the two joints moves the other
+    velocity_sum: Tensor  # (n, n): 2 descendants^T - 1, body velocity plus that of the parent body
+    twist_basis: Tensor  # (6, 12): [w, v] -> row-major [[w]x, v]
+    inertias: Tensor  # (n, 4, 4) pseudo-inertias of the bodies, merged
+    gravity: Tensor  # (3,)
+    armature: Tensor  # (n,)
+    has_armature: bool
+
+    def to(self, device: torch.device) -> Tree:
+        """The same constants on another device."""
+        moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
+        levels = tuple(
+            Level(*(part.to(device) if isinstance(part, Tensor) else part for part in (level.joints, level.parents)))
+            for level in self.levels
+        )
+        return replace(self, **moved, levels=levels)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The tree as plain Python: movable joints in order, the parent body of each, and the placement of every link."""
+
+    joints: tuple[JointDescription, ...]
+    parents: tuple[int, ...]
+    origins: tuple[np.ndarray, ...]  # body frame at q = 0 in the parent body's frame
+    links: dict[str, Placement]
+
+
+def lay_out(description: RobotDescription, locked: Mapping[str, float]) -> Layout:
+    """Order the joints, turn ``locked`` ones into fixed ones and merge fixed links into the bodies that carry them."""
+    _check_locked(description, locked)
+    root, children = _tree_of(description)
+    joints: list[JointDescription] = []
+    parents: list[int] = []
+    origins: list[np.ndarray] = []
+    links = {root: Placement(WORLD, np.eye(4))}
+    stack = list(reversed(children[root]))
+    while stack:
+        joint = stack.pop()
+        above = links[joint.parent]
+        offset = above.offset @ joint.origin
+        if joint.type == "fixed" or joint.name in locked:
+            links[joint.child] = Placement(above.body, offset @ _joint_motion(joint, locked.get(joint.name, 0.0)))
+        else:
+            turn = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
+            links[joint.child] = Placement(len(joints), inverse(turn))
+            joints.append(joint)
+            parents.append(above.body)
+            origins.append(offset @ turn)
+        stack.extend(reversed(children[joint.child]))
+    if not joints:
+        raise RobotModelError(
+            f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics; "
+            f"use a URDF with at least one joint of type {', '.join(MOVABLE)} that is not locked."
+        )
+    return Layout(tuple(joints), tuple(parents), tuple(origins), links)
+
+
+def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
+    by_name = {joint.name: joint for joint in description.joints}
+    for name, position in locked.items():
+        if name not in by_name:
+            owner = f"{description.source}"
+            raise UnknownJoint(unknown_name_message("joint", name, owner, by_name))
+        if by_name[name].type == "fixed":
+            raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
+        if not np.isfinite(position):
+            raise InvalidInput(f"locked joint {name!r} at {position!r}: give a finite position in rad or m.")
+    for joint in description.joints:
+        if joint.mimics is not None and joint.name not in locked:
+            raise UnsupportedJoint(
+                f"{description.source}: joint {joint.name!r} mimics {joint.mimics!r}, which is not supported; lock it with "
+                f"locked={{{joint.name!r}: position}}, or remove its <mimic> element to move it independently."
+            )
+
+
+def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[JointDescription]]]:
+    """Root link and the joints below each link; :class:`KinematicLoop` where the joints form no single tree."""
+    source = description.source
+    above: dict[str, JointDescription] = {}
+    children: dict[str, list[JointDescription]] = {link: [] for link in description.links}
+    for joint in description.joints:
+        if joint.child in above:
+            raise KinematicLoop(
+                f"{source}: link {joint.child!r} has two parents, through joints {above[joint.child].name!r} and "
+                f"{joint.name!r}; a link can be the child of one joint only, remove one of them."
+            )
+        above[joint.child] = joint
+        children[joint.parent].append(joint)
+    roots = [link for link in description.links if link not in above]
+    if len(roots) > 1:
+        raise KinematicLoop(
+            f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}; "
+            "connect them by (fixed) joints so that one base link remains."
+        )
+    reached = set(roots)
+    queue = list(roots)
+    while queue:
+        below = [joint.child for joint in children[queue.pop()]]
+        reached.update(below)
+        queue.extend(below)
+    stray = next((link for link in description.links if link not in reached), None)
+    if stray is not None:
+        loop, link = [], stray
+        while link not in loop:
+            loop.append(link)
+            link = above[link].parent
+        loop = [*loop[loop.index(link) :], link]
+        raise KinematicLoop(
+            f"{source}: the links {' <- '.join(map(repr, loop))} form a loop; remove one of its joints "
+            "(a closed mechanism needs a tree plus constraints)."
+        )
+    return roots[0], children
+
+
+def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
+    axis = np.array(joint.axis)
+    if joint.type == "prismatic":
+        return transform(np.eye(3), position * axis)
+    return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
+
+
+def body_inertias(description: RobotDescription, layout: Layout, links: Mapping[str, Placement]) -> np.ndarray:
+    """Pseudo-inertias (n, 4, 4) of the bodies, summed over ``links``, each in its body's frame."""
+    out = np.zeros((len(layout.joints), 4, 4))
+    for name, placement in links.items():
+        inertial = description.links[name]
+        if placement.body != WORLD and inertial is not None:
+            local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
+            out[placement.body] += placement.offset @ local @ placement.offset.T
+    return out
+
+
+def check_inertias(description: RobotDescription, layout: Layout) -> None:
+    """Every moving link must be physically possible and every body must have mass; links fixed to the world are not asked."""
+    mass = np.zeros(len(layout.joints))
+    for name, placement in layout.links.items():
+        inertial: InertialDescription | None = description.links[name]
+        if placement.body == WORLD or inertial is None:
+            continue
+        objection = physical_objection(inertial.mass, inertial.center_of_mass, inertial.inertia)
+        if objection is not None:
+            raise NonPhysicalInertia(
+                f"{description.source}: no physical body has the inertia of link {name!r}: {objection}. Correct its "
+                "<inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)."
+            )
+        mass[placement.body] += inertial.mass
+    for body, joint in enumerate(layout.joints):
+        if mass[body] == 0.0:
+            carried = [
+                name for name, placement in layout.links.items() if placement.body == body and name != joint.child
+            ]
+            others = f" and the links fixed to it ({', '.join(map(repr, carried))})" if carried else ""
+            raise MissingInertia(
+                f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no mass; add an "
+                f"<inertial> element, make the joint fixed, or lock it with locked={{{joint.name!r}: 0.0}}."
+            )
+
+
+def compile_tree(
+    description: RobotDescription, layout: Layout, *, gravity: np.ndarray, armature: np.ndarray, device: torch.device
+) -> Tree:
+    """Batched constants for :mod:`forcegp.robots.algorithms`, on ``device``."""
+    n = len(layout.joints)
+    revolute = np.array([joint.type != "prismatic" for joint in layout.joints])
+    rest = np.zeros((n, 4, 4))
+    motion = np.zeros((n, 3, 4, 4))  # factors of sin q, cos q and q
+    descendants = np.eye(n)
+    for i, (parent, origin) in enumerate(zip(layout.parents, layout.origins, strict=True)):
+        if revolute[i]:
+            rest[i, :, 2:] = origin[:, 2:]
+            motion[i, 0, :, 0], motion[i, 0, :, 1] = origin[:, 1], -origin[:, 0]
+            motion[i, 1, :, :2] = origin[:, :2]
+        else:
+            rest[i] = origin
+            motion[i, 2, :, 3] = origin[:, 2]
+        if parent != WORLD:
+            descendants[:, i] += descendants[:, parent]
+    twist_basis = np.zeros((6, 3, 4))
+    for k, axis in enumerate(np.eye(3)):
+        twist_basis[k, :, :3] = np.cross(axis, np.eye(3)).T
+        twist_basis[3 + k, :, 3] = axis
+    levels, order = _levels(layout.parents, device)
+    as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array, dtype=np.float64), device=device)  # noqa: E731
+    related = np.maximum(descendants, descendants.T)
+    return Tree(
+        rest=as_tensor(rest.reshape(n, 1, 16)),
+        motion=as_tensor(motion.reshape(n, 3, 16)[:, : 2 if revolute.all() else 3]),
+        levels=levels,
+        order=order,
+        revolute=as_tensor(revolute),
+        all_revolute=bool(revolute.all()),
+        is_chain=bool(related.all()),
+        descendants=as_tensor(descendants),
+        related=as_tensor(related),
+        velocity_sum=as_tensor(2.0 * descendants.T - np.eye(n)),
+        twist_basis=as_tensor(twist_basis.reshape(6, 12)),
+        inertias=as_tensor(body_inertias(description, layout, layout.links)),
+        gravity=as_tensor(gravity),
+        armature=as_tensor(armature),
+        has_armature=bool(armature.any()),
+    )
+
+
+def _levels(parents: tuple[int, ...], device: torch.device) -> tuple[tuple[Level, ...], Tensor | None]:
+    depth: list[int] = []
+    for parent in parents:
+        depth.append(0 if parent == WORLD else depth[parent] + 1)
+    members = [[i for i, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
+    levels = []
+    for level, joints in enumerate(members):
+        above = [members[level - 1].index(parents[i]) for i in joints] if level else None
+        whole = above is None or above == list(range(len(members[level - 1])))
+        contiguous = joints == list(range(joints[0], joints[-1] + 1))
+        levels.append(
+            Level(
+                slice(joints[0], joints[-1] + 1) if contiguous else torch.tensor(joints, device=device),
+                None if whole else torch.tensor(above, device=device),
+            )
+        )
+    laid = [i for joints in members for i in joints]
+    order = None if laid == sorted(laid) else torch.tensor(np.argsort(laid), device=device)
+    return tuple(levels), order

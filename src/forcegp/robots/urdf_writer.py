@@ -1,0 +1,117 @@
+"""Write identified inertials back into the original URDF text; every other byte stays as it is."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from forcegp.errors import UnknownLink
+from forcegp.robots.urdf import declared_encoding
+
+
+def replace_inertial(
+    text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
+) -> str:
+    """URDF text with the ``<inertial>`` element of ``link`` replaced (or added), values printed so that they read back exactly.
+
+    ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, in the axes of the link frame.
+    """
+    data = text.encode("utf-8")
+    spans = _find_link(data, link)
+    if spans is None:
+        raise UnknownLink(f"{source}: no link {link!r} in the URDF text.")
+    (start, head_end, end), inertial = spans
+    if inertial is not None:
+        first, last = inertial
+        indent = _indent_of(data, first)
+        return (data[:first] + _inertial(mass, center_of_mass, inertia, indent) + data[last:]).decode("utf-8")
+    indent = _indent_of(data, start)
+    element = b"\n" + indent + b"  " + _inertial(mass, center_of_mass, inertia, indent + b"  ")
+    if data[head_end - 2 : head_end] == b"/>":  # <link name="tool"/> has no inside yet
+        opened = data[start : head_end - 2].rstrip() + b">"
+        return (data[:start] + opened + element + b"\n" + indent + b"</link>" + data[end:]).decode("utf-8")
+    return (data[:head_end] + element + data[head_end:]).decode("utf-8")
+
+
+def write_text(text: str, path: Path) -> None:
+    """Write URDF text in the encoding that it declares, to a temporary file that is then renamed."""
+    encoding = declared_encoding(text[:200].encode("utf-8"))
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(text.encode(encoding))
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def _find_link(data: bytes, link: str) -> tuple[tuple[int, int, int], tuple[int, int] | None] | None:
+    """Byte offsets of a link's element (start, end of its start tag, end) and of the ``<inertial>`` directly in it."""
+    parser = expat.ParserCreate("utf-8")
+    path: list[tuple[str, int]] = []
+    inside = False
+    found: list[int] = []
+    inertial: list[int] = []
+
+    def after_tag(position: int) -> int:
+        quote = b""
+        while True:
+            byte = data[position : position + 1]
+            if quote:
+                quote = b"" if byte == quote else quote
+            elif byte in (b'"', b"'"):
+                quote = byte
+            elif byte == b">":
+                return position + 1
+            position += 1
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal inside
+        position = parser.CurrentByteIndex
+        path.append((tag, position))
+        if len(path) == 2 and tag == "link" and attributes.get("name") == link:
+            inside = True
+            found.extend((position, after_tag(position)))
+        elif inside and len(path) == 3 and tag == "inertial":
+            inertial.append(position)
+
+    def end(tag: str) -> None:
+        nonlocal inside
+        if inside and len(path) == 3 and tag == "inertial":
+            inertial.append(after_tag(parser.CurrentByteIndex))
+        elif inside and len(path) == 2:
+            found.append(after_tag(parser.CurrentByteIndex))
+            inside = False
+        path.pop()
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(data, True)
+    if not found:
+        return None
+    return (found[0], found[1], found[2]), ((inertial[0], inertial[1]) if inertial else None)
+
+
+def _indent_of(data: bytes, position: int) -> bytes:
+    line = data[data.rfind(b"\n", 0, position) + 1 : position]
+    return line if not line.strip() else b""
+
+
+def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, indent: bytes) -> bytes:
+    xyz = " ".join(repr(float(value)) for value in center_of_mass)
+    entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    moments = " ".join(f'{key}="{float(inertia[index])!r}"' for key, index in entries.items())
+    inner = indent.decode() + "  "
+    lines = [
+        "<inertial>",
+        f'{inner}<origin xyz="{xyz}" rpy="0 0 0"/>',
+        f'{inner}<mass value="{float(mass)!r}"/>',
+        f"{inner}<inertia {moments}/>",
+        f"{indent.decode()}</inertial>",
+    ]
+    return "\n".join(lines).encode()
