@@ -105,6 +105,10 @@ class FitError(NumericalError):
     """No restart of the optimisation gave a usable model."""
 
 
+class SimulationError(ForceGPError):
+    """A simulated motion that diverged or left the robot's limits, so that its data are of no use."""
+
+
 class MissingExtra(ForceGPError, ImportError):
     """An optional dependency is not installed; the message holds the pip command."""
 
