@@ -51,8 +51,8 @@ $(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
 $(VENV)/.demo $(VENV)/.test $(VENV)/.check: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing forcegp[$(EXTRAS)] in $(VENV): one to two minutes the first time."
-	$(BIN)/python -m pip install --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --quiet --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	@touch $(STAMPS)
 
 $(VENV)/pyvenv.cfg:
