@@ -1,0 +1,131 @@
+"""What do the likelihood and all its gradients cost, against the dense formulation of the paper?
+
+The dense side forms the DN x DN covariance and lets autograd differentiate `torch.linalg.solve` and `torch.logdet` (two LU
+factorisations), as the paper's formulation does. Both sides get the same kernels, mixing vectors and residuals and return the same
+154 + 7 gradients (7 x (21 length scales + 1 output scale) + 7 noise levels). One process, one thread, CPU seconds, medians; each side's
+peak memory is measured in a child process of its own, above the memory that process had before the first evaluation.
+
+    python -m benchmarks.likelihood
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from threadpoolctl import threadpool_limits
+
+from forcegp.inference.kernels import kernel_matrix, squared_exponential_kernel
+from forcegp.inference.likelihood import negative_log_likelihood
+
+JOINTS, INPUTS = 7, 21
+
+
+class Problem:
+    """A random well-posed problem with the shapes of the iiwa: 7 joints, 21 inputs, m constraints."""
+
+    def __init__(self, count: int, constraints: int) -> None:
+        generator = torch.Generator().manual_seed(0)
+
+        def normal(*shape: int) -> torch.Tensor:
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        factor = normal(count, JOINTS, JOINTS) / math.sqrt(JOINTS)
+        M = factor @ factor.mT + 0.1 * torch.eye(JOINTS, dtype=torch.float64)
+        M_inv = torch.linalg.inv(M)
+        A = normal(count, constraints, JOINTS)
+        self.H = M_inv - M_inv @ A.mT @ torch.linalg.solve(A @ M_inv @ A.mT, A @ M_inv)
+        self.inputs = normal(count, INPUTS)
+        self.residual = normal(count, JOINTS)
+        self.kernels = [squared_exponential_kernel(INPUTS, 4.0, 1.0 + joint) for joint in range(JOINTS)]
+        self.log_noise = torch.full((JOINTS,), math.log(0.1), dtype=torch.float64, requires_grad=True)
+        self.parameters = [parameter for kernel in self.kernels for parameter in kernel.parameters()] + [self.log_noise]
+
+    def deflated(self) -> tuple[torch.Tensor, ...]:
+        matrices = [kernel_matrix(kernel, self.inputs) for kernel in self.kernels]
+        value = negative_log_likelihood(self.H, self.residual, (2.0 * self.log_noise).exp()[None], matrices)
+        return (value.detach(), *torch.autograd.grad(value, self.parameters))
+
+    def dense(self) -> tuple[torch.Tensor, ...]:
+        count = self.inputs.shape[0]
+        matrices = []
+        for kernel in self.kernels:
+            scaled = self.inputs / kernel.base_kernel.lengthscale
+            squared = scaled.square().sum(-1)
+            distance = squared[:, None] + squared[None, :] - 2.0 * scaled @ scaled.mT
+            matrices.append(kernel.outputscale * torch.exp(-0.5 * distance))
+        weighted = torch.stack(matrices, dim=1)[..., None] * self.H.permute(2, 0, 1)  # (i, c, j, e)
+        S = torch.bmm(self.H, weighted.reshape(count, JOINTS, count * JOINTS))
+        S = S.reshape(count * JOINTS, count * JOINTS)
+        S = S + torch.diag_embed((2.0 * self.log_noise).exp().repeat(count))
+        y = self.residual.reshape(-1)
+        value = 0.5 * (y @ torch.linalg.solve(S, y) + torch.logdet(S) + y.numel() * math.log(2.0 * math.pi))
+        return (value.detach(), *torch.autograd.grad(value, self.parameters))
+
+
+def median_cpu_seconds(function, repeats: int) -> float:
+    """Median CPU seconds of one call, after one call to warm up."""
+    function()
+    seconds = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds)
+
+
+def peak_mebibytes(side: str, count: int, constraints: int) -> float:
+    """Peak resident memory of one evaluation above the start of it, in a fresh process."""
+    command = [sys.executable, "-m", "benchmarks.likelihood", "--peak", side, str(count), str(constraints)]
+    return float(json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout))
+
+
+def peak_of_this_process() -> float:
+    """Peak resident memory in MiB (Linux; ru_maxrss would inherit the parent's peak through exec)."""
+    status = Path("/proc/self/status").read_text()
+    return next(float(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM"))
+
+
+def run() -> dict[str, float]:
+    """Measure and print; returns the keys of results.json that this question answers."""
+    results: dict[str, float] = {}
+    print(f"{'N':>5} {'constraints':>11} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} {'value diff':>10} {'gradient diff':>13}")
+    for count, constraints, repeats, key in (
+        (400, 1, 5, "nll_speedup_n400"),
+        (400, 3, 5, "nll_speedup_n400_three_constraints"),
+        (1000, 1, 3, "nll_speedup_n1000"),
+    ):
+        problem = Problem(count, constraints)
+        expected, given = problem.dense(), problem.deflated()
+        value_error = float((expected[0] - given[0]).abs())
+        gradient_error = max(float((e - g).abs().max() / e.abs().max()) for e, g in zip(expected[1:], given[1:], strict=True))
+        dense = median_cpu_seconds(problem.dense, repeats)
+        deflated = median_cpu_seconds(problem.deflated, repeats)
+        results[key] = dense / deflated
+        print(
+            f"{count:5d} {constraints:11d} {dense:10.3f} {deflated:13.3f} {dense / deflated:6.2f} {value_error:10.1e} {gradient_error:13.1e}"
+        )
+    dense_peak, deflated_peak = (peak_mebibytes(side, 1000, 1) for side in ("dense", "deflated"))
+    results["nll_memory_ratio_n1000"] = deflated_peak / dense_peak
+    print(f"peak memory at N=1000: dense {dense_peak:.0f} MiB, deflated {deflated_peak:.0f} MiB, ratio {deflated_peak / dense_peak:.3f}")
+    return results
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    with threadpool_limits(1):
+        if len(sys.argv) == 5 and sys.argv[1] == "--peak":
+            side, count, constraints = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+            getattr(Problem(20, constraints), side)()  # libraries load their work buffers before the baseline is taken
+            problem = Problem(count, constraints)
+            before = peak_of_this_process()
+            getattr(problem, side)()
+            print(peak_of_this_process() - before)
+        else:
+            run()

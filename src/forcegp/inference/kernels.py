@@ -1,0 +1,108 @@
+"""Kernel matrices of GPyTorch kernels, evaluated lean in memory.
+
+GPyTorch's own lazy paths are not used: above N D = 800 they switch silently to conjugate gradients (measured error of the predictive mean
+7.9 rad/s^2 on the iiwa). Kernels are called densely. The squared exponential, which almost every model uses, has hand-written gradients:
+one N x N by N x d product per latent and no N x N x d tensor; other kernels are recomputed in the backward pass, one latent at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from gpytorch.constraints import Positive
+from gpytorch.kernels import Kernel, RBFKernel, ScaleKernel
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+
+def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outputscale: float | Tensor) -> ScaleKernel:
+    """A GPyTorch squared-exponential kernel with one length scale per input, both parameters optimised on a log scale.
+
+    `lengthscale` (scalar or (dimension,)) and `outputscale` (variance) are the start values.
+    """
+
+    def positive() -> Positive:
+        return Positive(transform=torch.exp, inv_transform=torch.log)
+
+    kernel = ScaleKernel(
+        RBFKernel(ard_num_dims=dimension, lengthscale_constraint=positive()), outputscale_constraint=positive()
+    ).double()
+    kernel.base_kernel.lengthscale = torch.as_tensor(lengthscale, dtype=torch.float64).expand(1, dimension)
+    kernel.outputscale = torch.as_tensor(outputscale, dtype=torch.float64)
+    return kernel
+
+
+def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N"]:
+    """k(z_i, z_j), dense and differentiable in the kernel's parameters and in z."""
+    if _is_squared_exponential(kernel):
+        return _SquaredExponential.apply(z, kernel.base_kernel.lengthscale.reshape(-1), kernel.outputscale)
+    if torch.is_grad_enabled():
+        return checkpoint(lambda points: kernel(points, points).to_dense(), z, use_reentrant=False)
+    return kernel(z, z).to_dense()
+
+
+def kernel_cross(kernel: Kernel, z: Float[Tensor, "n d"], z_train: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
+    """k(z_i, z_train_j), dense."""
+    if _is_squared_exponential(kernel):
+        lengthscale = kernel.base_kernel.lengthscale.reshape(-1)
+        return kernel.outputscale * torch.exp(-0.5 * _squared_distance(z / lengthscale, z_train / lengthscale))
+    return kernel(z, z_train).to_dense()
+
+
+def kernel_diagonal(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
+    """k(z_i, z_i)."""
+    return kernel(z, z, diag=True)
+
+
+def kernel_matrices(kernels: Sequence[Kernel], features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
+    """One dense matrix per latent."""
+    return [kernel_matrix(kernel, z) for kernel, z in zip(kernels, features, strict=True)]
+
+
+def _is_squared_exponential(kernel: Kernel) -> bool:
+    if type(kernel) is not ScaleKernel or type(kernel.base_kernel) is not RBFKernel:
+        return False
+    base = kernel.base_kernel
+    return kernel.active_dims is None and base.active_dims is None and not kernel.batch_shape and not base.batch_shape
+
+
+def _squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+    """|x_i - y_j|^2 by one matrix product; centred first, which keeps the cancellation error below 1e-14 for standardised inputs."""
+    centre = y.mean(dim=0, keepdim=True) if y.shape[0] else 0.0
+    x, y = x - centre, y - centre
+    return (x.square().sum(-1)[:, None] + y.square().sum(-1)[None, :]).addmm(x, y.mT, alpha=-2.0).clamp_min(0.0)
+
+
+class _SquaredExponential(torch.autograd.Function):
+    """s exp(-1/2 |z_i - z_j|^2 / l^2); saves nothing of size N x N but its own result."""
+
+    @staticmethod
+    def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor) -> Tensor:  # type: ignore[override]
+        scaled = z / lengthscale
+        K = _squared_distance(scaled, scaled).mul_(-0.5)
+        K.diagonal().zero_()
+        K.exp_().mul_(outputscale)
+        ctx.save_for_backward(z, lengthscale, outputscale, K)
+        return K
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        z, lengthscale, outputscale, K = ctx.saved_tensors
+        weighted = upstream * K
+        scaled = z / lengthscale
+        product = weighted @ scaled
+        rows, columns = weighted.sum(1), weighted.sum(0)
+        z_gradient = lengthscale_gradient = None
+        if ctx.needs_input_grad[1]:
+            # sum_ij G_ij K_ij (x_id - x_jd)^2 / l_d^3, expanded so that only N x d arrays appear
+            per_input = ((rows + columns)[:, None] * scaled.square()).sum(0) - 2.0 * (scaled * product).sum(0)
+            lengthscale_gradient = per_input / lengthscale
+            if lengthscale.numel() == 1:
+                lengthscale_gradient = lengthscale_gradient.sum().reshape(lengthscale.shape)
+        if ctx.needs_input_grad[0]:
+            transposed = weighted.mT @ scaled
+            z_gradient = (product + transposed - (rows + columns)[:, None] * scaled) / lengthscale
+        return z_gradient, lengthscale_gradient, weighted.sum() / outputscale
