@@ -95,7 +95,9 @@ def peak_of_this_process() -> float:
 def run() -> dict[str, float]:
     """Measure and print; returns the keys of results.json that this question answers."""
     results: dict[str, float] = {}
-    print(f"{'N':>5} {'constraints':>11} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} {'value diff':>10} {'gradient diff':>13}")
+    print(
+        f"{'N':>5} {'constraints':>11} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} {'value diff':>10} {'gradient diff':>13}"
+    )
     for count, constraints, repeats, key in (
         (400, 1, 5, "nll_speedup_n400"),
         (400, 3, 5, "nll_speedup_n400_three_constraints"),
@@ -104,7 +106,9 @@ def run() -> dict[str, float]:
         problem = Problem(count, constraints)
         expected, given = problem.dense(), problem.deflated()
         value_error = float((expected[0] - given[0]).abs())
-        gradient_error = max(float((e - g).abs().max() / e.abs().max()) for e, g in zip(expected[1:], given[1:], strict=True))
+        gradient_error = max(
+            float((e - g).abs().max() / e.abs().max()) for e, g in zip(expected[1:], given[1:], strict=True)
+        )
         dense = median_cpu_seconds(problem.dense, repeats)
         deflated = median_cpu_seconds(problem.deflated, repeats)
         results[key] = dense / deflated
@@ -113,7 +117,9 @@ def run() -> dict[str, float]:
         )
     dense_peak, deflated_peak = (peak_mebibytes(side, 1000, 1) for side in ("dense", "deflated"))
     results["nll_memory_ratio_n1000"] = deflated_peak / dense_peak
-    print(f"peak memory at N=1000: dense {dense_peak:.0f} MiB, deflated {deflated_peak:.0f} MiB, ratio {deflated_peak / dense_peak:.3f}")
+    print(
+        f"peak memory at N=1000: dense {dense_peak:.0f} MiB, deflated {deflated_peak:.0f} MiB, ratio {deflated_peak / dense_peak:.3f}"
+    )
     return results
 
 

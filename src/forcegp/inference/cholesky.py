@@ -54,7 +54,9 @@ class CholeskyFactor:
         # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a copy.
         inverse, info = lapack.dpotri(self.lower.numpy().T, lower=0, overwrite_c=1)
         if info != 0:
-            raise NumericalError(f"inverting the covariance from its Cholesky factor failed (LAPACK dpotri info={info})")
+            raise NumericalError(
+                f"inverting the covariance from its Cholesky factor failed (LAPACK dpotri info={info})"
+            )
         return torch.from_numpy(inverse.T)
 
 

@@ -65,7 +65,9 @@ def solve_deflated(deflation: Deflation, kernel_matrices: Sequence[Float[Tensor,
     return DeflatedSystem(deflation, factor, alpha, beta)
 
 
-def deflated_covariance(C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> Float[Tensor, "n n"]:
+def deflated_covariance(
+    C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "N N"]]
+) -> Float[Tensor, "n n"]:
     """T of size (rN, rN), point-major; only the lower triangle (and the diagonal panels) are filled."""
     count, rank, _ = C.shape
     T = torch.empty(count * rank, count * rank, dtype=C.dtype, device=C.device)
@@ -125,7 +127,9 @@ class _DeflatedNLL(torch.autograd.Function):
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
         if upstream.requires_grad and torch.is_grad_enabled():
-            raise NotImplementedError("the deflated likelihood has first derivatives only; use torch.autograd.functional on its gradient")
+            raise NotImplementedError(
+                "the deflated likelihood has first derivatives only; use torch.autograd.functional on its gradient"
+            )
         return tuple(None if g is None else upstream * g for g in ctx.gradients)
 
 

@@ -1,0 +1,33 @@
+"""What is known about the mechanics: surfaces, contacts, known forces, and Gauss' principle that joins them."""
+
+from forcegp.mechanics.contacts import Baumgarte, Contact
+from forcegp.mechanics.gauss_principle import AffineMap, ConstrainedDynamics
+from forcegp.mechanics.known_forces import (
+    Actuation,
+    Armature,
+    CoulombJointFriction,
+    KnownForce,
+    RigidBodyBias,
+    ViscousJointFriction,
+)
+from forcegp.mechanics.surfaces import Cylinder, ImplicitSurface, Plane, Sphere, Surface
+from forcegp.mechanics.system import MechanicalSystem
+
+__all__ = [
+    "Actuation",
+    "AffineMap",
+    "Armature",
+    "Baumgarte",
+    "ConstrainedDynamics",
+    "Contact",
+    "CoulombJointFriction",
+    "Cylinder",
+    "ImplicitSurface",
+    "KnownForce",
+    "MechanicalSystem",
+    "Plane",
+    "RigidBodyBias",
+    "Sphere",
+    "Surface",
+    "ViscousJointFriction",
+]

@@ -1,0 +1,122 @@
+"""Gauss' principle of least constraint: what a constrained rigid body does under given forces.
+
+    M a = Q + Q_I,  A a = b   gives   a = M^-1 Q_b + H Q,   lambda = (A M^-1 A^T)^+ (b - A M^-1 Q),   Q_I = A^T lambda
+    H = M^-1 - M^-1 A^T (A M^-1 A^T)^+ A M^-1,   Q_b = A^T (A M^-1 A^T)^+ b
+
+(Udwadia & Kalaba 1992; Rath et al. 2021, eqs. 2-4.) With the Cholesky factor M = L L^T and A~ = A L^-T everything is read from the one
+small pseudo-inverse A~^+, which also covers redundant constraints: (A M^-1 A^T)^+ = (A~^+)^T A~^+ and H = L^-T (I - A~^+ A~) L^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import NumericalError
+from forcegp.robots import Kinematics
+
+REDUNDANCY_TOLERANCE = 1e-9
+"""Singular values of A~ below this fraction of the largest belong to redundant constraints."""
+
+
+class AffineMap(NamedTuple):
+    """y = offset + matrix @ Q for joint forces Q (..., nv)."""
+
+    offset: Tensor  # (..., k)
+    matrix: Tensor  # (..., k, nv)
+
+    def __call__(self, Q: Float[Tensor, "*batch nv"]) -> Tensor:
+        return self.offset + (self.matrix @ Q[..., None])[..., 0]
+
+
+@dataclass(frozen=True, eq=False)
+class ConstrainedDynamics:
+    """The dynamics at a batch of states, affine in the joint forces that are still unknown.
+
+    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_b`, `Q_K` (..., nv); `normals` (..., m, 3) are the surface gradients s_p, so that
+    the contact force on the robot in N is s_p^T lambda. `u` (..., nv) and `kinematics` are the states themselves.
+    """
+
+    kinematics: Kinematics
+    u: Float[Tensor, "*batch nv"]
+    M: Float[Tensor, "*batch nv nv"]
+    A: Float[Tensor, "*batch m nv"]
+    b: Float[Tensor, "*batch m"]
+    normals: Float[Tensor, "*batch m 3"]
+    H: Float[Tensor, "*batch nv nv"]
+    Q_b: Float[Tensor, "*batch nv"]
+    Q_K: Float[Tensor, "*batch nv"]
+    constrained_offset: Float[Tensor, "*batch nv"]  # M^-1 Q_b
+    inverse_lower: Float[Tensor, "*batch nv nv"]  # L^-1
+    pseudo_inverse: Float[Tensor, "*batch nv m"]  # A~^+
+
+    @classmethod
+    def from_constraint(
+        cls,
+        kinematics: Kinematics,
+        u: Float[Tensor, "*batch nv"],
+        M: Float[Tensor, "*batch nv nv"],
+        A: Float[Tensor, "*batch m nv"],
+        b: Float[Tensor, "*batch m"],
+        normals: Float[Tensor, "*batch m 3"],
+        Q_K: Float[Tensor, "*batch nv"],
+    ) -> ConstrainedDynamics:
+        """Gauss' principle for M (..., nv, nv) and A a = b. Raises NumericalError when M is not positive definite."""
+        try:
+            lower = torch.linalg.cholesky(M)
+        except torch.linalg.LinAlgError:
+            raise NumericalError(
+                "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
+            ) from None
+        identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
+        inverse_lower = torch.linalg.solve_triangular(lower, identity.expand_as(M), upper=False)
+        A_white = A @ inverse_lower.mT
+        if A.shape[-2]:
+            pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
+        else:
+            pseudo_inverse = A_white.mT
+        H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower
+        H = 0.5 * (H + H.mT)
+        white_offset = pseudo_inverse @ b[..., None]
+        Q_b = (lower @ white_offset)[..., 0]
+        offset = (inverse_lower.mT @ white_offset)[..., 0]
+        return cls(kinematics, u, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse)
+
+    def acceleration_map(self, known: bool = True) -> AffineMap:
+        """a = offset + H Q_U, with offset = M^-1 Q_b + H Q_K, or M^-1 Q_b alone when `known` is false (then Q_U must carry Q_K too)."""
+        offset = self.constrained_offset
+        if known:
+            offset = offset + (self.H @ self.Q_K[..., None])[..., 0]
+        return AffineMap(offset, self.H)
+
+    def multiplier_map(self, known: bool = True) -> AffineMap:
+        """lambda = offset + matrix Q_U, in N for surfaces that are signed distances."""
+        matrix = -self.pseudo_inverse.mT @ self._constrained_projector @ self.inverse_lower
+        offset = (self.pseudo_inverse.mT @ (self.pseudo_inverse @ self.b[..., None]))[..., 0]
+        if known:
+            offset = offset + (matrix @ self.Q_K[..., None])[..., 0]
+        return AffineMap(offset, matrix)
+
+    def contact_force_map(self, known: bool = True) -> AffineMap:
+        """World force on the robot at each contact in turn, s_p^T lambda, stacked to (..., 3 m), in N."""
+        multiplier = self.multiplier_map(known)
+        offset = (self.normals * multiplier.offset[..., None]).flatten(-2)
+        matrix = (self.normals[..., None] * multiplier.matrix[..., None, :]).flatten(-3, -2)
+        return AffineMap(offset, matrix)
+
+    def acceleration(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch nv"]:
+        """a = M^-1 Q_b + H (Q_K + Q_U) in rad/s^2 or m/s^2."""
+        return self.acceleration_map()(Q_U)
+
+    def multiplier(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch m"]:
+        """lambda = (A M^-1 A^T)^+ (b - A M^-1 (Q_K + Q_U)); the constraint force is A^T lambda."""
+        return self.multiplier_map()(Q_U)
+
+    @property
+    def _constrained_projector(self) -> Float[Tensor, "*batch nv nv"]:
+        """A~^+ A~."""
+        return self.pseudo_inverse @ (self.A @ self.inverse_lower.mT)

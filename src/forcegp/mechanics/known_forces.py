@@ -1,0 +1,172 @@
+"""Known joint forces as explicit objects: Q_K is the sum of what is listed, and nothing else.
+
+A new known force is one subclass with a `force`, and an entry in `KNOWN_FORCES` so that files can carry it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.robots import Kinematics, Robot
+
+PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
+
+
+class KnownForce(ABC):
+    """A joint force that the model takes as given."""
+
+    per_joint: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields with one non-negative number per joint."""
+
+    @abstractmethod
+    def force(
+        self, kinematics: Kinematics, u: Float[Tensor, "*batch nv"], inertials: Mapping[str, Tensor] | None = None
+    ) -> Float[Tensor, "*#batch nv"]:
+        """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""
+
+    def added_inertia(self) -> Float[Tensor, "nv"] | None:
+        """What this adds to the diagonal of the mass matrix, in kg m^2 or kg."""
+        return None
+
+    def bound_to(self, robot: Robot) -> KnownForce:
+        """The same with per-joint numbers as tensors (nv,) in the order of robot.joint_names, checked."""
+        bound = {
+            name: _per_joint(f"{type(self).__name__} {name}", getattr(self, name), robot) for name in self.per_joint
+        }
+        return type(self)(**{f.name: bound.get(f.name, getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class Actuation(KnownForce):
+    """What the actuators deliver: u itself."""
+
+    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
+        return u
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBodyBias(KnownForce):
+    """Coriolis, centrifugal and gravity forces of the rigid bodies: -bias(q, v)."""
+
+    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
+        return -kinematics.bias_forces(inertials)
+
+
+@dataclass(frozen=True, eq=False)
+class ViscousJointFriction(KnownForce):
+    """-d v with d in Nms/rad or Ns/m: one number, one per joint, or by joint name (joints not named have none)."""
+
+    coefficients: PerJoint
+    per_joint: ClassVar[tuple[str, ...]] = ("coefficients",)
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> ViscousJointFriction:
+        """The <dynamics damping> of the URDF."""
+        return cls([joint.damping for joint in robot.joints])
+
+    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
+        assert kinematics.v is not None
+        return -self.coefficients * kinematics.v  # type: ignore[operator]
+
+
+@dataclass(frozen=True, eq=False)
+class CoulombJointFriction(KnownForce):
+    """-c tanh(v / velocity_scale): dry friction of c Nm or N, smoothed below `velocity_scale` (rad/s or m/s)."""
+
+    coefficients: PerJoint
+    velocity_scale: PerJoint = 0.01
+    per_joint: ClassVar[tuple[str, ...]] = ("coefficients", "velocity_scale")
+
+    @classmethod
+    def from_robot(cls, robot: Robot, velocity_scale: PerJoint = 0.01) -> CoulombJointFriction:
+        """The <dynamics friction> of the URDF."""
+        return cls([joint.friction for joint in robot.joints], velocity_scale)
+
+    def bound_to(self, robot: Robot) -> KnownForce:
+        bound = super().bound_to(robot)
+        if bool((torch.as_tensor(bound.velocity_scale) <= 0).any()):  # type: ignore[attr-defined]
+            raise InvalidInput("CoulombJointFriction velocity_scale must be positive for every joint (rad/s or m/s).")
+        return bound
+
+    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
+        assert kinematics.v is not None
+        return -self.coefficients * torch.tanh(kinematics.v / self.velocity_scale)  # type: ignore[operator]
+
+
+@dataclass(frozen=True, eq=False)
+class Armature(KnownForce):
+    """Rotor inertia seen at the joint (kg m^2 or kg), added to the mass matrix on top of the robot's own `armature`."""
+
+    inertia: PerJoint
+    per_joint: ClassVar[tuple[str, ...]] = ("inertia",)
+
+    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
+        return torch.zeros_like(kinematics.q)
+
+    def added_inertia(self) -> Tensor:
+        return self.inertia  # type: ignore[return-value]
+
+
+KNOWN_FORCES: dict[str, type[KnownForce]] = {
+    "actuation": Actuation,
+    "rigid-body-bias": RigidBodyBias,
+    "viscous-joint-friction": ViscousJointFriction,
+    "coulomb-joint-friction": CoulombJointFriction,
+    "armature": Armature,
+}
+"""Known forces that files can carry, by the name they have there."""
+
+
+def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
+    """Plain numbers that `known_force_from_dict` turns back. Raises InvalidInput for a force that files do not know."""
+    name = next((name for name, kind in KNOWN_FORCES.items() if type(force) is kind), None)
+    if name is None:
+        raise InvalidInput(f"a {type(force).__name__} cannot be stored; files carry {', '.join(KNOWN_FORCES)}")
+    stored: dict[str, Any] = {"type": name}
+    for f in fields(force):  # type: ignore[arg-type]
+        stored[f.name] = torch.as_tensor(getattr(force, f.name)).tolist()
+    return stored
+
+
+def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
+    """The force that `known_force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
+    values = dict(stored)
+    name = values.pop("type", None)
+    if name not in KNOWN_FORCES:
+        raise FileFormatError(f"unknown known force {name!r}; known: {', '.join(KNOWN_FORCES)}")
+    try:
+        return KNOWN_FORCES[name](**values)
+    except TypeError as error:
+        raise FileFormatError(f"known force {name!r} has wrong fields {sorted(values)}: {error}") from None
+
+
+def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
+    """One non-negative float64 number per joint, on the robot's device; tensors keep their graph."""
+    if isinstance(given, Mapping):
+        unknown = next((joint for joint in given if joint not in robot.joint_names), None)
+        if unknown is not None:
+            raise UnknownJoint(unknown_name_message("joint", unknown, robot.name, robot.joint_names))
+        given = [given.get(joint, 0.0) for joint in robot.joint_names]
+    try:
+        values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(
+            f"{name} is {given!r}; give a number, one per joint, or a mapping from joint names."
+        ) from None
+    if values.dim() == 0:
+        values = values.expand(robot.nv)
+    if values.shape != (robot.nv,):
+        raise InvalidInput(
+            f"{name} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: {', '.join(robot.joint_names)}"
+        )
+    if not bool((values >= 0).all()):
+        raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number >= 0.")
+    return values

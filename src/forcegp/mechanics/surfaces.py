@@ -1,0 +1,209 @@
+"""Surfaces s(p) = 0 that a point of the robot can be held on.
+
+A surface returns its value, gradient and Hessian at points p (..., 3) in m, world axes. The built-in surfaces are signed distances, so
+their gradient is a unit normal and the multiplier of a contact is the normal force in N. A new surface is one subclass of `Surface` that
+defines `value`; the derivatives follow by autograd unless it knows better. To be stored with a dataset or a model it also needs an
+entry in `SURFACES` and plain numbers as its fields.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import ContactError, FileFormatError, InvalidInput
+
+Vector = tuple[float, float, float]
+
+
+class Surface(ABC):
+    """A level set s(p) = 0; `value` must be twice differentiable and written with torch operations."""
+
+    @abstractmethod
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """s(p) at points p (..., 3) in m; 0 on the surface, positive on the side that the gradient points to."""
+
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """s_p = ds/dp (..., 3)."""
+        return self._over_batch(torch.func.grad(self.value), p, (3,))
+
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        """s_pp = d2s/dp2 (..., 3, 3)."""
+        return self._over_batch(torch.func.jacrev(torch.func.grad(self.value)), p, (3, 3))
+
+    @staticmethod
+    def _over_batch(function: Callable[[Tensor], Tensor], p: Tensor, trailing: tuple[int, ...]) -> Tensor:
+        flat = p.reshape(-1, 3)
+        if not flat.shape[0]:
+            return p.new_zeros(*p.shape[:-1], *trailing)
+        return torch.func.vmap(function)(flat).reshape(*p.shape[:-1], *trailing)
+
+
+@dataclass(frozen=True)
+class Plane(Surface):
+    """The plane n . p = offset; `normal` need not be a unit vector (then n and offset are divided by its length)."""
+
+    normal: Vector
+    offset: float
+
+    def __post_init__(self) -> None:
+        normal = _vector("Plane normal", self.normal)
+        length = math.hypot(*normal)
+        if length == 0.0:
+            raise InvalidInput("Plane normal is (0, 0, 0); give a direction, for example (0, 0, 1).")
+        object.__setattr__(self, "normal", tuple(entry / length for entry in normal))
+        object.__setattr__(self, "offset", _number("Plane offset", self.offset) / length)
+
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return p @ _tensor(self.normal, p) - self.offset
+
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return _tensor(self.normal, p).expand(p.shape)
+
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        return p.new_zeros(*p.shape[:-1], 3, 3)
+
+
+@dataclass(frozen=True)
+class Sphere(Surface):
+    """The sphere |p - center| = radius; the normal points outwards."""
+
+    center: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", _vector("Sphere center", self.center))
+        object.__setattr__(self, "radius", _positive("Sphere radius", self.radius))
+
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1) - self.radius
+
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        ray = p - _tensor(self.center, p)
+        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        ray = p - _tensor(self.center, p)
+        return _distance_hessian(ray, torch.eye(3, dtype=p.dtype, device=p.device))
+
+
+@dataclass(frozen=True)
+class Cylinder(Surface):
+    """All points at distance `radius` from the line through `point` along `axis`; the normal points outwards."""
+
+    point: Vector
+    axis: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        axis = _vector("Cylinder axis", self.axis)
+        length = math.hypot(*axis)
+        if length == 0.0:
+            raise InvalidInput("Cylinder axis is (0, 0, 0); give a direction, for example (1, 0, 0).")
+        object.__setattr__(self, "axis", tuple(entry / length for entry in axis))
+        object.__setattr__(self, "point", _vector("Cylinder point", self.point))
+        object.__setattr__(self, "radius", _positive("Cylinder radius", self.radius))
+
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return torch.linalg.vector_norm(self._radial(p)[0], dim=-1) - self.radius
+
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        ray = self._radial(p)[0]
+        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        return _distance_hessian(*self._radial(p))
+
+    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Vector from the axis to p, and the projector onto the plane across the axis."""
+        axis = _tensor(self.axis, p)
+        projector = torch.eye(3, dtype=p.dtype, device=p.device) - torch.outer(axis, axis)
+        return (p - _tensor(self.point, p)) @ projector, projector
+
+
+@dataclass(frozen=True)
+class ImplicitSurface(Surface):
+    """s(p) = function(p) for any twice differentiable `function` of one point (3,) -> scalar, written in torch.
+
+    The multiplier of a contact is then the normal force divided by |s_p|. A function cannot be stored in a file (files never carry code):
+    pass the surface again when loading.
+    """
+
+    function: Callable[[Tensor], Tensor] = field(compare=True)
+
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self._over_batch(self.function, p, ()) if p.dim() > 1 else self.function(p)
+
+
+SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder}
+"""Surfaces that files can carry, by the name they have there."""
+
+
+def surface_to_dict(surface: Surface) -> dict[str, Any]:
+    """Plain numbers that `surface_from_dict` turns back into the surface. Raises ContactError for a surface that holds code."""
+    name = next((name for name, kind in SURFACES.items() if type(surface) is kind), None)
+    if name is None:
+        raise ContactError(
+            f"a {type(surface).__name__} cannot be stored: files carry numbers, never code. Use one of {', '.join(SURFACES)}, or save "
+            "without contacts and pass them again when loading."
+        )
+    return {"type": name, **asdict(surface)}  # type: ignore[call-overload]
+
+
+def surface_from_dict(stored: dict[str, Any]) -> Surface:
+    """The surface that `surface_to_dict` stored. Raises FileFormatError for an unknown type or missing fields."""
+    fields = dict(stored)
+    name = fields.pop("type", None)
+    if name not in SURFACES:
+        raise FileFormatError(f"unknown surface type {name!r}; known types: {', '.join(SURFACES)}")
+    try:
+        return SURFACES[name](
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
+        )
+    except TypeError as error:
+        raise FileFormatError(f"surface {name!r} has wrong fields {sorted(fields)}: {error}") from None
+
+
+def _distance_hessian(ray: Tensor, projector: Tensor) -> Tensor:
+    """Hessian of |ray| where d ray / dp = projector: (projector - n n^T) / |ray|."""
+    distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
+    normal = ray[..., None] / distance
+    return (projector - normal @ normal.mT) / distance
+
+
+def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
+def _number(name: str, value: object) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InvalidInput(f"{name} is {value!r}; give a number.") from None
+    if not math.isfinite(number):
+        raise InvalidInput(f"{name} is {number}; give a finite number.")
+    return number
+
+
+def _positive(name: str, value: object) -> float:
+    number = _number(name, value)
+    if number <= 0.0:
+        raise InvalidInput(f"{name} is {number}; it must be positive (m).")
+    return number
+
+
+def _vector(name: str, values: object) -> Vector:
+    try:
+        entries = tuple(_number(name, entry) for entry in values)  # type: ignore[attr-defined]
+    except TypeError:
+        entries = ()
+    if len(entries) != 3:
+        raise InvalidInput(f"{name} is {values!r}; give three numbers x, y, z.")
+    return entries  # type: ignore[return-value]

@@ -1,0 +1,187 @@
+"""`MechanicalSystem`: a robot, its contacts and the forces that are known, as one immutable value that files can carry."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.mechanics.contacts import Baumgarte, Contact
+from forcegp.mechanics.gauss_principle import ConstrainedDynamics
+from forcegp.mechanics.known_forces import (
+    Actuation,
+    KnownForce,
+    RigidBodyBias,
+    known_force_from_dict,
+    known_force_to_dict,
+)
+from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
+from forcegp.robots import Robot
+
+FORMAT_VERSION = 1
+CONSISTENCY_TOLERANCE = 1e-6
+"""|A a - b| above this fraction of 1 + |b| means that redundant contacts contradict each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class MechanicalSystem:
+    """What is known: the robot, the contacts that hold it, the known forces, and Baumgarte's terms if the motion has them.
+
+    `known_forces` is the complete list; the default is actuation and rigid-body bias. Joint damping and friction of the URDF enter only
+    where listed, for example `ViscousJointFriction.from_robot(robot)`.
+    Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
+    """
+
+    robot: Robot
+    contacts: tuple[Contact, ...] = ()
+    known_forces: tuple[KnownForce, ...] = (Actuation(), RigidBodyBias())
+    baumgarte: Baumgarte | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "contacts", tuple(self.contacts))
+        object.__setattr__(self, "known_forces", tuple(force.bound_to(self.robot) for force in self.known_forces))
+        for contact in self.contacts:
+            body, _ = self.robot.frame(contact.frame)
+            if body < 0:
+                raise ContactError(
+                    f"frame {contact.frame!r} of {self.robot.name} is fixed in the world, so a contact there constrains nothing; name a frame "
+                    "that moves."
+                )
+
+    def dynamics(
+        self,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        u: Float[Tensor, "*#batch nv"],
+        inertials: Mapping[str, Tensor] | None = None,
+    ) -> ConstrainedDynamics:
+        """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable in all arguments.
+
+        `inertials` maps link names to log-Cholesky parameters (..., 10). Contact points are kinematic: no inertial parameter moves them.
+        """
+        self.robot.check_input("u", u)
+        kinematics = self.robot.kinematics(*torch.broadcast_tensors(q, v))
+        if u.shape != kinematics.q.shape:
+            batch = torch.broadcast_shapes(u.shape, kinematics.q.shape)
+            u = u.expand(batch)
+            kinematics = self.robot.kinematics(kinematics.q.expand(batch), v.expand(batch))
+        M = kinematics.mass_matrix(inertials)
+        Q_K = torch.zeros_like(kinematics.q)
+        for force in self.known_forces:
+            Q_K = Q_K + force.force(kinematics, u, inertials)
+            inertia = force.added_inertia()
+            if inertia is not None:
+                M = M + torch.diag_embed(inertia)
+        A, b, normals = self._constraint(kinematics)
+        batch = M.shape[:-2]  # inertials may carry batch dimensions of their own
+        A, b, normals = (
+            part.expand(*batch, *part.shape[k:])
+            for part, k in ((A, A.dim() - 2), (b, b.dim() - 1), (normals, normals.dim() - 2))
+        )
+        return ConstrainedDynamics.from_constraint(kinematics, u, M, A, b, normals, Q_K)
+
+    def _constraint(self, kinematics: Any) -> tuple[Tensor, Tensor, Tensor]:
+        if not self.contacts:
+            q = kinematics.q
+            return (
+                q.new_zeros(*q.shape[:-1], 0, q.shape[-1]),
+                q.new_zeros(*q.shape[:-1], 0),
+                q.new_zeros(*q.shape[:-1], 0, 3),
+            )
+        rows, right, normals = zip(
+            *(contact.constraint(kinematics, self.baumgarte) for contact in self.contacts), strict=True
+        )
+        return torch.stack(rows, dim=-2), torch.stack(right, dim=-1), torch.stack(normals, dim=-2)
+
+    def check_states(self, q: Float[Tensor, "N nv"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nv"]) -> None:
+        """Raise ContactError, naming row and contact, where a contact cannot constrain the motion or contacts contradict each other."""
+        dynamics = self.dynamics(q, v, u)
+        if not self.contacts:
+            return
+        size = torch.linalg.vector_norm(dynamics.A, dim=-1)
+        bad = torch.nonzero(~(size > 1e-12))
+        if len(bad):
+            row, index = (int(entry) for entry in bad[0])
+            raise ContactError(
+                f"contact {index} (frame {self.contacts[index].frame!r}) has no direction at row {row}: the gradient of its surface vanishes "
+                "or the point cannot move along it; check the surface, the contact point and q."
+            )
+        a = dynamics.acceleration_map().offset
+        violation = ((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs() / (1.0 + dynamics.b.abs())
+        if bool((violation > CONSISTENCY_TOLERANCE).any()):
+            row, index = divmod(int(violation.argmax()), violation.shape[-1])
+            raise ContactError(
+                f"the contacts contradict each other at row {row}: |A a - b| = {float(violation.max()):.2e} for contact {index} although redundant "
+                "contacts are solved in the least-squares sense; remove one of them or check their surfaces."
+            )
+
+    def with_robot(self, robot: Robot) -> MechanicalSystem:
+        """The same contacts and forces on another robot with the same joints."""
+        return replace(self, robot=robot)
+
+    def with_contacts(self, contacts: Sequence[Contact]) -> MechanicalSystem:
+        """The same robot and forces under other contacts."""
+        return replace(self, contacts=tuple(contacts))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON values, the robot as URDF text. Raises ContactError for a surface that holds code."""
+        return {
+            "format": FORMAT_VERSION,
+            "urdf": self.robot.urdf_text,
+            "gravity": self.robot.gravity.tolist(),
+            "armature": self.robot.armature.tolist(),
+            "locked": dict(self.robot.locked),
+            "contacts": [
+                {"frame": contact.frame, "point": list(contact.point), "surface": surface_to_dict(contact.surface)}
+                for contact in self.contacts
+            ],
+            "known_forces": [known_force_to_dict(force) for force in self.known_forces],
+            "baumgarte": None if self.baumgarte is None else asdict(self.baumgarte),
+        }
+
+    def to_json(self) -> str:
+        """`to_dict` as JSON text."""
+        return json.dumps(self.to_dict())
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any], contacts: Sequence[Contact] | None = None) -> MechanicalSystem:
+        """The system that `to_dict` stored; `contacts` replaces the stored ones. Raises FileFormatError for anything else."""
+        if stored.get("format") != FORMAT_VERSION:
+            raise FileFormatError(
+                f"stored system has format {stored.get('format')!r}; this forcegp reads {FORMAT_VERSION}"
+            )
+        try:
+            robot = Robot.from_urdf_text(
+                stored["urdf"],
+                source="stored URDF",
+                gravity=stored["gravity"],
+                armature=stored["armature"] if any(stored["armature"]) else None,
+                locked=stored["locked"] or None,
+            )
+            if contacts is None:
+                contacts = [
+                    Contact(entry["frame"], tuple(entry["point"]), surface_from_dict(entry["surface"]))
+                    for entry in stored["contacts"]
+                ]
+            baumgarte = None if stored["baumgarte"] is None else Baumgarte(**stored["baumgarte"])
+            forces = tuple(known_force_from_dict(entry) for entry in stored["known_forces"])
+        except (KeyError, TypeError) as error:
+            raise FileFormatError(f"stored system is incomplete or damaged: {error}") from None
+        return cls(robot, tuple(contacts), forces, baumgarte)
+
+    @classmethod
+    def from_json(cls, text: str) -> MechanicalSystem:
+        """The system that `to_json` stored."""
+        try:
+            stored = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise FileFormatError(f"stored system is not JSON: {error}") from None
+        if not isinstance(stored, dict):
+            raise InvalidInput(f"stored system is a {type(stored).__name__}, expected a JSON object")
+        return cls.from_dict(stored)
