@@ -1,0 +1,267 @@
+"""`Dataset`: what was measured on a robot, checked once and never changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from forcegp.data.columns import finite_columns, integer_column
+from forcegp.data.frozen_dict import FrozenDict, frozen_json
+from forcegp.data.hdf5 import read_fields, write_fields
+from forcegp.data.units import units_for, validated_units
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.mechanics import MechanicalSystem
+
+TRUTH_NAMES = ("a", "lambda", "Q_U")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Dataset:
+    """Rows `(q, v, u) -> a` of one robot, with everything needed to read them.
+
+    Arrays are copied to float64, made read-only and checked; a Dataset that exists is valid. In row k, `a` is the
+    acceleration that the state `(q, v)` and the actuator forces `u` of the same row produce.
+
+    Fields
+    ------
+    q, v, u: (rows, nv) positions, velocities and actuator forces [units].
+    a: (rows, nv) measured acceleration, with its noise.
+    time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
+    joint_names: nv names, in the order of the columns; those of `system.robot` if a system is given.
+    units: mapping of "q", "v", "u", "a", "time" to SI units; one text, or one per joint where joints differ.
+    episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
+    system: the robot and what it touches, or None.
+    noise_std: (nv,) standard deviation of the noise on `a`, if known.
+    truth: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N] and the unknown joint forces "Q_U"
+        (rows, nv), as far as a simulation knows them.
+    metadata: anything that JSON can hold; frozen.
+    time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
+
+    Raises DatasetError naming the array, row and column that break this, and what to do.
+    """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    q: Float[np.ndarray, "rows nv"]
+    v: Float[np.ndarray, "rows nv"]
+    u: Float[np.ndarray, "rows nv"]
+    a: Float[np.ndarray, "rows nv"]
+    time: Float[np.ndarray, " rows"]
+    joint_names: tuple[str, ...]
+    units: Mapping[str, Any]
+    episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
+    system: MechanicalSystem | None = None
+    noise_std: Float[np.ndarray, " nv"] | None = None
+    truth: Mapping[str, np.ndarray] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    time_ordered: bool = True
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        names = _joint_names(self.joint_names, self.system)
+        put("joint_names", names)
+        put("q", finite_columns("q", self.q, names))
+        rows = len(self.q)
+        for name in ("v", "u", "a"):
+            put(name, finite_columns(name, getattr(self, name), names, rows))
+        put("time", finite_columns("time", self.time, None, rows))
+        put("episode", integer_column("episode", np.zeros(rows, int) if self.episode is None else self.episode, rows))
+        put("units", validated_units(self.units, names))
+        if self.system is not None and self.units != units_for(self.system.robot):
+            raise DatasetError(
+                f"units are {self.units}; the joint types of {self.system.robot.name!r} ask for "
+                f"{units_for(self.system.robot)}."
+            )
+        put("noise_std", _noise_std(self.noise_std, names))
+        put("truth", _truth(self.truth, names, rows, self.system))
+        put("metadata", frozen_json(self.metadata))
+        put("time_ordered", bool(self.time_ordered))
+        _check_time(self.time, self.episode, self.time_ordered)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __repr__(self) -> str:
+        robot = f"{self.system.robot.name!r}, contacts: {len(self.system.contacts)}" if self.system else "no system"
+        truth = f", truth: {', '.join(self.truth)}" if self.truth else ""
+        return f"Dataset({len(self)} rows, {self.nv} joints, episodes {list(self.episodes)}, {robot}{truth})"
+
+    def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
+        return _rebuild, (self._fields(),)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def episodes(self) -> tuple[int, ...]:
+        """The episode numbers in order of first appearance."""
+        values, first = np.unique(self.episode, return_index=True)
+        return tuple(int(value) for value in values[np.argsort(first)])
+
+    def rows(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
+        """The rows of a slice, boolean mask (rows,) or list of row numbers, in the order given.
+
+        Raises InvalidInput for row numbers that do not exist or repeat, and for an empty selection.
+        """
+        chosen = _row_numbers(index, len(self))
+        truth = {name: values[chosen] for name, values in self.truth.items()}
+        arrays = {name: getattr(self, name)[chosen] for name in ("q", "v", "u", "a", "time", "episode")}
+        ordered = _first_disorder(arrays["time"], arrays["episode"]) is None
+        return replace(self, **arrays, truth=truth, time_ordered=ordered)
+
+    def select_episodes(self, ids: Iterable[int]) -> Dataset:
+        """All rows of the given episodes, in their present order. Raises InvalidInput for numbers that do not occur."""
+        wanted = tuple(ids)
+        missing = [number for number in wanted if number not in self.episodes]
+        if missing or not wanted:
+            raise InvalidInput(
+                f"no episodes {missing if wanted else '(none asked for)'}; this Dataset has {list(self.episodes)}."
+            )
+        return self.rows(np.isin(self.episode, wanted))
+
+    def split_by_episode(self, test_episodes: Iterable[int]) -> tuple[Dataset, Dataset]:
+        """`(train, test)`, where `test` holds whole episodes and no trajectory is in both.
+
+        Raises InvalidInput for numbers that do not occur and when nothing is left for training.
+        """
+        wanted = set(test_episodes)
+        test = self.select_episodes(sorted(wanted))
+        rest = [number for number in self.episodes if number not in wanted]
+        if not rest:
+            raise InvalidInput(
+                f"all {len(self.episodes)} episodes {list(self.episodes)} are for testing; none is left to train on."
+            )
+        return self.select_episodes(rest), test
+
+    def save(self, path: str | Path) -> None:
+        """Write an HDF5 file (docs/data-format.md); an interrupted write leaves the old file, or none."""
+        write_fields(Path(path), self._fields())
+
+    @staticmethod
+    def load(path: str | Path) -> Dataset:
+        """Read a file written by `save`. Raises FileFormatError saying what is wrong with the file."""
+        given = read_fields(Path(path))
+        try:
+            return Dataset(**given)
+        except DatasetError as error:
+            raise FileFormatError(f"{path} holds data that are not valid: {error}") from error
+
+    def _fields(self) -> dict[str, Any]:
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+
+def _rebuild(arguments: dict[str, Any]) -> Dataset:
+    return Dataset(**arguments)
+
+
+def _joint_names(given: Sequence[str], system: MechanicalSystem | None) -> tuple[str, ...]:
+    if isinstance(given, str) or not all(isinstance(name, str) and name for name in given):
+        raise DatasetError(f"joint_names must be a sequence of non-empty texts; given: {given!r}.")
+    names = tuple(given)
+    if not names:
+        raise DatasetError("joint_names is empty; a Dataset has at least one joint.")
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise DatasetError(f"joint_names repeats {repeated}; every column needs its own name.")
+    if system is not None and names != tuple(system.robot.joint_names):
+        raise DatasetError(
+            f"joint_names are {list(names)}, but {system.robot.name!r} has {list(system.robot.joint_names)}. "
+            "Give the columns in the robot's order, with its names."
+        )
+    return names
+
+
+def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None:
+    if given is None:
+        return None
+    values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
+    if (values <= 0).any():
+        column = int(np.argmax(values <= 0))
+        raise DatasetError(
+            f"noise_std of joint {joint_names[column]!r} is {values[column]}; it must be > 0. "
+            "Give None if it is not known or if there is no noise."
+        )
+    return values
+
+
+def _truth(
+    given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, system: MechanicalSystem | None
+) -> FrozenDict:
+    unknown = sorted(set(given) - set(TRUTH_NAMES))
+    if unknown:
+        raise DatasetError(f"truth has no {unknown}; allowed: {list(TRUTH_NAMES)}.")
+    checked = {}
+    for name in TRUTH_NAMES:
+        if name not in given:
+            continue
+        if name == "lambda":
+            values = finite_columns("truth['lambda']", given[name], (), rows)
+            if system is not None and values.shape[1] != len(system.contacts):
+                raise DatasetError(
+                    f"truth['lambda'] has {values.shape[1]} columns; the system has {len(system.contacts)} contacts."
+                )
+        else:
+            values = finite_columns(f"truth[{name!r}]", given[name], joint_names, rows)
+        checked[name] = values
+    return FrozenDict(checked)
+
+
+def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:
+    """Row whose time does not come after that of the row before it in the same episode."""
+    order = np.argsort(episode, kind="stable")  # stable: keeps the order of rows inside an episode
+    wrong = (np.diff(time[order]) <= 0) & (np.diff(episode[order]) == 0)
+    return int(order[1:][wrong].min()) if wrong.any() else None
+
+
+def _check_time(time: np.ndarray, episode: np.ndarray, ordered: bool) -> None:
+    if ordered:
+        row = _first_disorder(time, episode)
+        if row is not None:
+            raise DatasetError(
+                f"time does not increase at row {row} (episode {episode[row]}, time {time[row]} s). "
+                "Sort the rows, drop repeated time stamps, or number a new recording as a new episode."
+            )
+        return
+    order = np.lexsort((time, episode))
+    row = _first_disorder(time[order], episode[order])
+    if row is not None:
+        raise DatasetError(
+            f"time {time[order][row]} s occurs twice in episode {episode[order][row]}; drop the repeated rows."
+        )
+
+
+def _row_numbers(index: slice | Sequence[int] | np.ndarray, rows: int) -> np.ndarray:
+    if isinstance(index, slice):
+        chosen = np.arange(rows)[index]
+    else:
+        given = np.asarray(index)
+        if given.dtype == bool and given.shape == (rows,):
+            chosen = np.flatnonzero(given)
+        elif given.ndim == 1 and (given.dtype.kind in "iu" or given.size == 0):
+            wrong = given[(given < -rows) | (given >= rows)]
+            if wrong.size:
+                raise InvalidInput(f"row {wrong[0]} does not exist; this Dataset has {rows} rows, 0 to {rows - 1}.")
+            chosen = given.astype(np.intp) % rows
+        else:
+            raise InvalidInput(
+                f"rows are chosen by a slice, {rows} booleans or a list of integers; "
+                f"given: {given.dtype} of shape {given.shape}."
+            )
+    if chosen.size == 0:
+        raise InvalidInput("no rows selected; a Dataset has at least one row.")
+    if np.unique(chosen).size != chosen.size:
+        values, counts = np.unique(chosen, return_counts=True)
+        raise InvalidInput(f"row {values[counts > 1][0]} is selected more than once; select each row once.")
+    return chosen

@@ -1,0 +1,87 @@
+"""Farthest-point sampling: few rows that cover the visited states evenly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data.dataset import Dataset
+
+ROUNDING = 1e-13
+"""Standard deviation, relative to the largest entry, below which a column is constant but for rounding."""
+
+
+def farthest_point_sampling(
+    points: Float[np.ndarray, "rows features"], count: int, *, start: int | None = None, seed: int | None = None
+) -> Int[np.ndarray, " count"]:
+    """Numbers of `count` rows of which each is the farthest from all rows chosen before it.
+
+    Greedy k-centre (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance") with Euclidean distances
+    on columns standardised to zero mean and unit standard deviation. The first row is `start`, or drawn by `seed`, or
+    row 0. The result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are
+    the sample of size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
+    Time O(rows * count * features), memory O(rows * features).
+
+    Raises InvalidInput if `points` is not a finite table, or for a `count` or `start` outside the rows.
+    """
+    table = np.asarray(points)
+    if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():
+        raise InvalidInput(
+            f"points must be a (rows, features) table of finite numbers; given: {table.dtype} {table.shape}."
+        )
+    rows = table.shape[0]
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= rows:
+        raise InvalidInput(f"count is {count!r}; it must be an integer from 1 to {rows}, the number of rows.")
+    columns = _standardized_columns(table)
+    distance = np.full(rows, np.inf)
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = _first_row(rows, start, seed)
+    for position in range(count):
+        if position:
+            chosen[position] = np.argmax(distance)  # the lowest row number among equals
+        row = chosen[position]
+        # Differences, not |x|^2 - 2 x.y + |y|^2: a repeated row must have distance exactly 0.
+        squared = np.zeros(rows)
+        for column in columns:
+            difference = column - column[row]
+            squared += difference * difference
+        np.minimum(distance, squared, out=distance)
+        distance[row] = -1.0  # never chosen again, not even among repeated rows
+    return chosen
+
+
+def farthest_rows(dataset: Dataset, count: int, *, start: int | None = None, seed: int | None = None) -> Dataset:
+    """The `count` rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`.
+
+    A model trained on fewer points takes the first ones: `farthest_rows(data, 1000).rows(slice(100))`.
+    """
+    points = np.hstack([dataset.q, dataset.v, dataset.u])
+    return dataset.rows(farthest_point_sampling(points, count, start=start, seed=seed))
+
+
+def _standardized_columns(table: np.ndarray) -> np.ndarray:
+    """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
+    columns = np.ascontiguousarray(table.T, dtype=np.float64)
+    scale = np.abs(columns).max(axis=1, keepdims=True)
+    columns = columns / np.where(scale > 0, scale, 1.0)  # so that squaring in std cannot overflow or underflow
+    spread = columns.std(axis=1, keepdims=True)
+    spread[spread < ROUNDING] = 0.0
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)
+
+
+def _first_row(rows: int, start: int | None, seed: int | None) -> int:
+    if start is not None and seed is not None:
+        raise InvalidInput("give start (a row number) or seed (which draws one), not both.")
+    if seed is not None:
+        return int(np.random.default_rng(seed).integers(rows))
+    if start is None:
+        return 0
+    if not 0 <= start < rows:
+        raise InvalidInput(f"start is {start}; it must be a row number from 0 to {rows - 1}.")
+    return int(start)

@@ -1,0 +1,185 @@
+"""Low-pass filtering, differentiation and resampling of logs; every function returns new arrays or a new Dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt
+
+from forcegp.data.dataset import Dataset
+from forcegp.errors import DatasetError, InvalidInput
+
+JITTER = 0.01
+"""Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
+
+TRANSIENT = 1e-3
+"""What is left of a filter's transient at the ends of a recording; sets the length of the padding."""
+
+Signal = Literal["q", "v", "u", "a"]
+
+
+def zero_phase_low_pass(
+    values: Float[np.ndarray, "rows columns"], sample_rate: float, cutoff: float, order: int = 4
+) -> Float[np.ndarray, "rows columns"]:
+    """Butterworth low-pass, run forwards and backwards so that nothing is delayed.
+
+    Both ends are continued by point reflection until the filter's transient has died out, so that straight lines pass.
+    Two passes square the gain: `1 / (1 + (tan(pi f / f_s) / tan(pi f_c / f_s))^(2 order))`, so 1/2 at `cutoff` [Hz].
+    Raises InvalidInput for a cut-off at or above half the sample rate [Hz] and DatasetError for too few rows.
+    """
+    if not (np.isfinite(sample_rate) and sample_rate > 0):
+        raise InvalidInput(f"sample_rate is {sample_rate} Hz; it must be > 0.")
+    if not 0 < cutoff < sample_rate / 2:
+        raise InvalidInput(
+            f"cutoff is {cutoff} Hz; it must be > 0 and below {sample_rate / 2} Hz, half the sample rate."
+        )
+    if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= 12:
+        raise InvalidInput(f"order is {order!r}; it must be an integer from 1 to 12.")
+    sections = butter(order, cutoff, fs=sample_rate, output="sos")
+    slowest = np.abs(butter(order, cutoff, fs=sample_rate, output="zpk")[1]).max()
+    padding = max(int(np.ceil(np.log(TRANSIENT) / np.log(slowest))), order + 1)
+    if len(values) <= padding:
+        raise DatasetError(
+            f"{len(values)} rows are too few for a filter of order {order} with a cut-off at {cutoff} Hz; "
+            f"more than {padding} are needed. Use a higher cut-off or a lower order, or leave the episode out."
+        )
+    return sosfiltfilt(sections, values, axis=0, padlen=padding)
+
+
+def differentiate(values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"]) -> np.ndarray:
+    """Central differences, second order also at both ends and for unequal steps (three-point Lagrange formulas).
+
+    Units: those of `values` per second. Raises DatasetError for fewer than three rows or time that does not increase.
+    """
+    if len(values) < 3:
+        raise DatasetError(f"{len(values)} rows are too few to differentiate; at least 3 are needed.")
+    if len(time) != len(values) or not (np.diff(time) > 0).all():
+        raise DatasetError(f"time must have {len(values)} entries that increase strictly.")
+    return np.gradient(values, time, axis=0, edge_order=2)
+
+
+def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording") -> float:
+    """The sampling interval [s]. Raises DatasetError if steps differ by more than `JITTER` (1 %) from their median."""
+    if len(time) < 2:
+        raise DatasetError(f"{name} has {len(time)} row; at least 2 are needed.")
+    steps = np.diff(time)
+    median = float(np.median(steps))
+    worst = int(np.argmax(np.abs(steps - median)))
+    if median <= 0 or abs(steps[worst] - median) > JITTER * median:
+        raise DatasetError(
+            f"{name} is not sampled uniformly: the step after row {worst} is {steps[worst]:.6g} s, "
+            f"the median {median:.6g} s. "
+            "Resample it first (forcegp.data.resample)."
+        )
+    return float((time[-1] - time[0]) / (len(time) - 1))
+
+
+def low_pass(
+    dataset: Dataset, cutoff: float, *, order: int = 4, signals: Sequence[Signal] = ("q", "v", "u", "a")
+) -> Dataset:
+    """The Dataset with the named signals low-pass filtered (`zero_phase_low_pass`) within each episode.
+
+    Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Raises as
+    `zero_phase_low_pass` and `uniform_step`, naming the episode; DatasetError for rows that are not in order of time
+    and for positions that jump by a turn.
+    """
+    if not signals or not set(signals) <= {"q", "v", "u", "a"}:
+        raise InvalidInput(f"signals are {tuple(signals)!r}; allowed: one or more of q, v, u, a.")
+
+    def filtered(name: str, rows: Dataset, label: str) -> np.ndarray:
+        if name == "q":
+            _require_no_turns(rows, label)
+        return zero_phase_low_pass(getattr(rows, name), 1.0 / uniform_step(rows.time, label), cutoff, order)
+
+    changed = _by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
+    return replace(dataset, **changed, noise_std=None if "a" in signals else dataset.noise_std)
+
+
+def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset:
+    """The Dataset with `a` computed from `v` by central differences, or `v` and `a` from `q`, within each episode.
+
+    Differences amplify noise: filter `source` first (`low_pass`). `noise_std` becomes None. Raises DatasetError for
+    rows that are not in order of time, episodes of fewer than 3 rows and positions that jump by a turn; InvalidInput
+    for another source.
+    """
+    if source not in ("q", "v"):
+        raise InvalidInput(f"source is {source!r}; allowed: 'q' (gives v and a) or 'v' (gives a).")
+
+    def derivatives(rows: Dataset, label: str) -> dict[str, np.ndarray]:
+        if source == "v":
+            return {"a": differentiate(rows.v, rows.time)}
+        _require_no_turns(rows, label)
+        velocity = differentiate(rows.q, rows.time)
+        return {"v": velocity, "a": differentiate(velocity, rows.time)}
+
+    return replace(dataset, **_by_episode(dataset, derivatives), noise_std=None)
+
+
+def resample(dataset: Dataset, step: float) -> Dataset:
+    """The Dataset at uniform times, `step` [s] apart, by a cubic spline through each signal of each episode.
+
+    Filter first (`low_pass`) when going to a longer step: a spline does not remove what the new rate cannot carry.
+    `truth` and `noise_std` are dropped, since interpolation makes neither. Raises InvalidInput for a step <= 0 or
+    longer than an episode, DatasetError for rows that are not in order of time or positions that jump by a turn.
+    """
+    if not (np.isfinite(step) and step > 0):
+        raise InvalidInput(f"step is {step} s; it must be > 0.")
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "u", "a", "time", "episode")}
+    for number, rows, label in _episodes(dataset):
+        _require_no_turns(rows, label)
+        duration = rows.time[-1] - rows.time[0]
+        count = int(np.floor(duration / step * (1 + 1e-12))) + 1
+        if count < 2:
+            raise InvalidInput(f"step is {step} s, longer than {label} ({duration:.6g} s).")
+        time = np.minimum(rows.time[0] + step * np.arange(count), rows.time[-1])
+        for name in ("q", "v", "u", "a"):
+            parts[name].append(CubicSpline(rows.time, getattr(rows, name), axis=0)(time))
+        parts["time"].append(time)
+        parts["episode"].append(np.full(count, number))
+    joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+    return replace(dataset, **joined, truth={}, noise_std=None)
+
+
+def _episodes(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
+    if not dataset.time_ordered:
+        raise DatasetError(
+            "the rows are not in order of time (a sample of rows?); filter the whole recording, then sample."
+        )
+    return [(number, dataset.select_episodes([number]), f"episode {number}") for number in dataset.episodes]
+
+
+def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Apply `change` to each episode and put its rows back where they came from."""
+    result: dict[str, np.ndarray] = {}
+    for number, rows, label in _episodes(dataset):
+        try:
+            changed = change(rows, label)
+        except DatasetError as error:
+            raise error if label in str(error) else DatasetError(f"{label}: {error}") from error
+        for name, values in changed.items():
+            result.setdefault(name, np.empty_like(values, shape=(len(dataset), *values.shape[1:])))
+            result[name][dataset.episode == number] = values
+    return result
+
+
+def _require_no_turns(rows: Dataset, label: str) -> None:
+    """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
+    angular = [column for column, unit in enumerate(_position_units(rows)) if unit == "rad"]
+    jumps = np.abs(np.diff(rows.q[:, angular], axis=0)) > np.pi
+    if jumps.any():
+        row, column = np.argwhere(jumps)[0]
+        joint = rows.joint_names[angular[column]]
+        raise DatasetError(
+            f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
+            "Unwrap it first (np.unwrap(q, axis=0))."
+        )
+
+
+def _position_units(rows: Dataset) -> Sequence[str]:
+    unit = rows.units["q"]
+    return (unit,) * rows.nv if isinstance(unit, str) else unit

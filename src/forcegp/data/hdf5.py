@@ -1,0 +1,187 @@
+"""The dataset file: HDF5, version 1, described in docs/data-format.md.
+
+Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from forcegp import __version__
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+
+FORMAT = "forcegp-dataset"
+VERSION = 1
+
+_TEXT = h5py.string_dtype("utf-8")
+_LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that claims more holds no such data
+
+
+def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
+    """Write the fields of a Dataset to a temporary file in the same folder and rename it.
+
+    Raises InvalidInput if the folder does not exist or `path` is a folder.
+    """
+    if not path.parent.is_dir():
+        raise InvalidInput(f"cannot write {path}: the folder {path.parent} does not exist; create it first.")
+    if path.is_dir():
+        raise InvalidInput(f"cannot write {path}: it is a folder; give a file name.")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        with h5py.File(temporary, "x") as file:
+            _write(fields, file)
+        temporary.replace(path)
+    except BaseException:  # also KeyboardInterrupt: nothing half-written may stay
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_fields(path: Path) -> dict[str, Any]:
+    """The fields of the Dataset in a file. Raises FileFormatError with the path and what is wrong."""
+    if not path.is_file():
+        raise FileFormatError(f"{path} is not a file; give the path of a dataset written by forcegp (.h5).")
+    with _reading(path), h5py.File(path, "r") as file:
+        _check_header(path, file)
+        return _read(path, file)
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
+        kind = "is damaged" if h5py.is_hdf5(path) else "is not an HDF5 file"
+        raise FileFormatError(f"{path} {kind}: {error}. Write it again, or convert the log to a Dataset.") from error
+
+
+def _write(fields: Mapping[str, Any], file: h5py.File) -> None:
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = VERSION
+    file.attrs["written_by"] = f"forcegp {__version__}"
+    file.attrs["time_ordered"] = fields["time_ordered"]
+    for name in ("q", "v", "u", "a", "time", "episode"):
+        _put(file, name, fields[name])
+    for name, unit in fields["units"].items():
+        file[name].attrs.create("units", unit, dtype=_TEXT)
+    file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
+    if fields["noise_std"] is not None:
+        file.create_dataset("noise_std", data=fields["noise_std"])
+    for name, values in fields["truth"].items():
+        _put(file, f"truth/{name}", values)
+    file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
+    if fields["system"] is not None:
+        file.create_dataset("system", data=fields["system"].to_json(), dtype=_TEXT)
+
+
+def _put(file: h5py.File, name: str, values: np.ndarray) -> None:
+    compression = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size else {}
+    file.create_dataset(name, data=values, **compression)
+
+
+def _check_header(path: Path, file: h5py.File) -> None:
+    kind = file.attrs.get("format")
+    if kind != FORMAT:
+        raise FileFormatError(
+            f"{path} is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
+        )
+    version = file.attrs.get("format_version")
+    if not isinstance(version, int | np.integer) or version < 1:
+        raise FileFormatError(f"{path} has no valid 'format_version' ({version!r}); it is damaged.")
+    if version > VERSION:
+        raise FileFormatError(
+            f"{path} has format version {version}; this forcegp ({__version__}) reads up to {VERSION}. Upgrade forcegp."
+        )
+
+
+def _read(path: Path, file: h5py.File) -> dict[str, Any]:
+    required = ("q", "v", "u", "a", "time", "episode", "joint_names", "metadata")
+    missing = [name for name in required if name not in file]
+    if missing:
+        raise FileFormatError(f"{path} has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
+    values: dict[str, Any] = {name: _array(path, file, name) for name in required[:6]}
+    values["units"] = {name: _units(path, file, name) for name in ("q", "v", "u", "a", "time")}
+    values["joint_names"] = tuple(_texts(path, file, "joint_names"))
+    values["metadata"] = _json(path, "metadata", _text(path, file, "metadata"))
+    values["noise_std"] = _array(path, file, "noise_std") if "noise_std" in file else None
+    values["truth"] = {name: _array(path, file, f"truth/{name}") for name in _truth_names(path, file)}
+    values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
+    values["system"] = _system(path, _text(path, file, "system")) if "system" in file else None
+    return values
+
+
+def _truth_names(path: Path, file: h5py.File) -> list[str]:
+    if "truth" not in file:
+        return []
+    group = file["truth"]
+    if not isinstance(group, h5py.Group):
+        raise FileFormatError(f"{path}: 'truth' must be a group.")
+    return list(group)
+
+
+def _stored(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """The HDF5 dataset of that name, which must lie inside this very file."""
+    link = file.get(name, getlink=True)
+    found = file[name] if isinstance(link, h5py.HardLink) else None
+    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        raise FileFormatError(
+            f"{path}: {name!r} must be a dataset stored in this file, not a group or a link elsewhere."
+        )
+    return found
+
+
+def _array(path: Path, file: h5py.File, name: str) -> np.ndarray:
+    stored = _stored(path, file, name)
+    if stored.dtype.kind not in "fiu":
+        raise FileFormatError(f"{path}: {name!r} must hold numbers; it holds {stored.dtype}.")
+    if stored.size * stored.dtype.itemsize > _LARGEST_COMPRESSION * stored.id.get_storage_size():
+        raise FileFormatError(
+            f"{path}: {name!r} claims the shape {stored.shape}, but the file does not hold that much."
+        )
+    return stored[()]
+
+
+def _texts(path: Path, file: h5py.File, name: str) -> list[str]:
+    stored = _stored(path, file, name)
+    if h5py.check_string_dtype(stored.dtype) is None:
+        raise FileFormatError(f"{path}: {name!r} must hold text; it holds {stored.dtype}.")
+    return np.atleast_1d(stored.asstr()[()]).ravel().tolist()
+
+
+def _text(path: Path, file: h5py.File, name: str) -> str:
+    texts = _texts(path, file, name)
+    if len(texts) != 1:
+        raise FileFormatError(f"{path}: {name!r} must hold one text; it holds {len(texts)}.")
+    return texts[0]
+
+
+def _units(path: Path, file: h5py.File, name: str) -> str | tuple[str, ...]:
+    units = file[name].attrs.get("units")
+    if units is None:
+        raise FileFormatError(f"{path}: {name!r} has no attribute 'units'.")
+    return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))
+
+
+def _json(path: Path, name: str, text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise FileFormatError(f"{path}: {name!r} must be a JSON object; it is {type(value).__name__}.")
+    return value
+
+
+def _system(path: Path, text: str) -> Any:
+    from forcegp.mechanics import MechanicalSystem  # brings torch, which a file without a robot does not need
+
+    try:
+        return MechanicalSystem.from_json(text)
+    except ForceGPError as error:
+        raise FileFormatError(f"{path}: its robot or contacts cannot be used: {error}") from error

@@ -1,0 +1,291 @@
+import copy
+import dataclasses
+import json
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.data.samples import NAMES, arrays, assert_equal, columns, complete, dataset, system
+
+from forcegp.data import REVOLUTE_UNITS, Dataset, units_for
+from forcegp.errors import DatasetError, InvalidInput
+
+# ---------------------------------------------------------------- what it holds
+
+
+def test_arrays_are_private_float64_contiguous_and_read_only():
+    given = {name: np.asfortranarray(values) for name, values in columns().items()}
+    given["u"] = np.arange(80).reshape(40, 2)  # integers
+    data = dataset(**given)
+    before = {name: values.copy() for name, values in arrays(data).items()}
+    for values in given.values():
+        values[:] = 99
+    for name, values in arrays(complete()).items():
+        assert values.dtype == (np.int64 if name == "episode" else np.float64)
+        assert values.flags.c_contiguous
+        assert not values.flags.writeable
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 1
+    for name, values in arrays(data).items():
+        np.testing.assert_array_equal(values, before[name])
+
+
+def test_the_callers_arrays_stay_writable_and_unchanged():
+    given = columns()
+    kept = copy.deepcopy(given)
+    dataset(**given)
+    for name, values in given.items():
+        assert values.flags.writeable
+        np.testing.assert_array_equal(values, kept[name])
+
+
+def test_tensors_are_taken_as_arrays():
+    data = dataset(q=torch.ones(40, 2, dtype=torch.float64))
+    assert isinstance(data.q, np.ndarray)
+    with pytest.raises(DatasetError, match="q is not an array"):
+        dataset(q=torch.ones(40, 2, requires_grad=True))
+
+
+def test_fields_cannot_be_replaced_nor_mappings_changed():
+    data = complete()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        data.q = np.zeros((40, 2))  # type: ignore[misc]
+    for mapping in (data.units, data.truth, data.metadata, data.metadata["nested"]):
+        for change in (
+            lambda m: m.__setitem__("q", 1),
+            lambda m: m.pop("q"),
+            lambda m: m.update(q=1),
+            lambda m: m.clear(),
+            lambda m: m.setdefault("z", 1),
+            lambda m: m.__ior__({"z": 1}),
+        ):
+            with pytest.raises(TypeError, match="frozen"):
+                change(mapping)
+    assert data.metadata["nested"]["list"] == (1, 2.5, None, True)
+    assert json.loads(json.dumps(data.metadata))["nested"]["list"] == [1, 2.5, None, True]
+
+
+def test_metadata_is_a_copy():
+    given = {"list": [1]}
+    data = dataset(metadata=given)
+    given["list"].append(2)
+    assert data.metadata["list"] == (1,)
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda data: pickle.loads(pickle.dumps(data))])
+def test_copies_stay_frozen(again):
+    data = again(complete())
+    assert_equal(data, complete())
+    assert not any(values.flags.writeable for values in arrays(data).values())
+    with pytest.raises(TypeError, match="frozen"):
+        data.units["q"] = "deg"  # type: ignore[index]
+
+
+def test_length_names_and_a_short_text():
+    data = complete()
+    assert len(data) == 40
+    assert data.nv == 2
+    assert data.episodes == (0, 1)
+    assert dataset(episode=None).episodes == (0,)
+    assert "40 rows" in repr(data)
+    assert len(repr(data)) < 200
+
+
+# ---------------------------------------------------------------- what it refuses
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"q": np.zeros(40)}, r"q has shape \(40,\)"),
+        ({"q": np.zeros((40, 3))}, r"q has shape \(40, 3\); expected \(rows, 2\)"),
+        ({"v": np.zeros((39, 2))}, "v has 39 rows; expected 40"),
+        ({"time": np.zeros((40, 1))}, r"time has shape \(40, 1\)"),
+        ({"time": np.zeros(3)}, "time has 3 rows"),
+        ({"u": np.zeros((40, 2), dtype=complex)}, "u must be an array of real numbers"),
+        ({"u": np.full((40, 2), "a")}, "u must be an array of real numbers"),
+        ({"u": [[1.0, 2.0], [1.0]]}, "u is not an array of real numbers"),
+        ({"episode": np.zeros(40)}, "episode must be an array of integers"),
+        ({"episode": np.zeros(4, int)}, r"episode has shape \(4,\)"),
+        ({"joint_names": ("a", "a")}, "repeats"),
+        ({"joint_names": "ab"}, "sequence of non-empty texts"),
+        ({"joint_names": ("a", "")}, "sequence of non-empty texts"),
+        ({"joint_names": ()}, "at least one joint"),
+        ({"noise_std": np.array([0.1, 0.0])}, "'elbow' is 0.0; it must be > 0"),
+        ({"noise_std": np.array([0.1])}, "noise_std has 1 joints; expected 2"),
+        ({"truth": {"force": np.zeros((40, 2))}}, "truth has no"),
+        ({"truth": {"a": np.zeros((40, 3))}}, r"truth\['a'\] has shape"),
+        ({"truth": {"lambda": np.zeros((39, 1))}}, r"truth\['lambda'\] has 39 rows"),
+        ({"metadata": {"x": float("nan")}}, "metadata cannot be written as JSON"),
+        ({"metadata": {"x": np.zeros(2)}}, "metadata cannot be written as JSON"),
+        ({"metadata": {"x": {1: 2}}}, "key 1 is not text"),
+    ],
+)
+def test_wrong_fields_are_named(changes, message):
+    with pytest.raises(DatasetError, match=message):
+        dataset(**changes)
+
+
+def test_no_rows_is_an_error():
+    with pytest.raises(DatasetError, match="q has no rows"):
+        dataset(rows=0)
+
+
+@given(
+    st.sampled_from(["q", "v", "u", "a"]),
+    st.integers(0, 39),
+    st.integers(0, 1),
+    st.sampled_from([np.nan, np.inf, -np.inf]),
+)
+def test_the_row_and_column_of_a_bad_number_are_named(name, row, column, value):
+    given = columns()
+    given[name][row, column] = value
+    with pytest.raises(DatasetError) as error:
+        dataset(**given)
+    assert str(error.value).startswith(f"{name} is {value} at row {row}, column {column} ({NAMES[column]})")
+
+
+def test_bad_numbers_elsewhere_are_named_too():
+    time = 0.01 * np.arange(40)
+    time[7] = np.nan
+    with pytest.raises(DatasetError, match="time is nan at row 7;"):
+        dataset(time=time)
+    multiplier = np.zeros((40, 2))
+    multiplier[3, 1] = np.inf
+    with pytest.raises(DatasetError, match="is inf at row 3, column 1;"):
+        dataset(truth={"lambda": multiplier})
+
+
+def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
+    time = 0.01 * np.arange(40)
+    dataset(time=np.r_[time[:20], time[:20]])
+    for wrong in (time[4], time[4] - 1.0):
+        broken = time.copy()
+        broken[5] = wrong
+        with pytest.raises(DatasetError, match=r"time does not increase at row 5 \(episode 0"):
+            dataset(time=broken)
+    interleaved = np.tile([0, 1], 20)
+    assert dataset(time=np.repeat(time[:20], 2), episode=interleaved).episodes == (0, 1)
+
+
+# ---------------------------------------------------------------- units and system
+
+
+@pytest.mark.parametrize(
+    ("units", "message"),
+    [
+        ({}, "must name exactly"),
+        ({**REVOLUTE_UNITS, "force": "N"}, "must name exactly"),
+        ({**REVOLUTE_UNITS, "q": "deg"}, "deg.*Convert"),
+        ({**REVOLUTE_UNITS, "q": "m"}, "joint 'shoulder' has units"),
+        ({**REVOLUTE_UNITS, "time": "ms"}, "only 's'"),
+        ({**REVOLUTE_UNITS, "q": ("rad",)}, "one text or 2 of them"),
+    ],
+)
+def test_units_that_do_not_fit_are_refused(units, message):
+    with pytest.raises(DatasetError, match=message):
+        dataset(units=units)
+
+
+def test_units_may_differ_between_joints():
+    units = {
+        "q": ("rad", "m"),
+        "v": ("rad/s", "m/s"),
+        "u": ("Nm", "N"),
+        "a": ("rad/s^2", "m/s^2"),
+        "time": "s",
+    }
+    assert dataset(units=units).units == units
+    assert units_for(system("prismatic").robot) == units
+    assert units_for(system().robot) == REVOLUTE_UNITS
+
+
+def test_equal_units_per_joint_become_one_text():
+    assert dataset(units={**REVOLUTE_UNITS, "q": ["rad", "rad"]}).units == REVOLUTE_UNITS
+
+
+def test_a_system_must_have_the_same_joints_and_units():
+    assert dataset(system=system()).system is not None
+    with pytest.raises(DatasetError, match="in the robot's order"):
+        dataset(system=system(), joint_names=("elbow", "shoulder"))
+    with pytest.raises(DatasetError, match="joint types of 'slider'"):
+        dataset(system=system("prismatic"))
+    with pytest.raises(DatasetError, match="3 columns; the system has 0 contacts"):
+        dataset(system=system(), truth={"lambda": np.zeros((40, 3))})
+
+
+# ---------------------------------------------------------------- choosing rows
+
+
+def test_rows_by_slice_mask_and_numbers():
+    data = complete()
+    mask = data.q[:, 0] > 0
+    assert_equal(data.rows(mask), data.rows(np.flatnonzero(mask)))
+    assert_equal(data.rows(slice(3, 9, 2)), data.rows([3, 5, 7]))
+    assert_equal(data.rows([-1]), data.rows([39]))
+    part = data.rows([5, 3])
+    np.testing.assert_array_equal(part.q, data.q[[5, 3]])
+    np.testing.assert_array_equal(part.truth["lambda"], data.truth["lambda"][[5, 3]])
+    np.testing.assert_array_equal(part.noise_std, data.noise_std)
+
+
+def test_rows_out_of_order_are_marked_and_may_be_sorted_again():
+    data = dataset()
+    sample = data.rows([11, 2, 30])
+    assert not sample.time_ordered
+    assert sample.rows(np.argsort(sample.time)).time_ordered
+    with pytest.raises(DatasetError, match="does not increase"):
+        dataclasses.replace(sample, time_ordered=True)
+    with pytest.raises(DatasetError, match="occurs twice in episode 0"):
+        dataset(time=np.zeros(40), time_ordered=False)
+
+
+@pytest.mark.parametrize(
+    ("index", "message"),
+    [
+        ([40], "row 40 does not exist"),
+        ([-41], "row -41 does not exist"),
+        ([1, 1], "row 1 is selected more than once"),
+        ([1, -39], "row 1 is selected more than once"),
+        ([], "no rows selected"),
+        (slice(0, 0), "no rows selected"),
+        (np.zeros(40, bool), "no rows selected"),
+        (np.ones(39, bool), "rows are chosen by"),
+        (np.array([0.5]), "rows are chosen by"),
+    ],
+)
+def test_rows_that_do_not_exist_are_named(index, message):
+    with pytest.raises(InvalidInput, match=message):
+        dataset().rows(index)
+
+
+@given(st.permutations(range(12)))
+def test_rows_in_any_order_keep_rows_together(order):
+    data = dataset(12)
+    shuffled = data.rows(list(order))
+    assert_equal(shuffled.rows(np.argsort(order)), data)
+
+
+def test_episodes_are_selected_whole():
+    data = dataset(episode=np.repeat([7, 3, 5, 9], 10))
+    assert data.episodes == (7, 3, 5, 9)
+    assert data.select_episodes([5, 7]).episodes == (7, 5)
+    train, test = data.split_by_episode([3])
+    assert train.episodes == (7, 5, 9)
+    assert test.episodes == (3,)
+    assert len(train) + len(test) == len(data)
+    with pytest.raises(InvalidInput, match=r"no episodes \[4\]; this Dataset has \[7, 3, 5, 9\]"):
+        data.select_episodes([4])
+    with pytest.raises(InvalidInput, match="none asked for"):
+        data.select_episodes([])
+    with pytest.raises(InvalidInput, match="none is left to train on"):
+        data.split_by_episode([7, 3, 5, 9])
+
+
+def test_the_class_is_public():
+    import forcegp
+
+    assert forcegp.Dataset is Dataset

@@ -1,0 +1,235 @@
+import dataclasses
+import inspect
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.data.samples import arrays, dataset
+
+from forcegp.data import (
+    REVOLUTE_UNITS,
+    Dataset,
+    differentiate,
+    differentiated,
+    low_pass,
+    resample,
+    uniform_step,
+    zero_phase_low_pass,
+)
+from forcegp.errors import DatasetError, InvalidInput
+
+RATE = 1000.0
+TIME = np.arange(2000) / RATE
+INNER = slice(500, 1500)  # away from the transients of the ends
+
+
+def motion(time: np.ndarray = TIME, **changes: object) -> Dataset:
+    """q = (sin 10 t, t^2), with exact derivatives."""
+    fields = {
+        "q": np.stack([np.sin(10 * time), time**2], 1),
+        "v": np.stack([10 * np.cos(10 * time), 2 * time], 1),
+        "a": np.stack([-100 * np.sin(10 * time), np.full_like(time, 2)], 1),
+        "u": np.stack([np.cos(time), np.sin(time)], 1),
+        "time": time,
+        "joint_names": ("one", "two"),
+        "units": REVOLUTE_UNITS,
+        **changes,
+    }
+    return Dataset(**fields)
+
+
+# ---------------------------------------------------------------- low-pass
+
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+@pytest.mark.parametrize("frequency", [5.0, 20.0, 40.0])
+def test_gain_is_butterworths_twice_and_phase_is_zero(order, frequency):
+    cutoff = 20.0
+    sine, cosine = np.sin(2 * np.pi * frequency * TIME), np.cos(2 * np.pi * frequency * TIME)
+    filtered = zero_phase_low_pass(sine[:, None], RATE, cutoff, order)[INNER, 0]
+    warped = np.tan(np.pi * frequency / RATE) / np.tan(np.pi * cutoff / RATE)
+    fit = np.linalg.lstsq(np.stack([sine[INNER], cosine[INNER]], 1), filtered, rcond=None)[0]
+    np.testing.assert_allclose(fit, [1 / (1 + warped ** (2 * order)), 0.0], atol=2e-6)
+
+
+def test_a_straight_line_passes():
+    line = np.stack([TIME, 3.0 - 2.0 * TIME], 1)
+    np.testing.assert_allclose(zero_phase_low_pass(line, RATE, 10.0), line, atol=1e-3)
+
+
+@given(st.floats(-5, 5), st.floats(-5, 5))
+def test_it_is_linear(one, two):
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(2, 60, 1))
+    together = zero_phase_low_pass(one * x + two * y, 100.0, 10.0)
+    apart = one * zero_phase_low_pass(x, 100.0, 10.0) + two * zero_phase_low_pass(y, 100.0, 10.0)
+    np.testing.assert_allclose(together, apart, atol=1e-10)
+
+
+def test_time_reversal_commutes():
+    x = np.random.default_rng(0).normal(size=(200, 2))
+    np.testing.assert_allclose(
+        zero_phase_low_pass(x[::-1], 100.0, 20.0)[50:150], zero_phase_low_pass(x, 100.0, 20.0)[::-1][50:150], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("cutoff", [50.0, 60.0, 0.0, -1.0, np.nan])
+def test_a_cutoff_beyond_half_the_sample_rate_is_refused(cutoff):
+    with pytest.raises(InvalidInput, match=r"below 50.0 Hz, half the sample rate"):
+        zero_phase_low_pass(np.zeros((100, 1)), 100.0, cutoff)
+
+
+@pytest.mark.parametrize(("rate", "order"), [(0.0, 4), (np.nan, 4), (100.0, 0), (100.0, 13)])
+def test_other_wrong_arguments_are_refused(rate, order):
+    with pytest.raises(InvalidInput):
+        zero_phase_low_pass(np.zeros((100, 1)), rate, 10.0, order)
+
+
+def test_too_few_rows_are_refused():
+    # Poles of the analogue filter of order 2: 2 pi f_c at 45 degrees; log(1000) / (2 pi 0.01 / sqrt(2)) = 155 rows.
+    zero_phase_low_pass(np.zeros((157, 1)), 1000.0, 10.0, 2)
+    with pytest.raises(DatasetError, match="154 rows are too few for a filter of order 2 with a cut-off at 10.0 Hz"):
+        zero_phase_low_pass(np.zeros((154, 1)), 1000.0, 10.0, 2)
+
+
+def test_episodes_are_filtered_apart():
+    data = dataset(80)
+    filtered = low_pass(data, 20.0)
+    for number in (0, 1):
+        alone = low_pass(data.select_episodes([number]), 20.0)
+        for name in ("q", "v", "u", "a"):
+            np.testing.assert_array_equal(getattr(alone, name), getattr(filtered.select_episodes([number]), name))
+
+
+def test_interleaved_episodes_keep_their_rows():
+    data = dataset(80)
+    order = np.argsort(np.arange(80) % 40, kind="stable")
+    np.testing.assert_array_equal(low_pass(data.rows(order), 20.0).v, low_pass(data, 20.0).v[order])
+
+
+def test_only_the_named_signals_change_and_the_noise_of_a_is_then_unknown():
+    data = dataset(80, noise_std=np.ones(2), truth={"a": np.zeros((80, 2))})
+    kept = {name: values.copy() for name, values in arrays(data).items()}
+    filtered = low_pass(data, 20.0, signals=("v", "u"))
+    np.testing.assert_array_equal(filtered.q, data.q)
+    np.testing.assert_array_equal(filtered.a, data.a)
+    assert np.abs(filtered.v - data.v).max() > 0.1
+    np.testing.assert_array_equal(filtered.noise_std, data.noise_std)
+    assert low_pass(data, 20.0, signals=("a",)).noise_std is None
+    for name, values in arrays(data).items():
+        np.testing.assert_array_equal(values, kept[name])
+
+
+def test_what_cannot_be_filtered_is_named():
+    data = dataset(80)
+    with pytest.raises(InvalidInput, match="below 50"):
+        low_pass(data, 51.0)
+    with pytest.raises(InvalidInput, match="allowed: one or more of q, v, u, a"):
+        low_pass(data, 10.0, signals=())
+    with pytest.raises(InvalidInput, match="allowed: one or more"):
+        inspect.unwrap(low_pass)(data, 10.0, signals=("time",))
+    with pytest.raises(DatasetError, match="episode 1: 12 rows are too few"):
+        low_pass(data.rows(slice(0, 52)), 10.0)
+    with pytest.raises(DatasetError, match="not in order of time"):
+        low_pass(data.rows([3, 1]), 10.0)
+    with pytest.raises(DatasetError, match=r"episode 0 is not sampled uniformly: the step after row 9 .*Resample"):
+        low_pass(data.rows(np.delete(np.arange(80), 10)), 10.0)
+
+
+def test_an_angle_that_wraps_is_refused():
+    time = np.arange(100) / 100
+    turning = motion(time, q=np.stack([(7 * time + np.pi) % (2 * np.pi) - np.pi, time], 1))
+    with pytest.raises(DatasetError, match=r"episode 0: q of joint 'one' jumps by more than pi after row 44.*unwrap"):
+        low_pass(turning, 10.0)
+    with pytest.raises(DatasetError, match="wraps"):
+        differentiated(turning, "q")
+    with pytest.raises(DatasetError, match="wraps"):
+        resample(turning, 0.02)
+    low_pass(turning, 10.0, signals=("v",))
+
+
+# ---------------------------------------------------------------- differentiation
+
+
+@given(st.lists(st.floats(0.001, 1.0), min_size=2, max_size=20), st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+def test_a_parabola_is_differentiated_exactly_whatever_the_steps(steps, coefficients):
+    time = np.concatenate([[0.0], np.cumsum(steps)])
+    c, b, a = coefficients
+    values = (a * time**2 + b * time + c)[:, None]
+    np.testing.assert_allclose(differentiate(values, time)[:, 0], 2 * a * time + b, atol=1e-8)
+
+
+def test_the_error_is_of_second_order():
+    def error(rows: int) -> float:
+        time = np.linspace(0, 1, rows)
+        return float(np.abs(differentiate(np.sin(5 * time)[:, None], time)[:, 0] - 5 * np.cos(5 * time)).max())
+
+    assert 3.6 < error(101) / error(201) < 4.4
+
+
+def test_derivatives_of_a_dataset():
+    exact = motion(noise_std=np.ones(2))
+    raw = dataclasses.replace(exact, v=np.ones((2000, 2)), a=np.ones((2000, 2)))
+    from_q = differentiated(raw, "q")
+    np.testing.assert_allclose(from_q.v, exact.v, atol=1e-3)
+    np.testing.assert_allclose(from_q.a[2:-2], exact.a[2:-2], atol=1e-2)
+    np.testing.assert_array_equal(from_q.q, exact.q)
+    assert from_q.noise_std is None
+    from_v = differentiated(dataclasses.replace(exact, a=np.ones((2000, 2))))
+    np.testing.assert_allclose(from_v.a, exact.a, atol=1e-2)
+    np.testing.assert_array_equal(from_v.v, exact.v)
+
+
+def test_derivatives_do_not_cross_episodes():
+    data = dataset(40)
+    joined = differentiated(data)
+    np.testing.assert_array_equal(joined.a[:20], differentiated(data.select_episodes([0])).a)
+
+
+def test_what_cannot_be_differentiated_is_named():
+    with pytest.raises(DatasetError, match="episode 1: 2 rows are too few to differentiate"):
+        differentiated(dataset(40).rows(slice(0, 22)))
+    with pytest.raises(InvalidInput, match="allowed: 'q'"):
+        inspect.unwrap(differentiated)(dataset(), "u")
+    with pytest.raises(DatasetError, match="increase strictly"):
+        differentiate(np.zeros((4, 1)), np.zeros(4))
+
+
+# ---------------------------------------------------------------- sampling
+
+
+def test_uniform_step():
+    assert uniform_step(TIME) == pytest.approx(1 / RATE)
+    jitter = 1e-3 * np.random.default_rng(0).uniform(-1, 1, len(TIME)) / RATE
+    assert uniform_step(TIME + jitter) == pytest.approx(1 / RATE, rel=1e-5)
+    with pytest.raises(DatasetError, match="this recording is not sampled uniformly"):
+        uniform_step(np.array([0.0, 1.0, 2.0, 3.1]))
+    with pytest.raises(DatasetError, match="at least 2"):
+        uniform_step(np.zeros(1))
+
+
+def test_resampling_of_uneven_rows():
+    rng = np.random.default_rng(0)
+    uneven = np.sort(rng.choice(TIME, 1000, replace=False))
+    even = resample(motion(uneven), 0.002)
+    exact = motion(even.time)
+    assert uniform_step(even.time) == pytest.approx(0.002)
+    np.testing.assert_allclose(even.q, exact.q, atol=1e-6)
+    np.testing.assert_allclose(even.v, exact.v, atol=1e-5)
+    low_pass(even, 50.0)  # what the error message promises
+
+
+def test_resampling_keeps_the_rows_where_the_step_fits():
+    data = dataset(40, time=np.tile(0.01 * np.arange(20), 2), noise_std=np.ones(2), truth={"a": np.zeros((40, 2))})
+    again = resample(data, 0.01)
+    np.testing.assert_allclose(again.q, data.q, atol=1e-12)
+    np.testing.assert_array_equal(again.episode, data.episode)
+    assert again.truth == {}
+    assert again.noise_std is None
+
+
+@pytest.mark.parametrize(("step", "message"), [(0.0, "must be > 0"), (np.inf, "must be > 0"), (1.0, "longer than ep")])
+def test_wrong_steps(step, message):
+    with pytest.raises(InvalidInput, match=message):
+        resample(dataset(), step)

@@ -1,0 +1,249 @@
+import dataclasses
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from tests.data.samples import assert_equal, complete, dataset, system
+
+from forcegp.data import Dataset
+from forcegp.errors import FileFormatError, InvalidInput
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    path = tmp_path / "log.h5"
+    complete().save(path)
+    return path
+
+
+def test_everything_comes_back(file):
+    assert_equal(Dataset.load(file), complete())
+    assert not Dataset.load(str(file)).q.flags.writeable
+
+
+def test_the_system_comes_back(tmp_path):
+    data = dataset(system=system())
+    data.save(tmp_path / "log.h5")
+    found = Dataset.load(tmp_path / "log.h5").system
+    assert found is not None
+    assert found.to_json() == system().to_json()
+
+
+def test_a_sample_out_of_order_and_units_per_joint_come_back(tmp_path):
+    units = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "u": ("Nm", "N"), "a": ("rad/s^2", "m/s^2"), "time": "s"}
+    data = dataset(units=units, truth={"lambda": np.zeros((40, 0))}).rows([9, 2, 30])
+    data.save(tmp_path / "log.h5")
+    assert_equal(Dataset.load(tmp_path / "log.h5"), data)
+
+
+@settings(max_examples=20)
+@given(hnp.arrays(np.float64, (3, 2), elements=st.floats(allow_nan=False, allow_infinity=False)))
+def test_every_finite_number_comes_back_bit_by_bit(tmp_path_factory, values):
+    path = tmp_path_factory.mktemp("bits") / "log.h5"
+    data = dataset(3, q=values, a=values[::-1])
+    data.save(path)
+    assert Dataset.load(path).q.tobytes() == data.q.tobytes()
+
+
+def test_equal_datasets_give_equal_bytes(file, tmp_path):
+    complete().save(tmp_path / "again.h5")
+    assert (tmp_path / "again.h5").read_bytes() == file.read_bytes()
+
+
+def test_saving_replaces_the_old_file(file):
+    dataset().save(file)
+    assert Dataset.load(file).noise_std is None
+
+
+class Interrupted(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_an_interrupted_save_leaves_what_was_there_and_nothing_else(tmp_path, exists):
+    path = tmp_path / "log.h5"
+    if exists:
+        complete().save(path)
+    before = path.read_bytes() if exists else None
+
+    class UnwritableSystem:  # the system is written last, when the rest is on the disk
+        robot = system().robot
+        contacts = ()
+
+        def to_json(self) -> str:
+            assert len(list(tmp_path.iterdir())) == exists + 1
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        dataset(system=UnwritableSystem()).save(path)
+    assert [item.name for item in tmp_path.iterdir()] == (["log.h5"] if exists else [])
+    assert not exists or path.read_bytes() == before
+
+
+def test_saving_needs_a_folder(tmp_path):
+    with pytest.raises(InvalidInput, match="does not exist; create it first"):
+        dataset().save(tmp_path / "nowhere" / "log.h5")
+    with pytest.raises(InvalidInput, match="it is a folder"):
+        dataset().save(tmp_path)
+
+
+# ---------------------------------------------------------------- files that cannot be read
+
+
+def test_what_is_no_dataset_is_said(tmp_path):
+    with pytest.raises(FileFormatError, match="is not a file"):
+        Dataset.load(tmp_path / "absent.h5")
+    with pytest.raises(FileFormatError, match="is not a file"):
+        Dataset.load(tmp_path)
+    text = tmp_path / "log.csv"
+    text.write_text("q,v\n1,2\n")
+    with pytest.raises(FileFormatError, match="is not an HDF5 file"):
+        Dataset.load(text)
+    text.write_bytes(b"")
+    with pytest.raises(FileFormatError, match="is not an HDF5 file"):
+        Dataset.load(text)
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["q"] = np.zeros(3)
+    with pytest.raises(FileFormatError, match="not a forcegp dataset"):
+        Dataset.load(tmp_path / "other.h5")
+
+
+def change(file: Path, name: str, values: object = None) -> None:
+    """Delete a dataset, or put another in its place; keeps the attributes."""
+    with h5py.File(file, "a") as opened:
+        attributes = dict(opened[name].attrs)
+        del opened[name]
+        if values is not None:
+            opened[name] = values
+            opened[name].attrs.update(attributes)
+
+
+@pytest.mark.parametrize("version", [2, 1000])
+def test_a_newer_version_is_refused(file, version):
+    with h5py.File(file, "a") as opened:
+        opened.attrs["format_version"] = version
+    with pytest.raises(FileFormatError, match=rf"format version {version}; this forcegp .* reads up to 1. Upgrade"):
+        Dataset.load(file)
+
+
+@pytest.mark.parametrize("version", [0, -1, "one", 1.5])
+def test_a_version_that_is_none_is_refused(file, version):
+    with h5py.File(file, "a") as opened:
+        opened.attrs["format_version"] = version
+    with pytest.raises(FileFormatError, match="no valid 'format_version'"):
+        Dataset.load(file)
+
+
+@pytest.mark.parametrize("name", ["q", "v", "u", "a", "time", "episode", "joint_names", "metadata"])
+def test_a_missing_field_is_named(file, name):
+    change(file, name)
+    with pytest.raises(FileFormatError, match=rf"log.h5 has no {name}; a dataset needs"):
+        Dataset.load(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("q", np.zeros((4, 2)), "not valid: v has 40 rows"),
+        ("q", np.full((40, 2), np.nan), "not valid: q is nan at row 0"),
+        ("q", np.full((40, 2), b"x"), "'q' must hold numbers"),
+        ("episode", np.zeros(40), "episode must be an array of integers"),
+        ("joint_names", np.zeros(2), "'joint_names' must hold text"),
+        ("joint_names", ["a"], r"q has shape \(40, 2\)"),
+        ("metadata", "{", "is damaged"),
+        ("metadata", "[1]", "must be a JSON object"),
+        ("metadata", ["{}", "{}"], "must hold one text"),
+        ("truth/a", np.zeros((40, 9)), r"truth\['a'\] has shape"),
+        ("truth", np.zeros(3), "'truth' must be a group"),
+        ("noise_std", -np.ones(2), "noise_std of joint 'shoulder' is -1.0"),
+    ],
+)
+def test_wrong_contents_are_named(file, name, values, message):
+    change(file, name, values)
+    with pytest.raises(FileFormatError, match=message) as error:
+        Dataset.load(file)
+    assert str(file) in str(error.value)
+
+
+def test_a_quantity_without_units_is_refused(file):
+    with h5py.File(file, "a") as opened:
+        del opened["v"].attrs["units"]
+    with pytest.raises(FileFormatError, match="'v' has no attribute 'units'"):
+        Dataset.load(file)
+
+
+def test_a_system_that_cannot_be_used_is_refused(file):
+    with h5py.File(file, "a") as opened:
+        opened["system"] = "{}"
+    with pytest.raises(FileFormatError, match=r"log\.h5"):
+        Dataset.load(file)
+
+
+def test_nothing_outside_the_file_is_read(file, tmp_path):
+    np.zeros((40, 2)).tofile(tmp_path / "secret")
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["q"] = np.zeros((40, 2))
+    for make in (
+        lambda opened: opened.__setitem__("q", h5py.ExternalLink(str(tmp_path / "other.h5"), "/q")),
+        lambda opened: opened.__setitem__("q", h5py.SoftLink("/v")),
+        lambda opened: opened.create_dataset("q", (40, 2), "f8", external=str(tmp_path / "secret")),
+        lambda opened: opened.create_group("q"),
+    ):
+        with h5py.File(file, "a") as opened:
+            del opened["q"]
+            make(opened)
+        with pytest.raises(FileFormatError, match="'q' must be a dataset stored in this file"):
+            Dataset.load(file)
+
+
+def test_a_shape_that_the_file_does_not_hold_is_refused_before_memory_is_taken(file):
+    with h5py.File(file, "a") as opened:
+        del opened["q"]
+        opened.create_dataset("q", (10**13, 2), "f8", chunks=(1024, 2))
+        opened["q"].attrs["units"] = "rad"
+    with pytest.raises(FileFormatError, match="claims the shape"):
+        Dataset.load(file)
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_damaged_bytes_raise_or_load_something_valid(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("damage")
+    complete(5).save(folder / "log.h5")
+    content = bytearray((folder / "log.h5").read_bytes())
+    if data.draw(st.booleans(), label="cut"):
+        del content[data.draw(st.integers(0, len(content) - 1)) :]
+    else:
+        for _ in range(data.draw(st.integers(1, 8))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    (folder / "log.h5").write_bytes(content)
+    try:
+        loaded = Dataset.load(folder / "log.h5")
+    except FileFormatError:
+        return
+    dataclasses.replace(loaded)  # checks every field again
+
+
+# ---------------------------------------------------------------- docs/data-format.md
+
+
+def test_the_example_in_the_docs_writes_a_file_that_loads(repository, tmp_path, monkeypatch):
+    text = (repository / "docs/data-format.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    monkeypatch.chdir(tmp_path)
+    values = dataset()
+    exec(code, {"q": values.q, "v": values.v, "u": values.u, "a": values.a, "t": values.time})
+    assert_equal(Dataset.load("log.h5"), dataset(episode=None))
+
+
+def test_every_stored_name_is_in_the_docs(repository, file):
+    text = (repository / "docs/data-format.md").read_text(encoding="utf-8")
+    with h5py.File(file, "r") as opened:
+        names = [*opened.attrs]
+        opened.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    assert all(f"`{name}`" in text for name in [*names, "system"]), names
