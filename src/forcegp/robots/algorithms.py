@@ -1,17 +1,20 @@
 """Rigid-body algorithms as pure functions of batched tensors, in world axes about the world's origin.
 
-A twist is the 3x4 matrix ``[[w]x, v]`` (the upper rows of an element of se(3)), with ``w`` the angular velocity and ``v`` the
-velocity of the body point that passes the origin. The pseudo-inertia of a body in the world is ``P_w = T P T^T``. With both,
+A twist is the 3x4 matrix ``[[w]x, v]`` (the upper rows of an element of se(3)), with ``w`` the angular velocity and
+``v`` the velocity of the body point that passes the origin. The pseudo-inertia of a body in the world is
+``P_w = T P T^T``. With both,
 
     M_ij   = < S_i, S_j P_c,j >      for joint i above or equal to joint j, P_c,j summed over what joint j moves
     tau_i  = < S_i, sum_k A_k P_k >  over the bodies k that joint i moves
 
-where <., .> is the sum of products of entries and ``A_k = T''_k T_k^-1`` the acceleration of body k. These are the composite
-rigid body and recursive Newton-Euler algorithms (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 5 and 6) with
-their recursions over the tree written as products with the (n, n) descendant matrix.
+where <., .> is the sum of products of entries and ``A_k = T''_k T_k^-1`` the acceleration of body k. These are the
+composite-rigid-body and recursive Newton-Euler algorithms (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6
+and 5) with their recursions over the tree written as products with the (n, n) descendant matrix.
 
-Joints lead: tensors over joints or bodies have shape (n, *batch, ...), so that those products are single matrix products.
-All functions are compositions of differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated
+Tensors over joints or bodies have shape (n, rows, columns, batch): joints lead, so that sums over the tree are single
+matrix products; the batch, flattened to one dimension, trails, so that products of thousands of 4x4 matrices are
+vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the batch in front).
+All functions compose differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated
 differentiation apply.
 """
 
@@ -25,114 +28,109 @@ from forcegp.errors import NumericalError
 from forcegp.robots.tree import Tree
 
 
-def body_poses(tree: Tree, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "n *batch 4 4"]:
+def product(
+    left: Float[Tensor, "*#joints rows inner #batch"], right: Float[Tensor, "*#joints inner columns #batch"]
+) -> Float[Tensor, "*joints rows columns batch"]:
+    """Matrix product with the batch in the last dimension."""
+    return (left.unsqueeze(-2) * right.unsqueeze(-4)).sum(-3)
+
+
+def over_tree(matrix: Float[Tensor, "n n"], values: Float[Tensor, "n rows columns batch"]) -> Tensor:
+    """``sum_k matrix[i, k] values[k]``."""
+    return (matrix @ values.flatten(1)).view_as(values)
+
+
+def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Float[Tensor, "n 4 4 batch"]:
     """Pose T of every body frame in the world."""
-    position = q.movedim(-1, 0)
-    features = [position.sin(), position.cos()] if tree.all_revolute else [position.sin(), position.cos(), position]
-    stacked = torch.stack(features, dim=-1)
-    batch = position.shape[1:]
-    local = torch.baddbmm(tree.rest, stacked.reshape(len(position), batch.numel(), len(features)), tree.motion)
-    local = local.reshape(*position.shape, 4, 4)
+    local = torch.addcmul(tree.rest, tree.sine, q.sin()[:, None, None])
+    local = torch.addcmul(local, tree.cosine, q.cos()[:, None, None])
+    if not tree.all_revolute:
+        local = torch.addcmul(local, tree.slide, q[:, None, None])
     pose = local[tree.levels[0].joints]
     laid = [pose]
     for level in tree.levels[1:]:
         above = pose if level.parents is None else pose[level.parents]
-        pose = above @ local[level.joints]
+        pose = product(above, local[level.joints])
         laid.append(pose)
     poses = torch.cat(laid)
     return poses if tree.order is None else poses[tree.order]
 
 
-def joint_twists(tree: Tree, poses: Float[Tensor, "n *batch 4 4"]) -> Float[Tensor, "n *batch 3 4"]:
-    """Twist S_i of each body per unit velocity of its joint."""
-    axis, point = poses[..., :3, 2], poses[..., :3, 3]
-    moment = torch.linalg.cross(point, axis)
-    if tree.all_revolute:
-        twist = torch.cat([axis, moment], dim=-1)
-    else:
-        revolute = tree.revolute.reshape(-1, *(1 for _ in poses.shape[1:-1]))
-        twist = torch.cat([revolute * axis, revolute * moment + (1.0 - revolute) * axis], dim=-1)
-    return (twist @ tree.twist_basis).unflatten(-1, (3, 4))
-
-
-def _over_joints(matrix: Tensor, values: Tensor) -> Tensor:
-    """``sum_k matrix[i, k] values[k]`` over the leading (joint) dimension."""
-    return (matrix @ values.flatten(1)).unflatten(1, values.shape[1:])
+def joint_twists(
+    tree: Tree, poses: Float[Tensor, "n 4 4 batch"]
+) -> tuple[Float[Tensor, "n 6 batch"], Float[Tensor, "n 3 4 batch"]]:
+    """Twist of each body per unit velocity of its joint, as a vector [w; v] and as the matrix S = [[w]x, v]."""
+    axis, point = poses[:, :3, 2], poses[:, :3, 3]
+    moment = torch.linalg.cross(point, axis, dim=1)
+    if not tree.all_revolute:
+        moment = tree.revolute * moment + (1.0 - tree.revolute) * axis
+        axis = tree.revolute * axis
+    vectors = torch.cat([axis, moment], dim=1)
+    return vectors, (tree.twist_basis @ vectors).unflatten(1, (3, 4))
 
 
 def body_accelerations(
     tree: Tree,
-    twists: Float[Tensor, "n *batch 3 4"],
-    v: Float[Tensor, "*batch n"] | None,
-    a: Float[Tensor, "*batch n"] | None = None,
-) -> Float[Tensor, "n *batch 3 4"]:
-    """Accelerations ``A = T'' T^-1`` of all bodies, without gravity; ``v`` or ``a`` of None are zero.
+    twists: Float[Tensor, "n 3 4 batch"],
+    v: Float[Tensor, "n batch"],
+    a: Float[Tensor, "n batch"] | None = None,
+) -> Float[Tensor, "n 3 4 batch"]:
+    """Accelerations ``A = T'' T^-1`` of all bodies, without gravity; ``a`` of None is zero.
 
-    With V the body's and V_p its parent body's twist, ``A = A_p + (V_p + V) S v + S a``: differentiating ``T' = V T`` twice
-    along a chain, the bracket and the squared terms collapse to that one product.
+    With V the body's and V_p its parent body's twist, ``A = A_p + (V_p + V) S v + S a``: differentiating ``T' = V T``
+    twice along a chain, the bracket and the squared terms collapse to that one product.
     """
-    step = None
-    if v is not None:
-        moving = twists * v.movedim(-1, 0)[..., None, None]
-        step = _over_joints(tree.velocity_sum, moving)[..., :3] @ moving
+    moving = twists * v[:, None, None]
+    step = product(over_tree(tree.velocity_sum, moving)[:, :, :3], moving)
     if a is not None:
-        driven = twists * a.movedim(-1, 0)[..., None, None]
-        step = driven if step is None else step + driven
-    return _over_joints(tree.descendants.mT, torch.zeros_like(twists) if step is None else step)
+        step = torch.addcmul(step, twists, a[:, None, None])
+    return over_tree(tree.ancestors, step)
 
 
 def world_inertias(
-    poses: Float[Tensor, "n *batch 4 4"], inertias: Float[Tensor, "n *bodies 4 4"]
-) -> Float[Tensor, "n *batch 4 4"]:
-    """Pseudo-inertias ``T P T^T``; ``inertias`` are (n, 4, 4), shared by the batch, or (n, *batch, 4, 4)."""
-    if inertias.dim() == 3:
-        half = (poses.flatten(1, -2) @ inertias).view_as(poses)
-    else:
-        half = poses @ inertias
-    return half @ poses.mT
-
-
-def composite_inertias(tree: Tree, inertias: Float[Tensor, "n *batch 4 4"]) -> Float[Tensor, "n *batch 4 4"]:
-    """Pseudo-inertia of everything that each joint moves."""
-    return _over_joints(tree.descendants, inertias)
+    poses: Float[Tensor, "n 4 4 batch"], inertias: Float[Tensor, "n 4 4 #batch"]
+) -> Float[Tensor, "n 4 4 batch"]:
+    """Pseudo-inertias ``T P T^T``."""
+    return product(product(poses, inertias), poses.transpose(1, 2))
 
 
 def mass_matrix(
-    tree: Tree, twists: Float[Tensor, "n *batch 3 4"], composite: Float[Tensor, "n *batch 4 4"]
-) -> Float[Tensor, "*batch n n"]:
+    tree: Tree,
+    vectors: Float[Tensor, "n 6 batch"],
+    twists: Float[Tensor, "n 3 4 batch"],
+    inertias: Float[Tensor, "n 4 4 batch"],
+) -> Float[Tensor, "batch n n"]:
     """Joint-space inertia matrix, armature included on the diagonal."""
-    momentum = (twists @ composite).flatten(-2).movedim(0, -2)
-    above = twists.flatten(-2).movedim(0, -2) @ momentum.mT
-    # right where the row's joint moves the column's body; elsewhere its transpose is, or neither (different branches)
-    out = torch.where(tree.descendants > 0, above, above.mT)
+    momenta = product(twists, over_tree(tree.descendants, inertias))
+    # <[[w]x, v], F> is the product of the vector [w; v] with these six combinations of the entries of F
+    momenta = tree.twist_basis.mT @ momenta.flatten(1, 2)
+    above = product(vectors, momenta.transpose(0, 1))
+    # right where the row's joint moves the column's body; elsewhere the transpose is, or neither on different branches
+    out = torch.where(tree.is_above, above, above.transpose(0, 1))
     if not tree.is_chain:
         out = out * tree.related
-    return out + torch.diag(tree.armature) if tree.has_armature else out
+    if tree.has_armature:
+        out = out + torch.diag(tree.armature)[..., None]
+    return out.movedim(-1, 0).contiguous()
 
 
 def joint_forces(
     tree: Tree,
-    twists: Float[Tensor, "n *batch 3 4"],
-    accelerations: Float[Tensor, "n *batch 3 4"],
-    inertias: Float[Tensor, "n *batch 4 4"],
-) -> Float[Tensor, "*batch n"]:
-    """Joint forces that accelerate the bodies so (without armature)."""
-    wrench = _over_joints(tree.descendants, accelerations @ inertias)
-    return (twists * wrench).sum((-2, -1)).movedim(0, -1)
+    twists: Float[Tensor, "n 3 4 batch"],
+    accelerations: Float[Tensor, "n 3 4 batch"],
+    inertias: Float[Tensor, "n 4 4 batch"],
+) -> Float[Tensor, "batch n"]:
+    """Joint forces under which the bodies accelerate so against gravity (without armature)."""
+    wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
+    return (twists * wrenches).sum((1, 2)).mT
 
 
 def gravity_forces(
-    tree: Tree, twists: Float[Tensor, "n *batch 3 4"], composite: Float[Tensor, "n *batch 4 4"]
-) -> Float[Tensor, "*batch n"]:
-    """Joint forces that hold the robot still: ``-g . (S_i P_c,i)`` with the first moment and mass in P's last column."""
-    lifted = (twists @ composite[..., 3:]).squeeze(-1)
-    return -(lifted @ tree.gravity).movedim(0, -1)
-
-
-def with_gravity(tree: Tree, accelerations: Float[Tensor, "n *batch 3 4"]) -> Float[Tensor, "n *batch 3 4"]:
-    """Accelerations relative to free fall."""
-    fall = torch.nn.functional.pad(tree.gravity[:, None], (3, 0))
-    return accelerations - fall
+    tree: Tree, twists: Float[Tensor, "n 3 4 batch"], inertias: Float[Tensor, "n 4 4 batch"]
+) -> Float[Tensor, "batch n"]:
+    """Joint forces that hold the robot still."""
+    first_moments = over_tree(tree.descendants, inertias[..., 3:, :])
+    return -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
 
 
 def solve_mass_matrix(mass: Float[Tensor, "*batch n n"], force: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
@@ -141,7 +139,7 @@ def solve_mass_matrix(mass: Float[Tensor, "*batch n n"], force: Float[Tensor, "*
         factor = torch.linalg.cholesky(mass)
     except torch.linalg.LinAlgError as error:
         raise NumericalError(
-            "the mass matrix is not positive definite: either q or the inertial parameters hold NaN or infinity, or a body's "
-            "mass lies on its joint axis alone; check the inputs, or give that joint armature."
+            "the mass matrix is not positive definite: either q or the inertial parameters hold NaN or infinity, or "
+            "all mass that a joint moves lies on its axis; check the inputs, or give that joint armature."
         ) from error
     return torch.cholesky_solve(force[..., None], factor).squeeze(-1)

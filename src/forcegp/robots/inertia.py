@@ -31,9 +31,9 @@ _PLACE[np.arange(10), [0, 5, 10, 1, 6, 2, 3, 7, 11, 15]] = 1.0
 def pseudo_inertia_factor(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
     """Upper-triangular ``U`` with ``P = U U^T`` from log-Cholesky parameters, differentiable.
 
-    ``U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]`` for parameters in the order
-    ``alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3`` (Rucker & Wensing, "Smooth parameterization of rigid-body inertia",
-    RA-L 2022). Mass is ``e^(2 alpha)`` and the centre of mass is ``t``.
+    ``U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]`` for parameters in the
+    order ``alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3`` (Rucker & Wensing, "Smooth parameterization of rigid-body
+    inertia", RA-L 2022). Mass is ``e^(2 alpha)`` and the centre of mass is ``t``.
     """
     place = torch.as_tensor(_PLACE, dtype=parameters.dtype, device=parameters.device)
     scale = parameters[..., :1].exp()
@@ -50,7 +50,7 @@ def pseudo_inertia_from_parameters(parameters: Float[Tensor, "*batch 10"]) -> Fl
 def physical_from_parameters(
     parameters: Float[Tensor, "*batch 10"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes) from log-Cholesky parameters, differentiable."""
+    """Mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes) of log-Cholesky parameters."""
     factor = pseudo_inertia_factor(parameters)
     mass = factor[..., 3, 3].square()
     upper = factor[..., :3, :3]
@@ -66,8 +66,8 @@ def parameters_from_physical(
 ) -> Float[Tensor, "*batch 10"]:
     """Log-Cholesky parameters of a mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes).
 
-    The inverse of :func:`physical_from_parameters`. Raises :class:`~forcegp.errors.InvalidInput` for a non-positive mass or
-    a pseudo-inertia that is not positive definite, for which no logarithm exists.
+    The inverse of :func:`physical_from_parameters`. Raises :class:`~forcegp.errors.InvalidInput` for a non-positive
+    mass or a pseudo-inertia that is not positive definite, for which no logarithm exists.
     """
     trace = inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     identity = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
@@ -76,8 +76,8 @@ def parameters_from_physical(
     lower, failed = torch.linalg.cholesky_ex(second_moment.flip(-2, -1))
     if bool((failed != 0).any()) or not bool((mass > 0).all()):
         raise InvalidInput(
-            "log-Cholesky parameters exist only for a positive mass and an inertia that satisfies the triangle inequality "
-            "strictly; give the body some thickness in every direction."
+            "log-Cholesky parameters exist only for a positive mass and an inertia that satisfies the triangle "
+            "inequality strictly; give the body some thickness in every direction."
         )
     upper = lower.flip(-2, -1)
     logs = upper.diagonal(dim1=-2, dim2=-1).log()
@@ -118,14 +118,14 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
 
 
 def log_cholesky_of_body(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, link: str) -> Tensor:
-    """Log-Cholesky parameters (10,) of one link; :class:`NonPhysicalInertia` where its mass distribution is degenerate."""
+    """Log-Cholesky parameters (10,) of a link; :class:`NonPhysicalInertia` where its mass is a line, plate or point."""
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] + moments[1] - moments[2] <= SINGULAR * moments.sum():
         raise NonPhysicalInertia(
             f"link {link!r} has a flat, line-like or point-like mass distribution (mass {mass:g} kg, principal moments "
-            f"{', '.join(f'{moment:.6g}' for moment in moments)} kg m^2), for which log-Cholesky parameters do not exist. "
-            "Its dynamics is fine; to make its inertia a parameter, give it some thickness in every direction so that the "
-            "two smaller principal moments add up to more than the largest."
+            f"{', '.join(f'{moment:.6g}' for moment in moments)} kg m^2), for which log-Cholesky parameters do not "
+            "exist. Its dynamics is fine; to make its inertia a parameter, give it some thickness in every direction "
+            "so that the two smaller principal moments add up to more than the largest."
         )
     return parameters_from_physical(
         torch.tensor(mass, dtype=torch.float64), torch.as_tensor(center_of_mass), torch.as_tensor(inertia)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -24,76 +23,78 @@ Point = Tensor | Sequence[float]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Body poses, joint twists and accelerations of ``robot`` at states (q, v); made by ``robot.kinematics(q, v)``.
+    """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
 
     All methods are differentiable in q, v and their arguments. ``inertials`` maps link names to log-Cholesky parameters
-    (..., 10); links not named keep the inertia of the URDF. Batch dimensions broadcast.
+    (..., 10); links not named keep the inertia of the URDF. Batch dimensions broadcast. Methods that need velocities
+    raise :class:`~forcegp.errors.InvalidInput` if the kinematics was made without.
+
+    The fields are internal: the batch is flattened and trails (see :mod:`forcegp.robots.algorithms`).
     """
 
     robot: Robot
-    q: Tensor  # (*batch, nv)
-    v: Tensor | None  # (*batch, nv), or None: only what needs no velocity
-    poses: Tensor  # (nv, *batch, 4, 4)
-    twists: Tensor  # (nv, *batch, 3, 4)
+    batch_shape: torch.Size
+    poses: Tensor  # (nv, 4, 4, batch)
+    vectors: Tensor  # (nv, 6, batch)
+    twists: Tensor  # (nv, 3, 4, batch)
+    v: Tensor | None  # (nv, batch)
+    accelerations: Tensor | None  # (nv, 3, 4, batch), at zero joint acceleration and without gravity
 
     @classmethod
     def of(cls, robot: Robot, q: Tensor, v: Tensor | None) -> Kinematics:
-        """Kinematics at checked and broadcast inputs."""
-        poses = algorithms.body_poses(robot.tree, q)
-        return cls(robot, q, v, poses, algorithms.joint_twists(robot.tree, poses))
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions of the states."""
-        return self.q.shape[:-1]
+        """Kinematics at checked q and v (*batch, nv) of equal shape."""
+        batch = q.shape[:-1]
+        poses = algorithms.body_poses(robot.tree, _columns(q, batch))
+        vectors, twists = algorithms.joint_twists(robot.tree, poses)
+        if v is None:
+            return cls(robot, batch, poses, vectors, twists, None, None)
+        v = _columns(v, batch)
+        return cls(robot, batch, poses, vectors, twists, v, algorithms.body_accelerations(robot.tree, twists, v))
 
     # ------------------------------------------------------------------ dynamics
 
     def mass_matrix(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         at, inertias = self._with_inertias(inertials)
-        return at._mass_matrix(inertias)
+        return at._rows(at._mass_matrix(inertias))
 
     def bias_forces(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: the tau that gives zero acceleration."""
         at, inertias = self._with_inertias(inertials)
-        return at._forces(at._bias_accelerations, inertias)
+        return at._rows(at._bias_forces(inertias))
 
     def mass_matrix_and_bias(
         self, inertials: Inertials | None = None
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """:meth:`mass_matrix` and :meth:`bias_forces` from the same inertias."""
         at, inertias = self._with_inertias(inertials)
-        return at._mass_matrix(inertias), at._forces(at._bias_accelerations, inertias)
+        return at._rows(at._mass_matrix(inertias)), at._rows(at._bias_forces(inertias))
 
     def gravity_forces(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
         at, inertias = self._with_inertias(inertials)
-        tree = self.robot.tree
-        return algorithms.gravity_forces(tree, at.twists, algorithms.composite_inertias(tree, inertias))
+        return at._rows(algorithms.gravity_forces(self.robot.tree, at.twists, inertias))
 
     def inverse_dynamics(
-        self, a: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+        self, a: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
         self.robot.check_input("a", a)
-        self._require_velocity("inverse_dynamics")
-        batch = broadcast_shapes(q=self.q, a=a)
-        states = self._expand(batch)
-        at, inertias = states._with_inertias(inertials)
-        a = a.expand(*at.batch_shape, -1)
-        tree = self.robot.tree
-        force = at._forces(algorithms.body_accelerations(tree, at.twists, at.v, a), inertias)
-        return force + tree.armature * a if tree.has_armature else force
+        at, inertias = self._expand(self._broadcast("a", a.shape[:-1]))._with_inertias(inertials)
+        _, v = at._moving("inverse_dynamics")
+        tree, a = self.robot.tree, _columns(a, at.batch_shape)
+        accelerations = algorithms.body_accelerations(tree, at.twists, v, a)
+        forces = algorithms.joint_forces(tree, at.twists, accelerations, inertias)
+        return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
     def forward_dynamics(
-        self, tau: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+        self, tau: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
         self.robot.check_input("tau", tau)
-        batch = broadcast_shapes(q=self.q, tau=tau)
-        mass, bias = self._expand(batch).mass_matrix_and_bias(inertials)
-        return algorithms.solve_mass_matrix(mass, tau - bias)
+        at, inertias = self._expand(self._broadcast("tau", tau.shape[:-1]))._with_inertias(inertials)
+        net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
+        return at._rows(algorithms.solve_mass_matrix(at._mass_matrix(inertias), net))
 
     # ------------------------------------------------------------------ frames
 
@@ -102,113 +103,102 @@ class Kinematics:
         body, offset = self.robot.frame(frame)
         if body == WORLD:
             return offset.expand(*self.batch_shape, 4, 4)
-        return self.poses[body] @ offset
+        return self._rows((algorithms.product(self.poses[body], offset[..., None])).movedim(-1, 0))
 
     def frame_jacobian(self, frame: str, point: Point | None = None) -> Float[Tensor, "... 6 nv"]:
-        """Jacobian (..., 6, nv), rows [linear; angular] in world axes, of a ``point`` (..., 3) fixed in ``frame`` (m)."""
-        body, position = self._world_point(frame, point)
+        """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
+        at, body, position = self._world_point(frame, point)
         if body == WORLD:
-            return torch.zeros(*position.shape[:-2], 6, self.robot.nv, dtype=self.q.dtype, device=self.q.device)
-        linear = (self.twists @ position).squeeze(-1)
-        # the angular velocity sits in [w]x at (2, 1), (0, 2), (1, 0)
-        angular = self.twists.flatten(-2)[..., [9, 2, 4]].expand_as(linear)
-        jacobian = torch.cat([linear, angular], dim=-1).movedim(0, -1)
-        return jacobian * self.robot.tree.descendants[:, body]
+            return self.twists.new_zeros(*at.batch_shape, 6, self.robot.nv)
+        linear = algorithms.product(at.twists, position)[:, :, 0]
+        jacobian = torch.cat([linear, at.vectors[:, :3]], dim=1)
+        reached = self.robot.tree.descendants[:, body, None, None]
+        return at._rows((jacobian * reached).permute(2, 1, 0).contiguous())
 
     def frame_bias_acceleration(self, frame: str, point: Point | None = None) -> Float[Tensor, "... 6"]:
-        """Classical acceleration (..., 6), [linear; angular], of a ``point`` fixed in ``frame`` at zero joint acceleration.
+        """Classical acceleration (..., 6) of a ``point`` fixed in ``frame`` at zero joint acceleration.
 
-        This is ``Jdot v`` for :meth:`frame_jacobian`, in m/s^2 and rad/s^2, without gravity.
+        This is ``Jdot v`` for :meth:`frame_jacobian`: [linear; angular], in m/s^2 and rad/s^2, without gravity.
         """
-        self._require_velocity("frame_bias_acceleration")
-        body, position = self._world_point(frame, point)
+        at, body, position = self._world_point(frame, point)
+        accelerations, _ = at._moving("frame_bias_acceleration")
         if body == WORLD:
-            return torch.zeros(*position.shape[:-2], 6, dtype=self.q.dtype, device=self.q.device)
-        acceleration = self._bias_accelerations[body]
-        linear = (acceleration @ position).squeeze(-1)
-        # A = [dw/dt]x + [w]x [w]x: the second is symmetric, so the angular part is the antisymmetric half
-        entries = acceleration.flatten(-2)
-        angular = 0.5 * (entries[..., [9, 2, 4]] - entries[..., [6, 8, 1]])
-        return torch.cat([linear, angular.expand_as(linear)], dim=-1)
+            return self.twists.new_zeros(*at.batch_shape, 6)
+        acceleration = accelerations[body]
+        linear = algorithms.product(acceleration, position)[:, 0]
+        # A = [dw/dt]x + [w]x [w]x, whose second part is symmetric: the basis reads dw/dt off the antisymmetric half
+        angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ acceleration.flatten(0, 1))
+        return at._rows(torch.cat([linear, angular]).mT)
 
     # ------------------------------------------------------------------ inside
 
-    @cached_property
-    def _bias_accelerations(self) -> Tensor:
-        self._require_velocity("bias_forces")
-        return algorithms.body_accelerations(self.robot.tree, self.twists, self.v)
+    def _rows(self, values: Tensor) -> Tensor:
+        """Give values (batch, ...) their batch dimensions back."""
+        return values.reshape(*self.batch_shape, *values.shape[1:])
 
-    def _require_velocity(self, what: str) -> None:
-        if self.v is None:
+    def _mass_matrix(self, inertias: Tensor) -> Tensor:
+        return algorithms.mass_matrix(self.robot.tree, self.vectors, self.twists, inertias)
+
+    def _bias_forces(self, inertias: Tensor) -> Tensor:
+        accelerations, _ = self._moving("bias_forces")
+        return algorithms.joint_forces(self.robot.tree, self.twists, accelerations, inertias)
+
+    def _moving(self, what: str) -> tuple[Tensor, Tensor]:
+        if self.accelerations is None or self.v is None:
             raise InvalidInput(f"{what} needs velocities; make the kinematics with robot.kinematics(q, v).")
-
-    @cached_property
-    def _nominal_inertias(self) -> Tensor:
-        return algorithms.world_inertias(self.poses, self.robot.tree.inertias)
+        return self.accelerations, self.v
 
     def _with_inertias(self, inertials: Inertials | None) -> tuple[Kinematics, Tensor]:
         """These states broadcast against the batch of ``inertials``, and the bodies' pseudo-inertias in the world."""
         if not inertials:
-            return self, self._nominal_inertias
-        inertias = self.robot.body_inertias(inertials)
-        if inertias.dim() == 3:
-            return self, algorithms.world_inertias(self.poses, inertias)
-        try:
-            batch = torch.broadcast_shapes(self.batch_shape, inertias.shape[1:-2])
-        except RuntimeError:
-            raise InvalidInput(
-                f"inertials have batch shape {tuple(inertias.shape[1:-2])} and the states {tuple(self.batch_shape)}, which do "
-                "not broadcast; make them equal, or 1 where one value serves all."
-            ) from None
-        at = self._expand(batch)
-        return at, algorithms.world_inertias(at.poses, _expand_batch(inertias, batch, 2))
+            return self, algorithms.world_inertias(self.poses, self.robot.tree.inertias)
+        inertias = self.robot.body_inertias(inertials)  # (nv, 4, 4, *batch)
+        batch = inertias.shape[3:]
+        if not batch:
+            return self, algorithms.world_inertias(self.poses, inertias[..., None])
+        at = self._expand(self._broadcast("inertials", batch))
+        return at, algorithms.world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
+
+    def _world_point(self, frame: str, point: Point | None) -> tuple[Kinematics, int, Tensor]:
+        """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
+        body, offset = self.robot.frame(frame)
+        at = self
+        if point is None:
+            local = offset[:, 3:, None]
+        else:
+            point = self.robot.check_point(point)
+            homogeneous = offset[:, :3] @ point[..., None] + offset[:, 3:]
+            if point.dim() == 1:
+                local = homogeneous[..., None]
+            else:
+                at = self._expand(self._broadcast("point", point.shape[:-1]))
+                local = _expand_trailing(homogeneous.movedim((-2, -1), (0, 1)), 2, at.batch_shape)
+        return at, body, local if body == WORLD else algorithms.product(at.poses[body], local)
+
+    def _broadcast(self, name: str, batch: torch.Size) -> torch.Size:
+        return broadcast_batch({"the states": self.batch_shape, name: batch})
 
     def _expand(self, batch: torch.Size) -> Kinematics:
         if batch == self.batch_shape:
             return self
-        wider = replace(
+
+        def wider(values: Tensor) -> Tensor:
+            lead = values.shape[:-1]
+            return _expand_trailing(values.reshape(*lead, *self.batch_shape), len(lead), batch)
+
+        return replace(
             self,
-            q=self.q.expand(*batch, -1),
-            v=None if self.v is None else self.v.expand(*batch, -1),
-            poses=_expand_batch(self.poses, batch, 2),
-            twists=_expand_batch(self.twists, batch, 2),
+            batch_shape=batch,
+            poses=wider(self.poses),
+            vectors=wider(self.vectors),
+            twists=wider(self.twists),
+            v=None if self.v is None else wider(self.v),
+            accelerations=None if self.accelerations is None else wider(self.accelerations),
         )
-        if "_bias_accelerations" in self.__dict__:
-            wider.__dict__["_bias_accelerations"] = _expand_batch(self._bias_accelerations, batch, 2)
-        return wider
-
-    def _mass_matrix(self, inertias: Tensor) -> Tensor:
-        tree = self.robot.tree
-        return algorithms.mass_matrix(tree, self.twists, algorithms.composite_inertias(tree, inertias))
-
-    def _forces(self, accelerations: Tensor, inertias: Tensor) -> Tensor:
-        tree = self.robot.tree
-        return algorithms.joint_forces(tree, self.twists, algorithms.with_gravity(tree, accelerations), inertias)
-
-    def _world_point(self, frame: str, point: Point | None) -> tuple[int, Tensor]:
-        """Body that carries ``frame``, and the homogeneous world position (..., 4, 1) of ``point``."""
-        body, offset = self.robot.frame(frame)
-        if point is None:
-            local = offset[:, 3:]
-        else:
-            point = self.robot.check_point(point)
-            local = offset @ torch.nn.functional.pad(point, (0, 1), value=1.0)[..., None]
-        if body == WORLD:
-            batch = torch.broadcast_shapes(self.batch_shape, local.shape[:-2])
-            return body, local.expand(*batch, 4, 1)
-        return body, self.poses[body] @ local
 
 
-def _expand_batch(values: Tensor, batch: torch.Size, trailing: int) -> Tensor:
-    """Broadcast the middle (batch) dimensions of a tensor over joints (n, *batch, trailing dimensions)."""
-    lead, tail = values.shape[:1], values.shape[-trailing:]
-    missing = len(batch) - (values.dim() - 1 - trailing)
-    return values.reshape(*lead, *(1 for _ in range(missing)), *values.shape[1:]).expand(*lead, *batch, *tail)
-
-
-def broadcast_shapes(**tensors: Tensor) -> torch.Size:
-    """Common batch shape of tensors (..., nv); :class:`~forcegp.errors.InvalidInput` where there is none."""
-    shapes = {name: tensor.shape[:-1] for name, tensor in tensors.items()}
+def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
+    """Common batch shape; :class:`~forcegp.errors.InvalidInput` where there is none."""
     try:
         return torch.broadcast_shapes(*shapes.values())
     except RuntimeError:
@@ -216,3 +206,18 @@ def broadcast_shapes(**tensors: Tensor) -> torch.Size:
         raise InvalidInput(
             f"batch shapes do not broadcast: {listed}; make them equal, or 1 where one value serves all."
         ) from None
+
+
+def _columns(values: Tensor, batch: torch.Size) -> Tensor:
+    """(..., nv) broadcast to (*batch, nv) -> (nv, flattened batch), contiguous."""
+    size = values.shape[-1]
+    if values.shape[:-1] != batch:
+        values = values.expand(*batch, size)
+    return values.reshape(batch.numel(), size).mT.contiguous()
+
+
+def _expand_trailing(values: Tensor, lead: int, batch: torch.Size) -> Tensor:
+    """Broadcast the batch dimensions that follow the first ``lead`` ones to ``batch``, and flatten them."""
+    head, own = values.shape[:lead], values.shape[lead:]
+    values = values.reshape(*head, *(1 for _ in range(len(batch) - len(own))), *own)
+    return values.expand(*head, *batch).reshape(*head, batch.numel())

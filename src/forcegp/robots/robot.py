@@ -18,7 +18,7 @@ from forcegp.robots.inertia import (
     physical_from_parameters,
     pseudo_inertia_factor,
 )
-from forcegp.robots.kinematics import Inertials, Kinematics, Point, broadcast_shapes
+from forcegp.robots.kinematics import Inertials, Kinematics, Point, broadcast_batch
 from forcegp.robots.tree import WORLD, Layout, Tree, body_inertias, check_inertias, compile_tree, lay_out
 from forcegp.robots.urdf import RobotDescription, parse_urdf, read_text
 
@@ -57,10 +57,11 @@ class Link:
 class Robot:
     """A fixed-base tree of revolute, continuous, prismatic and fixed joints. Make one with :meth:`from_urdf`.
 
-    Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any leading
-    batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth first, branches in
-    file order. Batch dimensions of all arguments broadcast. ``inertials`` maps names of moving links to log-Cholesky
-    parameters (..., 10) (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the URDF.
+    Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any
+    leading batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth
+    first, branches in file order. Batch dimensions of all arguments broadcast. ``inertials`` maps names of moving links
+    to log-Cholesky parameters (..., 10) (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the
+    URDF.
 
     Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
     :class:`~forcegp.errors.UnknownName`.
@@ -87,10 +88,11 @@ class Robot:
     ) -> Robot:
         """Read a URDF file.
 
-        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per joint or
-        by joint name; ``locked`` maps joint names to positions at which movable joints become fixed.
+        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
+        joint or by joint name; ``locked`` maps joint names to positions at which movable joints become fixed.
 
-        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, the link or joint, and the remedy.
+        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, the link or joint, and the
+        remedy.
         """
         return cls.from_urdf_text(read_text(path), source=str(path), gravity=gravity, armature=armature, locked=locked)
 
@@ -121,7 +123,7 @@ class Robot:
         return cls(description, layout, tree, text, locked, frames)
 
     def with_inertials(self, inertials: Inertials) -> Robot:
-        """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values only, no gradient)."""
+        """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
         text = self.urdf_text
         for name, parameters in inertials.items():
             self._require_moving(name)
@@ -232,7 +234,7 @@ class Robot:
         """Log-Cholesky parameters (10,) of the named links, to start an identification from.
 
         Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
-        :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points, whose parameters would be infinite.
+        :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
         """
         out = {}
         for name in links:
@@ -240,8 +242,8 @@ class Robot:
             inertial = self.description.links[name]
             if inertial is None or inertial.mass == 0.0:
                 raise InvalidInput(
-                    f"link {name!r} of {self.name} is a massless frame, so it has no inertial parameters; name the link that "
-                    "carries the mass, or give this one an <inertial> element."
+                    f"link {name!r} of {self.name} is a massless frame, so it has no inertial parameters; name the "
+                    "link that carries the mass, or give this one an <inertial> element."
                 )
             parameters = log_cholesky_of_body(inertial.mass, inertial.center_of_mass, inertial.inertia, link=name)
             out[name] = parameters.to(self.device)
@@ -260,13 +262,13 @@ class Robot:
     # ------------------------------------------------------------------ dynamics
 
     def kinematics(self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"] | None = None) -> Kinematics:
-        """One kinematics pass; ask the result for several quantities at the same states. ``v`` may be left out if unused."""
+        """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""
         self.check_input("q", q)
         if v is None:
             return Kinematics.of(self, q, None)
         self.check_input("v", v)
         if q.shape != v.shape:
-            batch = broadcast_shapes(q=q, v=v)
+            batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1]})
             q, v = q.expand(*batch, -1), v.expand(*batch, -1)
         return Kinematics.of(self, q, v)
 
@@ -326,7 +328,7 @@ class Robot:
     def frame_jacobian(
         self, q: Float[Tensor, "*#batch nv"], frame: str, point: Point | None = None
     ) -> Float[Tensor, "... 6 nv"]:
-        """Jacobian (..., 6, nv), rows [linear; angular] in world axes, of a ``point`` (..., 3) fixed in ``frame`` (m)."""
+        """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
 
     def frame_bias_acceleration(
@@ -336,7 +338,7 @@ class Robot:
         frame: str,
         point: Point | None = None,
     ) -> Float[Tensor, "... 6"]:
-        """Classical acceleration ``Jdot v`` (..., 6), [linear; angular], of a ``point`` fixed in ``frame``, without gravity."""
+        """Classical acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], no gravity."""
         return self.kinematics(q, v).frame_bias_acceleration(frame, point)
 
     # ------------------------------------------------------------------ checks shared with Kinematics
@@ -349,7 +351,7 @@ class Robot:
         return found
 
     def check_input(self, name: str, value: object) -> None:
-        """:class:`~forcegp.errors.InvalidInput` unless ``value`` is a float64 tensor (..., nv) on the robot's device."""
+        """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""
         self._check_tensor(name, value, self.nv, f"one value per joint of {self.name}")
 
     def check_point(self, point: Point) -> Float[Tensor, "*batch 3"]:
@@ -359,7 +361,7 @@ class Robot:
         self._check_tensor("point", point, 3, "x, y, z in m")
         return point
 
-    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv *batch 4 4"]:
+    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
         names = tuple(inertials)
         values = []
@@ -367,17 +369,12 @@ class Robot:
             self._check_parameters(name, inertials[name])
             values.append(inertials[name])
         base, offsets, bodies = self._merge_plan(names)
-        try:
-            parameters = torch.stack(torch.broadcast_tensors(*values) if len(values) > 1 else values)
-        except RuntimeError:
-            shapes = ", ".join(f"{name!r} {tuple(value.shape)}" for name, value in inertials.items())
-            raise InvalidInput(
-                f"batch shapes of inertials do not broadcast: {shapes}; make them equal, or 1."
-            ) from None
-        batch = parameters.shape[1:-1]
+        batch = broadcast_batch({f"inertials[{name!r}]": inertials[name].shape[:-1] for name in names})
+        parameters = torch.stack([value.expand(*batch, 10) for value in values])
         factor = offsets.reshape(len(names), *(1 for _ in batch), 4, 4) @ pseudo_inertia_factor(parameters)
-        given = (bodies @ (factor @ factor.mT).flatten(1)).unflatten(1, (*batch, 4, 4))
-        return base.reshape(self.nv, *(1 for _ in batch), 4, 4) + given
+        given = (factor @ factor.mT).movedim((-2, -1), (1, 2))
+        added = (bodies @ given.flatten(1)).unflatten(1, given.shape[1:])
+        return base.reshape(self.nv, 4, 4, *(1 for _ in batch)) + added
 
     def _merge_plan(self, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Bodies' pseudo-inertias without the named links, these links' offsets, and which body each belongs to."""
@@ -391,7 +388,8 @@ class Robot:
                 np.stack([place.offset for place in placements]),
                 bodies,
             )
-            self._merge_plans[names] = tuple(torch.as_tensor(part, device=self.device) for part in plan)
+            base, offsets, members = (torch.as_tensor(part, device=self.device) for part in plan)
+            self._merge_plans[names] = (base, offsets, members)
         return self._merge_plans[names]
 
     def _require_moving(self, link: str):
@@ -401,8 +399,8 @@ class Robot:
         if placement.body == WORLD:
             moving = ", ".join(name for name, place in self.layout.links.items() if place.body != WORLD)
             raise InvalidInput(
-                f"link {link!r} of {self.name} is fixed in the world, so its inertia never enters the dynamics and cannot be "
-                f"a parameter; name a moving link: {moving}"
+                f"link {link!r} of {self.name} is fixed in the world, so its inertia never enters the dynamics and "
+                f"cannot be a parameter; name a moving link: {moving}"
             )
         return placement
 

@@ -1,9 +1,9 @@
 """Compile a robot description into the constants of the rigid-body algorithms.
 
-Movable joints are numbered depth first, children in the order in which their joints stand in the file. (Pinocchio visits
-children alphabetically; map by joint name when comparing.) Each movable joint i moves *body* i: its child link and every
-link fixed to it. Body i's frame is the child link's frame turned so that its z axis is the joint axis, which makes every
-joint a rotation about or a translation along z.
+Movable joints are numbered depth first, children in the order in which their joints stand in the file. (Pinocchio
+visits children alphabetically; map by joint name when comparing.) Each movable joint i moves *body* i: its child link
+and every link fixed to it. Body i's frame is the child link's frame turned so that its z axis is the joint axis, which
+makes every joint a rotation about or a translation along z.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from forcegp.errors import (
     unknown_name_message,
 )
 from forcegp.robots.inertia import physical_objection, pseudo_inertia
-from forcegp.robots.spatial import inverse, rotation_about, rotation_of_z_onto, transform
+from forcegp.robots.spatial import inverse, rotation_about, rotation_of_z_onto, skew, transform
 from forcegp.robots.urdf import MOVABLE, InertialDescription, JointDescription, RobotDescription
 
 WORLD = -1
@@ -34,7 +34,7 @@ WORLD = -1
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a link sits: ``offset`` (4, 4) from the frame of its ``body`` (``WORLD``: fixed in the world) to the link's."""
+    """Pose ``offset`` (4, 4) of a link in the frame of the ``body`` that carries it (``WORLD``: fixed in the world)."""
 
     body: int
     offset: np.ndarray
@@ -47,35 +47,41 @@ class Level:
     joints: Tensor | slice
     parents: Tensor | None  # positions in the previous level; None where that is the whole level, in order
 
+    def to(self, device: torch.device) -> Level:
+        """The same level with its indices on another device."""
+        joints = self.joints if isinstance(self.joints, slice) else self.joints.to(device)
+        return Level(joints, None if self.parents is None else self.parents.to(device))
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """Constants of a kinematic tree with n movable joints, on one device. Index i is joint i and the body that it moves."""
+    """Constants of a tree with n movable joints, on one device. Index i is joint i and the body that it moves."""
 
-    rest: Tensor  # (n, 1, 16) and
-    motion: Tensor  # (n, k, 16): local transform = rest + [sin q, cos q, (q)] @ motion
+    rest: Tensor  # (n, 4, 4, 1) and the next three: local transform = rest + sin q sine + cos q cosine + q slide
+    sine: Tensor
+    cosine: Tensor
+    slide: Tensor
     levels: tuple[Level, ...]
     order: Tensor | None  # joint i's position when the levels are laid end to end; None where that is i
-    revolute: Tensor  # (n,) 1 for revolute and continuous joints, 0 for prismatic ones
+    revolute: Tensor  # (n, 1, 1): 1 for revolute and continuous joints, 0 for prismatic ones
     all_revolute: bool
     is_chain: bool
     descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i
-    related: Tensor  # (n, n): 1 where one of the two joints moves the other
-    velocity_sum: Tensor  # (n, n): 2 descendants^T - 1, body velocity plus that of the parent body
-    twist_basis: Tensor  # (6, 12): [w, v] -> row-major [[w]x, v]
-    inertias: Tensor  # (n, 4, 4) pseudo-inertias of the bodies, merged
+    ancestors: Tensor  # its transpose
+    is_above: Tensor  # (n, n, 1): descendants as truth values
+    related: Tensor  # (n, n, 1): 1 where one of the two joints moves the other
+    velocity_sum: Tensor  # (n, n): 2 ancestors - 1, body velocity plus that of the parent body
+    twist_basis: Tensor  # (12, 6): [w; v] -> [[w]x, v], row by row
+    inertias: Tensor  # (n, 4, 4, 1): pseudo-inertias of the bodies, merged
     gravity: Tensor  # (3,)
+    fall: Tensor  # (3, 4, 1): the acceleration T'' T^-1 of free fall
     armature: Tensor  # (n,)
     has_armature: bool
 
     def to(self, device: torch.device) -> Tree:
         """The same constants on another device."""
         moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
-        levels = tuple(
-            Level(*(part.to(device) if isinstance(part, Tensor) else part for part in (level.joints, level.parents)))
-            for level in self.levels
-        )
-        return replace(self, **moved, levels=levels)
+        return replace(self, **moved, levels=tuple(level.to(device) for level in self.levels))
 
 
 @dataclass(frozen=True)
@@ -122,8 +128,7 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
     by_name = {joint.name: joint for joint in description.joints}
     for name, position in locked.items():
         if name not in by_name:
-            owner = f"{description.source}"
-            raise UnknownJoint(unknown_name_message("joint", name, owner, by_name))
+            raise UnknownJoint(unknown_name_message("joint", name, description.source, by_name))
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
         if not np.isfinite(position):
@@ -131,8 +136,8 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
     for joint in description.joints:
         if joint.mimics is not None and joint.name not in locked:
             raise UnsupportedJoint(
-                f"{description.source}: joint {joint.name!r} mimics {joint.mimics!r}, which is not supported; lock it with "
-                f"locked={{{joint.name!r}: position}}, or remove its <mimic> element to move it independently."
+                f"{description.source}: joint {joint.name!r} mimics {joint.mimics!r}, which is not supported; lock it "
+                f"with locked={{{joint.name!r}: position}}, or remove its <mimic> element to move it independently."
             )
 
 
@@ -194,7 +199,7 @@ def body_inertias(description: RobotDescription, layout: Layout, links: Mapping[
 
 
 def check_inertias(description: RobotDescription, layout: Layout) -> None:
-    """Every moving link must be physically possible and every body must have mass; links fixed to the world are not asked."""
+    """Every moving link must be physically possible and every body have mass; links fixed in the world need not be."""
     mass = np.zeros(len(layout.joints))
     for name, placement in layout.links.items():
         inertial: InertialDescription | None = description.links[name]
@@ -214,8 +219,8 @@ def check_inertias(description: RobotDescription, layout: Layout) -> None:
             ]
             others = f" and the links fixed to it ({', '.join(map(repr, carried))})" if carried else ""
             raise MissingInertia(
-                f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no mass; add an "
-                f"<inertial> element, make the joint fixed, or lock it with locked={{{joint.name!r}: 0.0}}."
+                f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no mass; "
+                f"add an <inertial> element, make the joint fixed, or lock it with locked={{{joint.name!r}: 0.0}}."
             )
 
 
@@ -225,41 +230,51 @@ def compile_tree(
     """Batched constants for :mod:`forcegp.robots.algorithms`, on ``device``."""
     n = len(layout.joints)
     revolute = np.array([joint.type != "prismatic" for joint in layout.joints])
-    rest = np.zeros((n, 4, 4))
-    motion = np.zeros((n, 3, 4, 4))  # factors of sin q, cos q and q
+    rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
     descendants = np.eye(n)
     for i, (parent, origin) in enumerate(zip(layout.parents, layout.origins, strict=True)):
-        if revolute[i]:
-            rest[i, :, 2:] = origin[:, 2:]
-            motion[i, 0, :, 0], motion[i, 0, :, 1] = origin[:, 1], -origin[:, 0]
-            motion[i, 1, :, :2] = origin[:, :2]
-        else:
+        x, y, z, translation = origin.T
+        if revolute[i]:  # origin @ Rz(q)
+            rest[i].T[2:] = z, translation
+            sine[i].T[:2] = y, -x
+            cosine[i].T[:2] = x, y
+        else:  # origin @ translation by q along z
             rest[i] = origin
-            motion[i, 2, :, 3] = origin[:, 2]
+            slide[i].T[3] = z
         if parent != WORLD:
             descendants[:, i] += descendants[:, parent]
     twist_basis = np.zeros((6, 3, 4))
     for k, axis in enumerate(np.eye(3)):
-        twist_basis[k, :, :3] = np.cross(axis, np.eye(3)).T
+        twist_basis[k, :, :3] = skew(axis)
         twist_basis[3 + k, :, 3] = axis
-    levels, order = _levels(layout.parents, device)
-    as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array, dtype=np.float64), device=device)  # noqa: E731
+    fall = np.zeros((3, 4))
+    fall[:, 3] = gravity
     related = np.maximum(descendants, descendants.T)
+    levels, order = _levels(layout.parents, device)
+
+    def constant(array: np.ndarray) -> Tensor:
+        return torch.tensor(array, dtype=torch.float64, device=device)
+
     return Tree(
-        rest=as_tensor(rest.reshape(n, 1, 16)),
-        motion=as_tensor(motion.reshape(n, 3, 16)[:, : 2 if revolute.all() else 3]),
+        rest=constant(rest[..., None]),
+        sine=constant(sine[..., None]),
+        cosine=constant(cosine[..., None]),
+        slide=constant(slide[..., None]),
         levels=levels,
         order=order,
-        revolute=as_tensor(revolute),
+        revolute=constant(revolute[:, None, None]),
         all_revolute=bool(revolute.all()),
         is_chain=bool(related.all()),
-        descendants=as_tensor(descendants),
-        related=as_tensor(related),
-        velocity_sum=as_tensor(2.0 * descendants.T - np.eye(n)),
-        twist_basis=as_tensor(twist_basis.reshape(6, 12)),
-        inertias=as_tensor(body_inertias(description, layout, layout.links)),
-        gravity=as_tensor(gravity),
-        armature=as_tensor(armature),
+        descendants=constant(descendants),
+        ancestors=constant(descendants.T),
+        is_above=constant(descendants[..., None]) > 0,
+        related=constant(related[..., None]),
+        velocity_sum=constant(2.0 * descendants.T - np.eye(n)),
+        twist_basis=constant(twist_basis.reshape(6, 12).T),
+        inertias=constant(body_inertias(description, layout, layout.links)[..., None]),
+        gravity=constant(gravity),
+        fall=constant(fall[..., None]),
+        armature=constant(armature),
         has_armature=bool(armature.any()),
     )
 

@@ -1,7 +1,8 @@
 """Strict URDF reader: XML text -> plain description. Everything that could be silently wrong is an error.
 
-Format: http://wiki.ros.org/urdf/XML. Defaults are those of the format (origin: identity, axis: x); a missing ``<limit>``
-means no limit. Visual, collision, transmission, sensor and simulator elements are ignored (and kept when written back).
+Format: http://wiki.ros.org/urdf/XML. Defaults are those of the format (origin: identity, axis: x); a missing
+``<limit>`` means no limit. Visual, collision, transmission, sensor and simulator elements are ignored (and kept when
+written back).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class InertialDescription:
 
 @dataclass(frozen=True)
 class JointDescription:
-    """One ``<joint>``; ``origin`` (4, 4) places the joint in its parent link, ``axis`` is a unit vector in the joint frame."""
+    """One ``<joint>``; ``origin`` (4, 4) places it in its parent link, ``axis`` is a unit vector in the joint frame."""
 
     name: str
     type: str
@@ -153,8 +154,8 @@ def _parse_xml(text: str, source: str) -> Element:
         return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
     except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
         raise UnsafeXml(
-            f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust the "
-            "memory; no URDF needs them, remove the <!DOCTYPE ...> block."
+            f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
+            "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
         ) from None
     except ParseError as error:
         hint = ""

@@ -16,9 +16,9 @@ from forcegp.robots.urdf import declared_encoding
 def replace_inertial(
     text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
 ) -> str:
-    """URDF text with the ``<inertial>`` element of ``link`` replaced (or added), values printed so that they read back exactly.
+    """URDF text with the ``<inertial>`` element of ``link`` replaced or added, with digits that read back exactly.
 
-    ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, in the axes of the link frame.
+    ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, axes of the link frame.
     """
     data = text.encode("utf-8")
     spans = _find_link(data, link)
@@ -44,9 +44,9 @@ def write_text(text: str, path: Path) -> None:
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(text.encode(encoding))
-        os.replace(temporary, path)
+        Path(temporary).replace(path)
     except BaseException:
-        os.unlink(temporary)
+        Path(temporary).unlink()
         raise
 
 
