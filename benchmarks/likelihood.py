@@ -21,8 +21,9 @@ from pathlib import Path
 import torch
 from threadpoolctl import threadpool_limits
 
-from forcegp.inference.kernels import kernel_matrix, squared_exponential_kernel
+from forcegp.inference.kernels import kernel_matrix
 from forcegp.inference.likelihood import negative_log_likelihood
+from forcegp.priors.kernels import squared_exponential_kernel
 
 JOINTS, INPUTS = 7, 21
 

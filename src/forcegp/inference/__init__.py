@@ -1,0 +1,16 @@
+"""Exact Gaussian-process inference by deflation. Knows mixing vectors, kernels, noise and targets; nothing of robots."""
+
+from forcegp.inference.kernels import LatentKernels
+from forcegp.inference.likelihood import negative_log_likelihood
+from forcegp.inference.optimization import OptimizationResult, OptimizerOptions, best_of, minimize_objective
+from forcegp.inference.posterior import LatentPosterior
+
+__all__ = [
+    "LatentKernels",
+    "LatentPosterior",
+    "OptimizationResult",
+    "OptimizerOptions",
+    "best_of",
+    "minimize_objective",
+    "negative_log_likelihood",
+]

@@ -38,7 +38,7 @@ class CholeskyFactor:
 
     def solve(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         """T^-1 right."""
-        if right.device.type != "cpu":
+        if not _is_for_lapack(self.lower):
             return torch.cholesky_solve(right, self.lower)
         solution, _ = lapack.dpotrs(self.lower.numpy().T, right.numpy(), lower=0)
         return torch.from_numpy(solution)
@@ -49,7 +49,7 @@ class CholeskyFactor:
 
     def into_inverse(self) -> Float[Tensor, "n n"]:
         """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
-        if self.lower.device.type != "cpu":
+        if not _is_for_lapack(self.lower):
             return torch.cholesky_inverse(self.lower.tril_(), out=self.lower)
         # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a copy.
         inverse, info = lapack.dpotri(self.lower.numpy().T, lower=0, overwrite_c=1)
@@ -99,8 +99,13 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
     )
 
 
+def _is_for_lapack(matrix: Tensor) -> bool:
+    """Where scipy can work: on the CPU, and not on an empty matrix, which its LAPACK refuses."""
+    return matrix.device.type == "cpu" and matrix.numel() > 0
+
+
 def _cholesky_in_place(matrix: Float[Tensor, "n n"]) -> tuple[Float[Tensor, "n n"], bool]:
-    if matrix.device.type != "cpu":
+    if not _is_for_lapack(matrix):
         lower, info = torch.linalg.cholesky_ex(matrix)
         return lower, bool(info == 0) and bool(torch.isfinite(lower.diagonal()).all())
     factor, info = lapack.dpotrf(matrix.numpy().T, lower=0, clean=0, overwrite_a=1)

@@ -63,16 +63,22 @@ def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> D
 
     U_i comes from the singular value decomposition of W~_i. Points of lower rank than the largest keep orthonormal columns with zero
     rows in C_i, which is exact too. Not differentiable on its own: `deflated_negative_log_likelihood` carries the gradients, which do
-    not depend on the choice of basis.
+    not depend on the choice of basis. Raises NumericalError where W~ or y~ is not finite.
     """
     with torch.no_grad():
+        _require_finite(W_white, "the mixing vectors W", "check q, v, u and the contact geometry")
+        _require_finite(y_white, "the residuals y - m", "check the measured accelerations and the mean")
         U, singular, _ = torch.linalg.svd(W_white, full_matrices=False)
         largest = singular.amax(dim=-1, keepdim=True)
-        if not bool(torch.isfinite(largest).all()):
-            raise NumericalError("the mixing vectors W are not finite; check q, v, u and the contact geometry")
         rank = int((singular > RANK_TOLERANCE * largest).sum(-1).max()) if singular.numel() else 0
         U = U[..., :rank].contiguous()
         C = U.mT @ W_white
         t = (U.mT @ y_white[..., None])[..., 0]
         remainder = y_white - (U @ t[..., None])[..., 0]
     return Deflation(U, C, t, remainder)
+
+
+def _require_finite(values: Tensor, what: str, remedy: str) -> None:
+    finite = torch.isfinite(values)
+    if not bool(finite.all()):
+        raise NumericalError(f"{what} of row {int(torch.nonzero(~finite)[0, 0])} are not finite; {remedy}")

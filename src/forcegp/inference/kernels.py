@@ -7,40 +7,32 @@ one N x N by N x d product per latent and no N x N x d tensor; other kernels are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 
 import torch
-from gpytorch.constraints import Positive
 from gpytorch.kernels import Kernel, RBFKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
+from torch.func import functional_call
 from torch.utils.checkpoint import checkpoint
-
-
-def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outputscale: float | Tensor) -> ScaleKernel:
-    """A GPyTorch squared-exponential kernel with one length scale per input, both parameters optimised on a log scale.
-
-    `lengthscale` (scalar or (dimension,)) and `outputscale` (variance) are the start values.
-    """
-
-    def positive() -> Positive:
-        return Positive(transform=torch.exp, inv_transform=torch.log)
-
-    kernel = ScaleKernel(
-        RBFKernel(ard_num_dims=dimension, lengthscale_constraint=positive()), outputscale_constraint=positive()
-    ).double()
-    kernel.base_kernel.lengthscale = torch.as_tensor(lengthscale, dtype=torch.float64).expand(1, dimension)
-    kernel.outputscale = torch.as_tensor(outputscale, dtype=torch.float64)
-    return kernel
 
 
 def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N"]:
     """k(z_i, z_j), dense and differentiable in the kernel's parameters and in z."""
     if _is_squared_exponential(kernel):
         return _SquaredExponential.apply(z, kernel.base_kernel.lengthscale.reshape(-1), kernel.outputscale)
-    if torch.is_grad_enabled():
-        return checkpoint(lambda points: kernel(points, points).to_dense(), z, use_reentrant=False)
-    return kernel(z, z).to_dense()
+    if not torch.is_grad_enabled():
+        return kernel(z, z).to_dense()
+    dense = _DenseKernel(kernel)
+    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own ones back.
+    names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
+    return checkpoint(
+        lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
+        z,
+        *values,
+        use_reentrant=False,
+    )
 
 
 def kernel_cross(kernel: Kernel, z: Float[Tensor, "n d"], z_train: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
@@ -56,9 +48,45 @@ def kernel_diagonal(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n
     return kernel(z, z, diag=True)
 
 
-def kernel_matrices(kernels: Sequence[Kernel], features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
-    """One dense matrix per latent."""
-    return [kernel_matrix(kernel, z) for kernel, z in zip(kernels, features, strict=True)]
+class LatentKernels(torch.nn.Module):
+    """One GPyTorch kernel per latent; parameters are read and replaced as one dictionary of unconstrained tensors."""
+
+    def __init__(self, kernels: Iterable[Kernel]) -> None:
+        super().__init__()
+        self.kernels = torch.nn.ModuleList(kernels)
+
+    def forward(self, features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
+        """One dense matrix per latent."""
+        return [kernel_matrix(kernel, z) for kernel, z in zip(self.kernels, features, strict=True)]
+
+    def matrices(
+        self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
+    ) -> list[Float[Tensor, "N N"]]:
+        """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
+        return functional_call(self, {name: parameters[name] for name, _ in self.named_parameters()}, (features,))
+
+    def initial_parameters(self) -> dict[str, Tensor]:
+        """The unconstrained parameters by name, detached copies."""
+        return {name: value.detach().clone() for name, value in self.named_parameters()}
+
+    def at(self, parameters: Mapping[str, Tensor]) -> LatentKernels:
+        """A copy that holds `parameters`, without gradients; this one is not changed."""
+        copy = deepcopy(self)
+        for name, value in copy.named_parameters():
+            value.data = parameters[name].detach().clone().reshape(value.shape)
+            value.requires_grad_(False)
+        return copy
+
+
+class _DenseKernel(torch.nn.Module):
+    """A kernel whose call returns the dense matrix at once, so that `functional_call` covers the whole evaluation."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        super().__init__()
+        self.kernel = kernel
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.kernel(z, z).to_dense()
 
 
 def _is_squared_exponential(kernel: Kernel) -> bool:

@@ -126,9 +126,9 @@ class _DeflatedNLL(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
-        if upstream.requires_grad and torch.is_grad_enabled():
+        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
             raise NotImplementedError(
-                "the deflated likelihood has first derivatives only; use torch.autograd.functional on its gradient"
+                "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its gradient"
             )
         return tuple(None if g is None else upstream * g for g in ctx.gradients)
 
@@ -149,7 +149,7 @@ def _inverse_contractions(
         corner = rows[:, panel.start * rank :]
         lower = corner.tril()
         corner.copy_(lower + lower.tril(-1).mT)  # LAPACK leaves the upper triangle of the diagonal block unset
-        rows = rows.view(height, rank, -1) if rows.is_contiguous() else rows.reshape(height, rank, -1)
+        rows = rows.reshape(height, rank, panel.stop * rank)
         left = torch.bmm(C[i].mT, rows).view(height, latents, panel.stop, rank)  # C_i^T T^-1_ij
         if any(K_needed):
             contracted = torch.einsum("icjb,cjb->cij", left, C_by_latent[:, j])

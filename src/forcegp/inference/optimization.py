@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,9 @@ from forcegp.errors import FitError, InvalidInput, NumericalError
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
 ProgressCallback = Callable[[int, float], None]
+
+LINE_SEARCH_FAILED = 2
+"""scipy's L-BFGS-B: neither converged (0) nor stopped by a limit (1)."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,16 @@ class OptimizationResult:
 
 
 class _Search:
-    """Counts evaluations and remembers the best finite one, so that every failure can roll back to it."""
+    """Counts evaluations and remembers the best finite one, so that every failure can retreat to it."""
 
     def __init__(self, objective: Objective, initial: Mapping[str, Tensor]) -> None:
         self.objective = objective
         self.template = {name: value.detach().clone() for name, value in initial.items()}
         self.evaluations = 0
+        self.failures = 0
         self.best_value = np.inf
         self.best_point = self.flatten(self.template)
+        self.best_slope = np.zeros_like(self.best_point)
         self.cause: str | None = None
 
     def flatten(self, parameters: Mapping[str, Tensor]) -> np.ndarray:
@@ -75,27 +80,45 @@ class _Search:
             offset += value.numel()
         return parameters
 
-    def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Objective and gradient; a point that cannot be evaluated counts as +inf and its cause is kept."""
+    def evaluate(self, point: np.ndarray) -> tuple[float, np.ndarray] | None:
+        """Objective and gradient; None, with the cause kept, where they cannot be evaluated or are not finite."""
         self.evaluations += 1
         parameters = {name: value.requires_grad_() for name, value in self.unflatten(point).items()}
+        gradients: Sequence[Tensor | None] = [None] * len(parameters)
         try:
-            value = self.objective(parameters)
-            gradients = torch.autograd.grad(value, list(parameters.values()), allow_unused=True)
+            with torch.enable_grad():
+                value = self.objective(parameters)
+            if parameters and value.requires_grad:
+                gradients = torch.autograd.grad(value, list(parameters.values()), allow_unused=True)
         except (NumericalError, torch.linalg.LinAlgError) as error:
-            self.cause = str(error)
-            return np.inf, np.zeros_like(point)
+            return self._fail(str(error))
         filled = {
             name: torch.zeros_like(parameter) if gradient is None else gradient
             for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True)
         }
         number, slope = float(value.detach()), self.flatten(filled)
         if not (np.isfinite(number) and np.isfinite(slope).all()):
-            self.cause = "the objective or its gradient is not finite"
-            return np.inf, np.zeros_like(point)
+            return self._fail("the objective or its gradient is not finite")
         if number < self.best_value:
-            self.best_value, self.best_point = number, point.copy()
+            self.best_value, self.best_point, self.best_slope = number, point.copy(), slope
         return number, slope
+
+    def _fail(self, cause: str) -> None:
+        self.failures += 1
+        self.cause = cause
+
+    def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        """Objective and gradient for a line search.
+
+        Where they do not exist, a parabola about the best point stands in, which rises by as much as the objective was to fall: the line
+        search then shortens its step, and never accepts the point. (An infinite value would end the whole search.)
+        """
+        evaluated = self.evaluate(point)
+        if evaluated is not None:
+            return evaluated
+        step = point - self.best_point
+        rise = max(abs(float(self.best_slope @ step)), np.finfo(np.float64).eps * max(1.0, abs(self.best_value)))
+        return self.best_value + rise, 2.0 * rise * step / max(float(step @ step), np.finfo(np.float64).tiny)
 
 
 def minimize_objective(
@@ -106,8 +129,9 @@ def minimize_objective(
 ) -> OptimizationResult:
     """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed).
 
-    L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). A point where the objective cannot be evaluated makes the search
-    fall back to the best point seen and start again from there with an empty memory, twice at most; then it ends there and says why.
+    L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). Where the objective cannot be evaluated, the line search shortens its step.
+    If it finds none that helps, the search rolls back to the best point seen and starts again from there with an empty memory, twice at
+    most; then it ends there and says why.
     `progress(iteration, value)` is called after every iteration.
 
     Raises
@@ -118,10 +142,9 @@ def minimize_objective(
     options = options or OptimizerOptions()
     start_time = time.process_time()
     search = _Search(objective, initial)
-    first_value, _ = search(search.best_point)
-    if not np.isfinite(first_value):
+    if search.evaluate(search.best_point) is None:
         raise FitError(f"the marginal likelihood cannot be evaluated at the start values: {search.cause}")
-    history = [first_value]
+    history = [search.best_value]
 
     def record(value: float) -> None:
         history.append(value)
@@ -135,7 +158,7 @@ def minimize_objective(
     for _attempt in range(3):
         if remaining <= 0 or not search.best_point.size:
             break
-        search.cause = None
+        failures_before = search.failures
         result = minimize(
             search,
             search.best_point,
@@ -151,11 +174,13 @@ def minimize_objective(
             },
         )
         remaining -= int(result.nit)
-        converged = bool(result.success) and search.cause is None
+        converged = bool(result.success)
         status = str(result.message)
-        if search.cause is None:
+        if result.status != LINE_SEARCH_FAILED or search.failures == failures_before:
             break
-        status = f"rolled back to the best point after: {search.cause}"
+        status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
+    if search.failures:
+        status += f" ({search.failures} of {search.evaluations} evaluations failed, the last because {search.cause})"
     return OptimizationResult(
         parameters=search.unflatten(search.best_point),
         value=float(search.best_value),
@@ -172,9 +197,10 @@ def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float], 
     point = torch.as_tensor(search.best_point.copy()).requires_grad_()
     optimizer = torch.optim.Adam([point], lr=options.adam_rate)
     for _ in range(options.adam_steps):
-        value, slope = search(point.detach().numpy())
-        if not np.isfinite(value):
+        evaluated = search.evaluate(point.detach().numpy())
+        if evaluated is None:
             return
+        value, slope = evaluated
         point.grad = torch.as_tensor(slope)
         optimizer.step()
         record(value)

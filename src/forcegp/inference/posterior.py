@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.inference.deflation import deflate, whiten
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal, kernel_matrices
+from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
 from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
 
 BLOCK_BYTES = 64 * 2**20
@@ -22,14 +21,14 @@ BLOCK_BYTES = 64 * 2**20
 class LatentPosterior:
     """p(f_1(z_1), ..., f_C(z_C) | data), exact."""
 
-    kernels: tuple[Kernel, ...]
+    kernels: LatentKernels
     features: tuple[Float[Tensor, "N _"], ...]
     system: DeflatedSystem
 
     @classmethod
     def condition(
         cls,
-        kernels: Sequence[Kernel],
+        kernels: LatentKernels,
         features: Sequence[Float[Tensor, "N _"]],
         W: Float[Tensor, "N D C"],
         residual: Float[Tensor, "N D"],
@@ -38,15 +37,15 @@ class LatentPosterior:
         """Condition on residual = y - m with mixing W and noise variances or covariances (see `negative_log_likelihood`)."""
         with torch.no_grad():
             W_white, y_white, _ = whiten(W, residual, noise)
-            system = solve_deflated(deflate(W_white, y_white), kernel_matrices(kernels, features))
-        return cls(tuple(kernels), tuple(z.detach() for z in features), system)
+            system = solve_deflated(deflate(W_white, y_white), kernels(features))
+        return cls(kernels, tuple(z.detach() for z in features), system)
 
     def mean(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
         """E f_c = sum_j k_c(z, z_j) beta_jc (Rasmussen & Williams 2006, eq. 2.25); differentiable in the features."""
         beta = self.system.beta
         columns = [
             kernel_cross(kernel, z, z_train) @ beta[:, c]
-            for c, (kernel, z, z_train) in enumerate(zip(self.kernels, features, self.features, strict=True))
+            for c, (kernel, z, z_train) in enumerate(zip(self.kernels.kernels, features, self.features, strict=True))
         ]
         return torch.stack(columns, dim=-1)
 
@@ -65,9 +64,14 @@ class LatentPosterior:
         C = self.system.deflation.C
         count, rank, latents = C.shape
         cross = torch.stack(
-            [kernel_cross(k, z, z_train) for k, z, z_train in zip(self.kernels, features, self.features, strict=True)]
+            [
+                kernel_cross(k, z, z_train)
+                for k, z, z_train in zip(self.kernels.kernels, features, self.features, strict=True)
+            ]
         )
         V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, -1)
         V = self.system.factor.solve_lower(V).reshape(count * rank, latents, -1).permute(2, 1, 0)
-        prior = torch.stack([kernel_diagonal(k, z) for k, z in zip(self.kernels, features, strict=True)], dim=-1)
+        prior = torch.stack(
+            [kernel_diagonal(k, z) for k, z in zip(self.kernels.kernels, features, strict=True)], dim=-1
+        )
         return torch.diag_embed(prior) - V @ V.mT

@@ -10,6 +10,7 @@ from forcegp.mechanics.known_forces import (
     RigidBodyBias,
     ViscousJointFriction,
 )
+from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import Cylinder, ImplicitSurface, Plane, Sphere, Surface
 from forcegp.mechanics.system import MechanicalSystem
 
@@ -28,6 +29,7 @@ __all__ = [
     "Plane",
     "RigidBodyBias",
     "Sphere",
+    "State",
     "Surface",
     "ViscousJointFriction",
 ]

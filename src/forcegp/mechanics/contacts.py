@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
+from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import Surface
 from forcegp.robots import Kinematics
 
@@ -62,20 +63,20 @@ class Contact:
         return self.surface.value(self.position(kinematics))
 
     def constraint(
-        self, kinematics: Kinematics, baumgarte: Baumgarte | None
+        self, state: State, baumgarte: Baumgarte | None
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
         A = s_p J_p and b = -(s_p Jdot_p v + (J_p v)^T s_pp (J_p v)) - 2 zeta omega A v - omega^2 s: the second time derivative of s(p(q)) = 0
         (Rath et al. 2021, section 2).
         """
-        assert kinematics.v is not None
+        kinematics = state.kinematics
         p = self.position(kinematics)
         J = kinematics.frame_jacobian(self.frame, self.point)[..., :3, :]
         bias_acceleration = kinematics.frame_bias_acceleration(self.frame, self.point)[..., :3]
         gradient = self.surface.gradient(p)
         A = (gradient[..., None, :] @ J)[..., 0, :]
-        velocity = (J @ kinematics.v[..., None])[..., 0]
+        velocity = (J @ state.v[..., None])[..., 0]
         curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
         b = -((gradient * bias_acceleration).sum(-1) + curvature)
         if baumgarte is not None:

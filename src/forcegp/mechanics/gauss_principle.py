@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.robots import Kinematics
+from forcegp.mechanics.state import State
 
 REDUNDANCY_TOLERANCE = 1e-9
 """Singular values of A~ below this fraction of the largest belong to redundant constraints."""
@@ -38,11 +38,10 @@ class ConstrainedDynamics:
     """The dynamics at a batch of states, affine in the joint forces that are still unknown.
 
     `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_b`, `Q_K` (..., nv); `normals` (..., m, 3) are the surface gradients s_p, so that
-    the contact force on the robot in N is s_p^T lambda. `u` (..., nv) and `kinematics` are the states themselves.
+    the contact force on the robot in N is s_p^T lambda. `state` holds (q, v, u) themselves.
     """
 
-    kinematics: Kinematics
-    u: Float[Tensor, "*batch nv"]
+    state: State
     M: Float[Tensor, "*batch nv nv"]
     A: Float[Tensor, "*batch m nv"]
     b: Float[Tensor, "*batch m"]
@@ -57,8 +56,7 @@ class ConstrainedDynamics:
     @classmethod
     def from_constraint(
         cls,
-        kinematics: Kinematics,
-        u: Float[Tensor, "*batch nv"],
+        state: State,
         M: Float[Tensor, "*batch nv nv"],
         A: Float[Tensor, "*batch m nv"],
         b: Float[Tensor, "*batch m"],
@@ -84,7 +82,7 @@ class ConstrainedDynamics:
         white_offset = pseudo_inverse @ b[..., None]
         Q_b = (lower @ white_offset)[..., 0]
         offset = (inverse_lower.mT @ white_offset)[..., 0]
-        return cls(kinematics, u, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse)
+        return cls(state, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse)
 
     def acceleration_map(self, known: bool = True) -> AffineMap:
         """a = offset + H Q_U, with offset = M^-1 Q_b + H Q_K, or M^-1 Q_b alone when `known` is false (then Q_U must carry Q_K too)."""

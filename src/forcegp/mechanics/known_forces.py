@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint, unknown_name_message
-from forcegp.robots import Kinematics, Robot
+from forcegp.mechanics.state import State
+from forcegp.robots import Robot
 
 PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
 
@@ -27,9 +28,7 @@ class KnownForce(ABC):
     """Names of the fields with one non-negative number per joint."""
 
     @abstractmethod
-    def force(
-        self, kinematics: Kinematics, u: Float[Tensor, "*batch nv"], inertials: Mapping[str, Tensor] | None = None
-    ) -> Float[Tensor, "*#batch nv"]:
+    def force(self, state: State) -> Float[Tensor, "*#batch nv"]:
         """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""
 
     def added_inertia(self) -> Float[Tensor, "nv"] | None:
@@ -48,16 +47,16 @@ class KnownForce(ABC):
 class Actuation(KnownForce):
     """What the actuators deliver: u itself."""
 
-    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
-        return u
+    def force(self, state: State) -> Tensor:
+        return state.u
 
 
 @dataclass(frozen=True, eq=False)
 class RigidBodyBias(KnownForce):
     """Coriolis, centrifugal and gravity forces of the rigid bodies: -bias(q, v)."""
 
-    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
-        return -kinematics.bias_forces(inertials)
+    def force(self, state: State) -> Tensor:
+        return -state.kinematics.bias_forces(state.inertials)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +71,8 @@ class ViscousJointFriction(KnownForce):
         """The <dynamics damping> of the URDF."""
         return cls([joint.damping for joint in robot.joints])
 
-    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
-        assert kinematics.v is not None
-        return -self.coefficients * kinematics.v  # type: ignore[operator]
+    def force(self, state: State) -> Tensor:
+        return -self.coefficients * state.v  # type: ignore[operator]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +94,8 @@ class CoulombJointFriction(KnownForce):
             raise InvalidInput("CoulombJointFriction velocity_scale must be positive for every joint (rad/s or m/s).")
         return bound
 
-    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
-        assert kinematics.v is not None
-        return -self.coefficients * torch.tanh(kinematics.v / self.velocity_scale)  # type: ignore[operator]
+    def force(self, state: State) -> Tensor:
+        return -self.coefficients * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +105,8 @@ class Armature(KnownForce):
     inertia: PerJoint
     per_joint: ClassVar[tuple[str, ...]] = ("inertia",)
 
-    def force(self, kinematics: Kinematics, u: Tensor, inertials: Mapping[str, Tensor] | None = None) -> Tensor:
-        return torch.zeros_like(kinematics.q)
+    def force(self, state: State) -> Tensor:
+        return torch.zeros_like(state.q)
 
     def added_inertia(self) -> Tensor:
         return self.inertia  # type: ignore[return-value]

@@ -21,6 +21,7 @@ from forcegp.mechanics.known_forces import (
     known_force_from_dict,
     known_force_to_dict,
 )
+from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 from forcegp.robots import Robot
 
@@ -65,37 +66,26 @@ class MechanicalSystem:
 
         `inertials` maps link names to log-Cholesky parameters (..., 10). Contact points are kinematic: no inertial parameter moves them.
         """
-        self.robot.check_input("u", u)
-        kinematics = self.robot.kinematics(*torch.broadcast_tensors(q, v))
-        if u.shape != kinematics.q.shape:
-            batch = torch.broadcast_shapes(u.shape, kinematics.q.shape)
-            u = u.expand(batch)
-            kinematics = self.robot.kinematics(kinematics.q.expand(batch), v.expand(batch))
-        M = kinematics.mass_matrix(inertials)
-        Q_K = torch.zeros_like(kinematics.q)
+        state = State.of(self.robot, q, v, u, inertials)
+        M = state.kinematics.mass_matrix(inertials)
+        Q_K = torch.zeros_like(state.q)
         for force in self.known_forces:
-            Q_K = Q_K + force.force(kinematics, u, inertials)
+            Q_K = Q_K + force.force(state)
             inertia = force.added_inertia()
             if inertia is not None:
                 M = M + torch.diag_embed(inertia)
-        A, b, normals = self._constraint(kinematics)
+        A, b, normals = self._constraint(state)
         batch = M.shape[:-2]  # inertials may carry batch dimensions of their own
-        A, b, normals = (
-            part.expand(*batch, *part.shape[k:])
-            for part, k in ((A, A.dim() - 2), (b, b.dim() - 1), (normals, normals.dim() - 2))
-        )
-        return ConstrainedDynamics.from_constraint(kinematics, u, M, A, b, normals, Q_K)
+        A, normals = (part.expand(*batch, *part.shape[-2:]) for part in (A, normals))
+        return ConstrainedDynamics.from_constraint(state, M, A, b.expand(*batch, -1), normals, Q_K.expand(*batch, -1))
 
-    def _constraint(self, kinematics: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def _constraint(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
+        """A (..., m, nv), b (..., m) and the surface gradients (..., m, 3)."""
         if not self.contacts:
-            q = kinematics.q
-            return (
-                q.new_zeros(*q.shape[:-1], 0, q.shape[-1]),
-                q.new_zeros(*q.shape[:-1], 0),
-                q.new_zeros(*q.shape[:-1], 0, 3),
-            )
+            *batch, nv = state.q.shape
+            return state.q.new_zeros(*batch, 0, nv), state.q.new_zeros(*batch, 0), state.q.new_zeros(*batch, 0, 3)
         rows, right, normals = zip(
-            *(contact.constraint(kinematics, self.baumgarte) for contact in self.contacts), strict=True
+            *(contact.constraint(state, self.baumgarte) for contact in self.contacts), strict=True
         )
         return torch.stack(rows, dim=-2), torch.stack(right, dim=-1), torch.stack(normals, dim=-2)
 

@@ -1,0 +1,46 @@
+"""`State`: (q, v, u) with its kinematics, computed once and shared by contacts, known forces and priors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.robots import Kinematics, Robot
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Positions, velocities and actuator forces (..., nv) of equal shape, and the inertial parameters that hold there.
+
+    `inertials` maps link names to log-Cholesky parameters (..., 10), or is None for those of the URDF.
+    """
+
+    q: Float[Tensor, "*batch nv"]
+    v: Float[Tensor, "*batch nv"]
+    u: Float[Tensor, "*batch nv"]
+    kinematics: Kinematics
+    inertials: Mapping[str, Tensor] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        u: Float[Tensor, "*#batch nv"],
+        inertials: Mapping[str, Tensor] | None = None,
+    ) -> State:
+        """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
+        for name, value in (("q", q), ("v", v), ("u", u)):
+            robot.check_input(name, value)
+        try:
+            q, v, u = torch.broadcast_tensors(q, v, u)
+        except RuntimeError:
+            shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
+            raise InvalidInput(f"batch shapes do not broadcast: {shapes}; make them equal, or 1.") from None
+        return cls(q, v, u, robot.kinematics(q, v), inertials)

@@ -1,0 +1,20 @@
+"""Models of the forward dynamics: fit -> posterior -> predict."""
+
+from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
+from forcegp.models.noise import Noise
+from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.storage import load_posterior, save_posterior
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_posterior import StructuredPosterior
+
+__all__ = [
+    "Gaussian",
+    "MarginalLikelihood",
+    "Noise",
+    "Prediction",
+    "StructuredGP",
+    "StructuredPosterior",
+    "TrainingData",
+    "load_posterior",
+    "save_posterior",
+]

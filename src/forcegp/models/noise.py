@@ -1,0 +1,74 @@
+"""`Noise`: white noise on the measured acceleration and, optionally, on the joint forces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+
+ACCELERATION = "noise.log_acceleration"
+FORCE = "noise.log_force"
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations: `acceleration` in rad/s^2 or m/s^2, `force` in Nm or N (None: no force-level noise).
+
+    Each is one number or one per joint. With `learn` they are start values of the optimisation, else they stay fixed.
+    The covariance of one row is diag(acceleration^2) + H diag(force^2) H^T.
+    """
+
+    acceleration: float | tuple[float, ...] = 0.1
+    force: float | tuple[float, ...] | None = None
+    learn: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "force"):
+            value = getattr(self, name)
+            if value is None and name == "force":
+                continue
+            numbers = tuple(float(entry) for entry in value) if isinstance(value, Sequence) else (float(value),)
+            if not numbers or not all(0.0 < number < float("inf") for number in numbers):
+                raise InvalidInput(f"Noise {name} is {value!r}; standard deviations must be positive and finite.")
+            object.__setattr__(self, name, numbers if isinstance(value, Sequence) else numbers[0])
+
+    def parameters(self, nv: int) -> dict[str, Float[Tensor, "nv"]]:
+        """Logarithms of the standard deviations, one per joint. Raises InvalidInput for a wrong number of values."""
+        named = {ACCELERATION: self.acceleration} | ({} if self.force is None else {FORCE: self.force})
+        out = {}
+        for name, value in named.items():
+            values = torch.as_tensor(value, dtype=torch.float64)
+            if values.dim() and len(values) != nv:
+                raise InvalidInput(f"Noise has {len(values)} values for {nv} joints; give one number or one per joint.")
+            out[name] = values.expand(nv).log()
+        return out
+
+    @staticmethod
+    def covariance(
+        parameters: Mapping[str, Tensor], H: Float[Tensor, "*batch nv nv"]
+    ) -> Float[Tensor, "#N nv"] | Float[Tensor, "N nv nv"]:
+        """Variances (1, nv) of the rows, or their covariances (..., nv, nv) when there is force-level noise."""
+        acceleration = (2.0 * parameters[ACCELERATION]).exp()
+        if FORCE not in parameters:
+            return acceleration[None]
+        force = (2.0 * parameters[FORCE]).exp()
+        return torch.diag_embed(acceleration) + (H * force) @ H.mT
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {
+            "acceleration": list(self.acceleration) if isinstance(self.acceleration, tuple) else self.acceleration,
+            "force": list(self.force) if isinstance(self.force, tuple) else self.force,
+            "learn": self.learn,
+        }
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Noise:
+        """The noise that `to_dict` stored."""
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()})

@@ -1,0 +1,53 @@
+"""Predictions as frozen values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian:
+    """A normal distribution per state: `mean` (..., k) and `covariance` (..., k, k), or None where only the mean was asked for."""
+
+    mean: Float[Tensor, "*batch k"]
+    covariance: Float[Tensor, "*batch k k"] | None
+
+    @property
+    def variance(self) -> Float[Tensor, "*batch k"]:
+        """Diagonal of the covariance (..., k)."""
+        if self.covariance is None:
+            raise ValueError("only the mean was predicted; call predict(..., covariance=True)")
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0)
+
+    @property
+    def std(self) -> Float[Tensor, "*batch k"]:
+        """Standard deviation of each entry (..., k)."""
+        return self.variance.sqrt()
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction(Gaussian):
+    """The acceleration (`mean` in rad/s^2 or m/s^2, `covariance`), without measurement noise, and the forces behind it.
+
+    `multiplier` is lambda (..., m); `contact_force` the world force on the robot at each contact in turn (..., 3 m) in N;
+    `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean includes Q_K.
+    `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with noisy data.
+    """
+
+    multiplier: Gaussian
+    contact_force: Gaussian
+    unknown_force: Gaussian
+    noise_covariance: Float[Tensor, "*batch nv nv"]
+
+    @property
+    def acceleration(self) -> Gaussian:
+        """`mean` and `covariance` under their full name."""
+        return Gaussian(self.mean, self.covariance)
+
+    @property
+    def measurement(self) -> Gaussian:
+        """The acceleration as a sensor with the model's noise would report it."""
+        return Gaussian(self.mean, None if self.covariance is None else self.covariance + self.noise_covariance)

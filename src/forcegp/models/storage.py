@@ -1,0 +1,183 @@
+"""Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
+
+The folder holds the training points and parameters; loading runs the same conditioning as fitting, so predictions are the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from forcegp import __version__
+from forcegp.data import units_for
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.inference import OptimizationResult
+from forcegp.mechanics import Contact, MechanicalSystem
+from forcegp.models.marginal_likelihood import TrainingData
+from forcegp.models.noise import Noise
+from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.priors import prior_from_dict, prior_to_dict
+
+KIND = "forcegp structured posterior"
+FORMAT_VERSION = 1
+STATES = ("q", "v", "u", "a")
+
+
+def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write `posterior` as the folder `path`, under a temporary name that is renamed at the end.
+
+    Raises
+    ------
+    FileFormatError: `path` exists and `overwrite` is false, or is not a model folder.
+    ContactError: a surface of the system holds code.
+    """
+    path = Path(path)
+    if path.exists():
+        if not overwrite:
+            raise FileFormatError(f"{path} exists already; choose another name or pass overwrite=True")
+        if not _is_model_folder(path):
+            raise FileFormatError(f"{path} exists and is not a folder written by forcegp, so it is not overwritten")
+    system = posterior.system.to_dict()
+    urdf = system.pop("urdf")
+    result = posterior.result
+    document = {
+        "kind": KIND,
+        "format_version": FORMAT_VERSION,
+        "forcegp_version": __version__,
+        "torch_version": torch.__version__,
+        "joint_names": list(posterior.joint_names),
+        "units": _plain(units_for(posterior.system.robot)),
+        "urdf_sha256": _sha256(urdf),
+        "system": system,
+        "model": {
+            "mean": posterior.model.mean,
+            "prior": prior_to_dict(posterior.model.prior),
+            "noise": None if posterior.model.noise is None else posterior.model.noise.to_dict(),
+        },
+        "result": {
+            "value": result.value,
+            "history": list(result.history),
+            "status": result.status,
+            "converged": result.converged,
+            "evaluations": result.evaluations,
+            "cpu_seconds": result.cpu_seconds,
+        },
+        "settings": dict(posterior.settings),
+    }
+    training = posterior.likelihood.training
+    tensors = {f"training.{name}": getattr(training, name).detach().cpu().contiguous() for name in STATES}
+    tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    try:
+        save_file(tensors, temporary / "tensors.safetensors")
+        (temporary / "robot.urdf").write_text(urdf, encoding="utf-8")
+        (temporary / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        temporary.chmod(0o755)
+        if path.exists():
+            shutil.rmtree(path)
+        temporary.rename(path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> StructuredPosterior:
+    """Read a folder that `save_posterior` wrote; it predicts without the training file. `contacts` replaces the stored ones.
+
+    Raises
+    ------
+    FileFormatError: not such a folder, damaged, changed by hand, or written by a newer version.
+    """
+    path = Path(path)
+    document = _document(path)
+    try:
+        urdf = (path / "robot.urdf").read_text(encoding="utf-8")
+        tensors = load_file(path / "tensors.safetensors")
+    except (OSError, SafetensorError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
+    if _sha256(urdf) != document.get("urdf_sha256"):
+        raise FileFormatError(
+            f"{path / 'robot.urdf'} is not the robot that the model was trained with (its hash differs)"
+        )
+    try:
+        system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
+        stored = document["model"]
+        noise = None if stored["noise"] is None else Noise.from_dict(stored["noise"])
+        model = StructuredGP(system, prior_from_dict(stored["prior"]), stored["mean"], noise)
+        training = TrainingData(*(tensors[f"training.{name}"] for name in STATES))
+        prefix = "parameters."
+        parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+        result = document["result"]
+        optimization = OptimizationResult(
+            parameters,
+            float(result["value"]),
+            tuple(result["history"]),
+            result["status"],
+            bool(result["converged"]),
+            int(result["evaluations"]),
+            float(result["cpu_seconds"]),
+        )
+        names = document["joint_names"]
+        settings = document["settings"]
+    except (KeyError, TypeError, InvalidInput) as error:
+        raise FileFormatError(f"{path / 'model.json'} is incomplete or damaged: {error}") from None
+    if list(system.robot.joint_names) != names:
+        raise FileFormatError(
+            f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
+        )
+    expected = model.parameter_shapes(training)
+    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
+    if given != expected:
+        raise FileFormatError(f"{path / 'tensors.safetensors'} does not hold the parameters of its model")
+    return model.condition(training, parameters, optimization, settings)
+
+
+def _document(path: Path) -> dict[str, Any]:
+    if not path.is_dir():
+        what = "does not exist" if not path.exists() else "is a file"
+        raise FileFormatError(f"{path} {what}; give the folder that `forcegp fit --out` wrote")
+    file = path / "model.json"
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except OSError:
+        raise FileFormatError(f"{path} holds no model.json; give the folder that `forcegp fit --out` wrote") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{file} is damaged: {error}") from None
+    if not isinstance(document, dict) or document.get("kind") != KIND:
+        raise FileFormatError(f"{file} is not a stored {KIND}")
+    version = document.get("format_version")
+    if version != FORMAT_VERSION:
+        raise FileFormatError(
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}; use the version that wrote it "
+            f"({document.get('forcegp_version')}) or fit again"
+        )
+    return document
+
+
+def _is_model_folder(path: Path) -> bool:
+    try:
+        return bool(_document(path))
+    except FileFormatError:
+        return False
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return list(value) if isinstance(value, tuple) else value

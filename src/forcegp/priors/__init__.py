@@ -1,0 +1,36 @@
+"""Priors on the forces that nobody modelled."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.priors.force_prior import ForcePrior
+from forcegp.priors.joint_forces import JointForces
+
+PRIORS: dict[str, type[ForcePrior]] = {"joint-forces": JointForces}
+"""Priors that stored models can name."""
+
+__all__ = ["PRIORS", "ForcePrior", "JointForces", "prior_from_dict", "prior_to_dict"]
+
+
+def prior_to_dict(prior: ForcePrior) -> dict[str, Any]:
+    """Plain values that `prior_from_dict` turns back. Raises InvalidInput for a prior that is not in `PRIORS`."""
+    name = next((name for name, kind in PRIORS.items() if type(prior) is kind), None)
+    if name is None:
+        raise InvalidInput(
+            f"a {type(prior).__name__} cannot be stored: register it first, PRIORS['my-prior'] = {type(prior).__name__}; "
+            f"registered: {', '.join(PRIORS)}"
+        )
+    return {"type": name, **prior.to_dict()}
+
+
+def prior_from_dict(stored: Mapping[str, Any]) -> ForcePrior:
+    """The prior that `prior_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
+    fields = dict(stored)
+    name = fields.pop("type", None)
+    if name not in PRIORS:
+        raise FileFormatError(f"unknown prior {name!r}; registered: {', '.join(PRIORS)}")
+    try:
+        return PRIORS[name](**fields)
+    except TypeError as error:
+        raise FileFormatError(f"prior {name!r} has wrong fields {sorted(fields)}: {error}") from None
