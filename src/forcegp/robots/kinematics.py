@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
     from forcegp.robots.robot import Robot
 
 Inertials = Mapping[str, Tensor]
-Point = Tensor | Sequence[float]
+Vector = Sequence[float | int] | np.ndarray | Tensor
+Point = Vector
 
 
 @dataclass(frozen=True, eq=False)

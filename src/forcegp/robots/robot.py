@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from forcegp.robots.inertia import (
     physical_from_parameters,
     pseudo_inertia_factor,
 )
-from forcegp.robots.kinematics import Inertials, Kinematics, Point, broadcast_batch
+from forcegp.robots.kinematics import Inertials, Kinematics, Point, Vector, broadcast_batch
 from forcegp.robots.tree import WORLD, Layout, Tree, body_inertias, check_inertias, compile_tree, lay_out
 from forcegp.robots.urdf import RobotDescription, parse_urdf, read_text
 
@@ -82,9 +82,9 @@ class Robot:
         cls,
         path: str | Path,
         *,
-        gravity: Sequence[float] = GRAVITY,
-        armature: Sequence[float] | Mapping[str, float] | None = None,
-        locked: Mapping[str, float] | None = None,
+        gravity: Vector = GRAVITY,
+        armature: Vector | Mapping[str, float | int] | None = None,
+        locked: Mapping[str, float | int] | None = None,
     ) -> Robot:
         """Read a URDF file.
 
@@ -102,9 +102,9 @@ class Robot:
         text: str,
         *,
         source: str = "<text>",
-        gravity: Sequence[float] = GRAVITY,
-        armature: Sequence[float] | Mapping[str, float] | None = None,
-        locked: Mapping[str, float] | None = None,
+        gravity: Vector = GRAVITY,
+        armature: Vector | Mapping[str, float | int] | None = None,
+        locked: Mapping[str, float | int] | None = None,
     ) -> Robot:
         """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
         description = parse_urdf(text, source=source)
@@ -136,7 +136,7 @@ class Robot:
             text = urdf_writer.replace_inertial(text, name, float(mass), center, inertia, source=self.source)
         return self._rebuilt(text, self.armature)
 
-    def with_armature(self, armature: Sequence[float] | Mapping[str, float]) -> Robot:
+    def with_armature(self, armature: Vector | Mapping[str, float | int]) -> Robot:
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
         if isinstance(armature, Mapping):
             armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True)) | dict(armature)
@@ -148,12 +148,12 @@ class Robot:
         frames = {name: (body, offset.to(device)) for name, (body, offset) in self._frames.items()}
         return replace(self, tree=self.tree.to(device), _frames=frames, _merge_plans={})
 
-    def _rebuilt(self, text: str, armature: Sequence[float] | Mapping[str, float] | Tensor) -> Robot:
+    def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> Robot:
         robot = Robot.from_urdf_text(
             text,
             source=self.source,
-            gravity=self.gravity.tolist(),
-            armature=armature.tolist() if isinstance(armature, Tensor) else armature,
+            gravity=self.gravity,
+            armature=armature,
             locked=self.locked,
         )
         return robot if self.device.type == "cpu" else robot.to(self.device)
@@ -338,7 +338,10 @@ class Robot:
         frame: str,
         point: Point | None = None,
     ) -> Float[Tensor, "... 6"]:
-        """Classical acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], no gravity."""
+        """Acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``, classical, without gravity.
+
+        Rows [linear; angular], world axes, in m/s^2 and rad/s^2: what the point does at zero joint acceleration.
+        """
         return self.kinematics(q, v).frame_bias_acceleration(frame, point)
 
     # ------------------------------------------------------------------ checks shared with Kinematics
@@ -433,7 +436,7 @@ def _finite_vector(name: str, values: object, size: int) -> np.ndarray:
     return array
 
 
-def _armature(given: Sequence[float] | Mapping[str, float] | None, joints: tuple[str, ...], robot: str) -> np.ndarray:
+def _armature(given: Vector | Mapping[str, float | int] | None, joints: tuple[str, ...], robot: str) -> np.ndarray:
     if given is None:
         return np.zeros(len(joints))
     if isinstance(given, Mapping):

@@ -104,9 +104,7 @@ def declared_encoding(data: bytes) -> str:
     """Encoding of an XML file from its byte-order mark or XML declaration; UTF-8 by default."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
-    if data.startswith(b"\xef\xbb\xbf"):
-        return "utf-8-sig"
-    head = data[:200].split(b"?>")[0].decode("ascii", errors="replace")
+    head = data.removeprefix(b"\xef\xbb\xbf")[:200].split(b"?>")[0].decode("ascii", errors="replace")
     if head.startswith("<?xml") and "encoding" in head:
         value = head.split("encoding", 1)[1].lstrip(" \t\r\n=")
         return value[1:].split(value[:1], 1)[0] if value[:1] in "'\"" else "utf-8"

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
 
-from forcegp.errors import UnknownLink
+from forcegp.errors import InvalidInput, UnknownLink
 from forcegp.robots.urdf import declared_encoding
 
 
@@ -21,33 +20,34 @@ def replace_inertial(
     ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, axes of the link frame.
     """
     data = text.encode("utf-8")
+    newline = b"\r\n" if b"\r\n" in data else b"\n"
     spans = _find_link(data, link)
     if spans is None:
         raise UnknownLink(f"{source}: no link {link!r} in the URDF text.")
     (start, head_end, end), inertial = spans
     if inertial is not None:
         first, last = inertial
-        indent = _indent_of(data, first)
-        return (data[:first] + _inertial(mass, center_of_mass, inertia, indent) + data[last:]).decode("utf-8")
+        element = _inertial(mass, center_of_mass, inertia, newline + _indent_of(data, first))
+        return (data[:first] + element + data[last:]).decode("utf-8")
     indent = _indent_of(data, start)
-    element = b"\n" + indent + b"  " + _inertial(mass, center_of_mass, inertia, indent + b"  ")
+    element = newline + indent + b"  " + _inertial(mass, center_of_mass, inertia, newline + indent + b"  ")
     if data[head_end - 2 : head_end] == b"/>":  # <link name="tool"/> has no inside yet
         opened = data[start : head_end - 2].rstrip() + b">"
-        return (data[:start] + opened + element + b"\n" + indent + b"</link>" + data[end:]).decode("utf-8")
+        return (data[:start] + opened + element + newline + indent + b"</link>" + data[end:]).decode("utf-8")
     return (data[:head_end] + element + data[head_end:]).decode("utf-8")
 
 
 def write_text(text: str, path: Path) -> None:
     """Write URDF text in the encoding that it declares, to a temporary file that is then renamed."""
-    encoding = declared_encoding(text[:200].encode("utf-8"))
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    if not path.parent.is_dir():
+        raise InvalidInput(f"{path}: the folder {path.parent} does not exist; create it first.")
+    data = text.encode(declared_encoding(text[:200].encode("utf-8")))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(text.encode(encoding))
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink()
-        raise
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _find_link(data: bytes, link: str) -> tuple[tuple[int, int, int], tuple[int, int] | None] | None:
@@ -102,16 +102,10 @@ def _indent_of(data: bytes, position: int) -> bytes:
     return line if not line.strip() else b""
 
 
-def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, indent: bytes) -> bytes:
+def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, line_start: bytes) -> bytes:
     xyz = " ".join(repr(float(value)) for value in center_of_mass)
     entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     moments = " ".join(f'{key}="{float(inertia[index])!r}"' for key, index in entries.items())
-    inner = indent.decode() + "  "
-    lines = [
-        "<inertial>",
-        f'{inner}<origin xyz="{xyz}" rpy="0 0 0"/>',
-        f'{inner}<mass value="{float(mass)!r}"/>',
-        f"{inner}<inertia {moments}/>",
-        f"{indent.decode()}</inertial>",
-    ]
-    return "\n".join(lines).encode()
+    inner = [f'<origin xyz="{xyz}" rpy="0 0 0"/>', f'<mass value="{float(mass)!r}"/>', f"<inertia {moments}/>"]
+    lines = [b"<inertial>", *(b"  " + element.encode() for element in inner), b"</inertial>"]
+    return line_start.join(lines)
