@@ -44,7 +44,7 @@ def whiten(
     count = W.shape[0]
     if noise.ndim == 2:
         if not bool((noise > 0).all()):
-            raise NumericalError(f"noise variances must be positive, the smallest is {float(noise.min()):.3e}")
+            raise NumericalError(f"noise variances must be positive, the smallest is {float(noise.detach().min()):.3e}")
         std = noise.sqrt()
         return W / std[..., None], residual / std, std.log().expand(count, -1).sum()
     lower, info = torch.linalg.cholesky_ex(noise)

@@ -1,0 +1,364 @@
+"""The deflated likelihood and every gradient of it against the dense covariance and autograd."""
+
+import math
+
+import gpytorch.kernels as gk
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.inference.dense import dense_covariance, dense_negative_log_likelihood, precise_value_and_gradients
+from tests.inference.problems import Problem, constrained_inverse_mass, normal, problem
+
+from forcegp.errors import NumericalError
+from forcegp.inference import LatentKernels, likelihood, negative_log_likelihood
+
+ABSOLUTE, RELATIVE = 1e-6, 1e-7
+
+SHAPES = {
+    "no constraint": {"constraints": 0},
+    "one constraint": {"constraints": 1},
+    "three constraints": {"constraints": 3},
+    "fewer latents than outputs": {"latents": 2, "constraints": 0},
+    "fewer latents than the rank of H": {"latents": 2, "constraints": 1},
+    "more latents than outputs": {"latents": 6, "outputs": 3, "constraints": 1},
+    "one latent": {"latents": 1},
+    "one output": {"outputs": 1, "constraints": 0},
+    "one point": {"count": 1},
+    "two points": {"count": 2},
+}
+PANELS = {"one panel": 4 * 2**20, "some panels": 5000, "one row per panel": 1}
+
+
+def plain_matrices(kernels: LatentKernels, features) -> list[torch.Tensor]:
+    """GPyTorch itself, dense, under plain autograd."""
+    return [kernel(z, z).to_dense() for kernel, z in zip(kernels.kernels, features, strict=True)]
+
+
+def assert_same_value_and_gradients(given_problem: Problem, noise_of=lambda problem: (problem.noise, [problem.noise])):
+    """Compare with the dense oracle with respect to everything: W, residual, noise, features and kernel parameters."""
+    for tensor in (given_problem.W, given_problem.residual, given_problem.noise, *given_problem.features):
+        tensor.requires_grad_()
+    noise, noise_leaves = noise_of(given_problem)
+    data = {"W": given_problem.W, "residual": given_problem.residual}
+    data |= {f"noise {k}": leaf for k, leaf in enumerate(noise_leaves)}
+    data |= {f"features {c}": z for c, z in enumerate(given_problem.features)}
+    data |= dict(given_problem.kernels.named_parameters())
+    arguments = given_problem.W, given_problem.residual, noise
+    expected = dense_negative_log_likelihood(*arguments, plain_matrices(given_problem.kernels, given_problem.features))
+    result = negative_log_likelihood(*arguments, given_problem.kernels(given_problem.features))
+    assert abs(float((result - expected).detach())) < ABSOLUTE
+    expected_gradients = torch.autograd.grad(expected, list(data.values()), retain_graph=True)
+    gradients = torch.autograd.grad(result, list(data.values()))
+    for name, gradient, reference in zip(data, gradients, expected_gradients, strict=True):
+        error = float((gradient - reference).abs().max())
+        assert error <= RELATIVE * max(1.0, float(reference.abs().max())), name
+
+
+@pytest.mark.parametrize("panel_bytes", PANELS.values(), ids=PANELS)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_value_and_all_gradients_with_noise_variances(shape, panel_bytes, monkeypatch):
+    monkeypatch.setattr(likelihood, "PANEL_BYTES", panel_bytes)
+    assert_same_value_and_gradients(problem(**shape))
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_noise_variances_shared_by_all_points(shape):
+    given_problem = problem(**shape)
+    given_problem.noise = given_problem.noise[:1].clone()
+    assert_same_value_and_gradients(given_problem)
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["one per point", "shared"])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_noise_covariances(shape, shared):
+    given_problem = problem(**shape)
+    count, outputs = given_problem.residual.shape
+    factor = 0.3 * normal(1 if shared else count, outputs, outputs, seed=7)
+    given_problem.noise = factor @ factor.mT + 0.05 * torch.eye(outputs, dtype=torch.float64)
+
+    def symmetric(
+        p,
+    ):  # a factorisation reads one triangle, so gradients with respect to single entries are a convention
+        return 0.5 * (p.noise + p.noise.mT), [p.noise]
+
+    assert_same_value_and_gradients(given_problem, symmetric)
+
+
+@pytest.mark.parametrize("constraints", [0, 1, 3])
+def test_force_level_noise(constraints, monkeypatch):
+    """R_i = diag(sigma^2) + H_i diag(sigma_F^2) H_i^T with H_i = W_i, so that W has two ways to the likelihood."""
+    monkeypatch.setattr(likelihood, "PANEL_BYTES", 5000)
+    given_problem = problem(constraints=constraints)
+    given_problem.noise = given_problem.noise[:1].clone()
+    log_force = 0.3 * normal(5, seed=9)
+
+    def force_noise(p):
+        log_force.requires_grad_()
+        covariance = (p.W * (2.0 * log_force).exp()) @ p.W.mT
+        return torch.diag_embed(p.noise) + covariance, [p.noise, log_force]
+
+    assert_same_value_and_gradients(given_problem, force_noise)
+
+
+@pytest.mark.parametrize("panel_bytes", PANELS.values(), ids=PANELS)
+def test_points_of_differing_rank(panel_bytes, monkeypatch):
+    """Free, held, held twice, fully blocked: ranks 4, 3, 2 and 0, in any order."""
+    monkeypatch.setattr(likelihood, "PANEL_BYTES", panel_bytes)
+    given_problem = problem(count=8, outputs=4, constraints=0)
+    for row, constraints in ((0, 3), (2, 1), (3, 4), (5, 2), (7, 1)):
+        if constraints == 4:
+            given_problem.W[row] = 0.0
+        else:
+            given_problem.W[row] = constrained_inverse_mass(1, 4, constraints, seed=row)[0]
+    assert_same_value_and_gradients(given_problem)
+
+
+def test_an_arm_with_a_light_wrist_keeps_its_precision():
+    """H_77 ~ 1000 at noise 0.01, as on the iiwa, makes the dense covariance lose digits; 40 digits are the oracle here."""
+    given_problem = problem(count=5, outputs=3, constraints=1)
+    scale = torch.tensor([1.0, 5.0, 40.0], dtype=torch.float64)
+    given_problem.W = scale[:, None] * given_problem.W * scale
+    given_problem.residual = given_problem.residual * scale
+    given_problem.noise = torch.full((1, 3), 0.01, dtype=torch.float64)
+    matrices = [K.detach().requires_grad_() for K in given_problem.kernels(given_problem.features)]
+    assert torch.linalg.cond(dense_covariance(given_problem.W, given_problem.noise, matrices).detach()) > 1e8
+    expected, expected_gradients = precise_value_and_gradients(*given_problem.data, matrices)
+    leaves = [*(tensor.requires_grad_() for tensor in given_problem.data), *matrices]
+    value = negative_log_likelihood(*given_problem.data, matrices)
+    assert float(value.detach()) == pytest.approx(expected, rel=1e-12)
+    for gradient, reference in zip(torch.autograd.grad(value, leaves), expected_gradients, strict=True):
+        torch.testing.assert_close(gradient, reference, rtol=0.0, atol=1e-10 * float(reference.abs().max()))
+
+
+def periodic() -> gk.Kernel:
+    kernel = gk.PeriodicKernel(ard_num_dims=3)
+    kernel.period_length = torch.tensor([[3.0, 4.0, 5.0]])
+    return kernel
+
+
+KERNELS = {
+    "one length scale": lambda: gk.ScaleKernel(gk.RBFKernel()),
+    "without scale": lambda: gk.RBFKernel(ard_num_dims=3),
+    "some inputs only": lambda: gk.ScaleKernel(gk.RBFKernel(ard_num_dims=2, active_dims=(0, 2))),
+    "some inputs only, outside": lambda: gk.ScaleKernel(gk.RBFKernel(ard_num_dims=2), active_dims=(0, 2)),
+    "Matern 5/2": lambda: gk.ScaleKernel(gk.MaternKernel(2.5, ard_num_dims=3)),
+    "Matern 3/2": lambda: gk.ScaleKernel(gk.MaternKernel(1.5)),
+    "rational quadratic": lambda: gk.ScaleKernel(gk.RQKernel(ard_num_dims=3)),
+    "periodic": lambda: gk.ScaleKernel(periodic()),
+    "linear": lambda: gk.LinearKernel(),
+    "sum": lambda: gk.ScaleKernel(gk.RBFKernel()) + gk.LinearKernel(),
+    "product": lambda: gk.ScaleKernel(gk.RBFKernel()) * gk.PolynomialKernel(power=2),
+}
+
+
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+def test_other_kernels(kernel):
+    given_problem = problem(count=8, outputs=3, constraints=1)
+    given_problem.kernels = LatentKernels([kernel().double() for _ in range(3)])
+    assert_same_value_and_gradients(given_problem)
+
+
+def test_different_kernels_on_different_features():
+    given_problem = problem(count=8, outputs=3, constraints=1)
+    given_problem.features = [normal(8, d, seed=d) for d in (1, 2, 3)]
+    given_problem.kernels = LatentKernels(
+        [
+            gk.ScaleKernel(gk.RBFKernel(ard_num_dims=1)).double(),
+            gk.MaternKernel(2.5).double(),
+            gk.LinearKernel().double(),
+        ]
+    )
+    assert_same_value_and_gradients(given_problem)
+
+
+def test_one_feature_tensor_and_one_kernel_for_all_latents():
+    """Shared tensors collect the gradients of all latents."""
+    given_problem = problem(count=8, outputs=3, constraints=1)
+    given_problem.features = [given_problem.features[0]] * 3
+    given_problem.kernels = LatentKernels([gk.ScaleKernel(gk.RBFKernel(ard_num_dims=3)).double()] * 3)
+    assert len(list(given_problem.kernels.parameters())) == 2
+    assert_same_value_and_gradients(given_problem)
+
+
+@pytest.mark.parametrize("wanted", ["W", "residual", "noise", "kernel"])
+def test_gradient_with_respect_to_one_argument_only(wanted):
+    """What need not be computed is left out; the rest is the same."""
+    given_problem = problem(count=6, outputs=3)
+    kernel_matrices = [K.detach() for K in given_problem.kernels(given_problem.features)]
+    arguments = {
+        "W": given_problem.W,
+        "residual": given_problem.residual,
+        "noise": given_problem.noise,
+        "kernel": kernel_matrices[1],
+    }
+    leaf = arguments[wanted].requires_grad_()
+    (gradient,) = torch.autograd.grad(negative_log_likelihood(*given_problem.data, kernel_matrices), leaf)
+    (expected,) = torch.autograd.grad(dense_negative_log_likelihood(*given_problem.data, kernel_matrices), leaf)
+    torch.testing.assert_close(gradient, expected, rtol=RELATIVE, atol=RELATIVE * float(expected.abs().max()))
+    assert not any(K.requires_grad for K in (kernel_matrices[0], kernel_matrices[2]))
+
+
+def test_gradient_scales_with_what_comes_from_above():
+    given_problem = problem(count=5, outputs=3)
+    W = given_problem.W.requires_grad_()
+    matrices = given_problem.kernels(given_problem.features)
+    value = negative_log_likelihood(*given_problem.data, matrices)
+    (once,) = torch.autograd.grad(value, W, retain_graph=True)
+    (scaled,) = torch.autograd.grad(value * -2.5, W, retain_graph=True)
+    torch.testing.assert_close(scaled, -2.5 * once)
+
+
+def test_arguments_are_left_alone():
+    given_problem = problem(count=6, outputs=3)
+    matrices = [K.detach().requires_grad_() for K in given_problem.kernels(given_problem.features)]
+    before = [tensor.detach().clone() for tensor in (*given_problem.data, *matrices)]
+    negative_log_likelihood(
+        given_problem.W.requires_grad_(), given_problem.residual, given_problem.noise, matrices
+    ).backward()
+    for tensor, kept in zip((*given_problem.data, *matrices), before, strict=True):
+        assert torch.equal(tensor.detach(), kept)
+
+
+def test_second_derivatives_are_refused_and_never_silently_wrong():
+    given_problem = problem(count=4, outputs=2, constraints=0)
+    noise = given_problem.noise.requires_grad_()
+    value = negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        torch.autograd.grad(value, noise, create_graph=True)
+
+
+# ---------------------------------------------------------------- closed forms
+
+
+def test_no_point_costs_nothing():
+    given_problem = problem(count=0)
+    assert value_of(given_problem) == 0.0
+
+
+@pytest.mark.parametrize("panel_bytes", PANELS.values(), ids=PANELS)
+def test_a_system_that_cannot_move_is_pure_noise(panel_bytes, monkeypatch):
+    monkeypatch.setattr(likelihood, "PANEL_BYTES", panel_bytes)
+    given_problem = problem(count=6, outputs=3)
+    given_problem.W = torch.zeros_like(given_problem.W)
+    residual, variances = given_problem.residual, given_problem.noise
+    value = negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
+    expected = -torch.distributions.Normal(0.0, variances.sqrt()).log_prob(residual).sum()
+    torch.testing.assert_close(value, expected)
+    assert_same_value_and_gradients(given_problem)
+
+
+def test_one_scalar_observation():
+    value = negative_log_likelihood(
+        torch.tensor([[[2.0]]]).double(),
+        torch.tensor([[1.5]]).double(),
+        torch.tensor([[0.25]]).double(),
+        [torch.tensor([[0.75]]).double()],
+    )
+    variance = 4.0 * 0.75 + 0.25
+    assert float(value) == pytest.approx(0.5 * (1.5**2 / variance + math.log(2.0 * math.pi * variance)))
+
+
+# ---------------------------------------------------------------- what it refuses
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_values_that_are_not_finite_are_named_by_row(value):
+    for name, message in (("W", "mixing vectors W of row 3"), ("residual", "residuals y - m of row 3")):
+        given_problem = problem(count=6, outputs=3)
+        getattr(given_problem, name)[3, 1] = value
+        with pytest.raises(NumericalError, match=message):
+            negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
+
+
+@pytest.mark.parametrize("variance", [0.0, -1.0, math.nan])
+def test_noise_variances_must_be_positive(variance):
+    given_problem = problem(count=6, outputs=3)
+    given_problem.noise[2, 1] = variance
+    given_problem.noise.requires_grad_()
+    with pytest.raises(NumericalError, match="noise variances must be positive"):
+        negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
+
+
+@pytest.mark.parametrize("entry", [-1.0, math.nan])
+def test_noise_covariances_must_be_positive_definite(entry):
+    given_problem = problem(count=6, outputs=3)
+    given_problem.noise = torch.diag_embed(given_problem.noise)
+    given_problem.noise[4, 1, 1] = entry
+    with pytest.raises(NumericalError, match="noise covariance of row 4"):
+        negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
+
+
+@pytest.mark.parametrize("where", [(2, 2), (4, 1)], ids=["diagonal", "beside it"])
+def test_kernel_matrices_must_be_finite(where):
+    given_problem = problem(count=6, outputs=3)
+    matrices = [K.detach().clone() for K in given_problem.kernels(given_problem.features)]
+    matrices[1][where] = math.nan
+    matrices[1][where[::-1]] = math.nan
+    with pytest.raises(NumericalError, match="covariance matrix"):
+        negative_log_likelihood(*given_problem.data, matrices)
+
+
+# ---------------------------------------------------------------- properties
+
+seeds = st.integers(0, 10_000)
+shapes = st.fixed_dictionaries(
+    {"count": st.integers(1, 6), "outputs": st.integers(1, 4), "latents": st.integers(1, 5), "seed": seeds}
+)
+
+
+def value_of(given_problem: Problem) -> float:
+    with torch.no_grad():
+        return float(negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features)))
+
+
+@settings(max_examples=40)
+@given(shape=shapes, seed=seeds)
+def test_order_of_points_does_not_matter(shape, seed):
+    given_problem = problem(constraints=0, **shape)
+    before = value_of(given_problem)
+    order = torch.randperm(shape["count"], generator=torch.Generator().manual_seed(seed))
+    given_problem.W, given_problem.residual, given_problem.noise = (tensor[order] for tensor in given_problem.data)
+    given_problem.features = [z[order] for z in given_problem.features]
+    assert value_of(given_problem) == pytest.approx(before, rel=1e-9, abs=1e-8)
+
+
+@settings(max_examples=40)
+@given(shape=shapes, seed=seeds)
+def test_rotating_the_outputs_of_every_point_does_not_matter(shape, seed):
+    """y_i -> Q_i y_i, W_i -> Q_i W_i, R_i -> Q_i R_i Q_i^T."""
+    given_problem = problem(constraints=0, **shape)
+    before = value_of(given_problem)
+    Q = torch.linalg.qr(normal(shape["count"], shape["outputs"], shape["outputs"], seed=seed)).Q
+    given_problem.W = Q @ given_problem.W
+    given_problem.residual = (Q @ given_problem.residual[..., None])[..., 0]
+    given_problem.noise = (Q * given_problem.noise[:, None, :]) @ Q.mT
+    assert value_of(given_problem) == pytest.approx(before, rel=1e-9, abs=1e-8)
+
+
+@settings(max_examples=40)
+@given(shape=shapes, scale=st.floats(1e-3, 1e3))
+def test_units_of_a_latent_do_not_matter(shape, scale):
+    """w_c -> s w_c together with k_c -> k_c / s^2."""
+    given_problem = problem(constraints=0, **shape)
+    matrices = [K.detach() for K in given_problem.kernels(given_problem.features)]
+    before = negative_log_likelihood(*given_problem.data, matrices)
+    W = given_problem.W.clone()
+    W[..., 0] *= scale
+    after = negative_log_likelihood(
+        W, given_problem.residual, given_problem.noise, [matrices[0] / scale**2, *matrices[1:]]
+    )
+    torch.testing.assert_close(after, before, rtol=1e-8, atol=1e-8)
+
+
+@settings(max_examples=40)
+@given(shape=shapes)
+def test_an_output_of_pure_noise_adds_its_own_likelihood(shape):
+    given_problem = problem(constraints=0, **shape)
+    before = value_of(given_problem)
+    count = shape["count"]
+    given_problem.W = torch.cat([given_problem.W, torch.zeros(count, 1, shape["latents"], dtype=torch.float64)], dim=1)
+    given_problem.residual = torch.cat([given_problem.residual, torch.ones(count, 1, dtype=torch.float64)], dim=1)
+    given_problem.noise = torch.cat([given_problem.noise, torch.ones(count, 1, dtype=torch.float64)], dim=1)
+    extra = count * 0.5 * (1.0 + math.log(2.0 * math.pi))
+    assert value_of(given_problem) == pytest.approx(before + extra, rel=1e-9, abs=1e-8)
