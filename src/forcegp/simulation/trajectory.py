@@ -1,0 +1,71 @@
+"""Reference motion of the tool: straight segments between random way-points, at rest in each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentPath:
+    """Straight lines with parabolic blends: constant acceleration, constant velocity, constant deceleration.
+
+    Craig, Introduction to Robotics, section 7.3 ("linear function with parabolic blends"), along each segment's length.
+
+    points: (segments + 1, 3) [m]; durations: (segments,) [s]; accelerations: (segments,) [m/s^2], at least
+    `4 length / duration^2`, with which the blends meet in the middle.
+    """
+
+    points: Float[np.ndarray, "corners 3"]
+    durations: Float[np.ndarray, " segments"]
+    accelerations: Float[np.ndarray, " segments"]
+
+    def sample(
+        self, time: Float[np.ndarray, " times"]
+    ) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]:
+        """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; at rest before and after."""
+        starts = np.concatenate([[0.0], np.cumsum(self.durations)])
+        segment = np.clip(np.searchsorted(starts, time, side="right") - 1, 0, len(self.durations) - 1)
+        duration, acceleration = self.durations[segment], self.accelerations[segment]
+        step = np.diff(self.points, axis=0)
+        length = np.linalg.norm(step, axis=1)
+        direction = (step / np.where(length > 0, length, 1.0)[:, None])[segment]
+        length = length[segment]
+
+        root = np.sqrt(np.maximum((acceleration * duration) ** 2 - 4.0 * acceleration * length, 0.0))
+        blend = 0.5 * duration - 0.5 * root / acceleration
+        cruise = acceleration * blend
+        inside = (time >= 0) & (time < starts[-1])
+        elapsed = np.clip(time - starts[segment], 0.0, duration)
+        left = duration - elapsed
+        speeding, braking = elapsed < blend, left <= blend
+        travelled = np.where(
+            speeding,
+            0.5 * acceleration * elapsed**2,
+            np.where(braking, length - 0.5 * acceleration * left**2, cruise * (elapsed - 0.5 * blend)),
+        )
+        speed = np.where(speeding, acceleration * elapsed, np.where(braking, acceleration * left, cruise))
+        change = np.where(speeding, acceleration, np.where(braking & (blend > 0), -acceleration, 0.0))
+        return (
+            self.points[segment] + direction * travelled[:, None],
+            direction * np.where(inside, speed, 0.0)[:, None],
+            direction * np.where(inside, change, 0.0)[:, None],
+        )
+
+
+def random_path(
+    config: KukaSurfaceConfig, start: Float[np.ndarray, "3"], seconds: float, rng: np.random.Generator
+) -> SegmentPath:
+    """Random way-points just below the surface, from `start` [m], for at least `seconds` [s]."""
+    points, durations = [np.asarray(start, dtype=np.float64)], []
+    height = config.surface_height - config.waypoint_depth
+    while sum(durations) < seconds:
+        durations.append(rng.uniform(*config.segment_seconds))
+        points.append(np.array([rng.uniform(*config.waypoint_x), rng.uniform(*config.waypoint_y), height]))
+    corners, times = np.array(points), np.array(durations)
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    return SegmentPath(corners, times, np.maximum(config.least_acceleration, 4.0 * lengths / times**2))

@@ -1,0 +1,282 @@
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from tests.data.samples import assert_equal
+from tests.simulation.test_bullet import urdf
+
+from forcegp.data import REVOLUTE_UNITS, Dataset, require_disjoint
+from forcegp.errors import DatasetError, InvalidInput, SimulationError
+from forcegp.mechanics import Plane
+from forcegp.robots import Robot
+from forcegp.simulation import SCENARIOS, KukaSurfaceConfig, simulate_kuka_surface
+from forcegp.simulation.kuka_description import TOOL_LINK
+
+pytest.importorskip("pybullet")
+
+SHORT = KukaSurfaceConfig(seconds=1.0, settle_seconds=1.0, seed=5)
+"""Long enough to touch the surface, short enough to repeat."""
+
+
+@pytest.fixture(scope="module")
+def data() -> Dataset:
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=5.0, seed=3))
+
+
+@pytest.fixture(scope="module")
+def short() -> Dataset:
+    return simulate_kuka_surface(SHORT)
+
+
+def tensors(data: Dataset, *names: str) -> list[torch.Tensor]:
+    return [torch.tensor(data.truth[name] if name in data.truth else getattr(data, name)) for name in names]
+
+
+# ---------------------------------------------------------------- the physics, by forcegp's own robot
+
+
+def test_rigid_body_dynamics_holds_in_every_row(data):
+    q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
+    dynamics = data.system.dynamics(q, v, u)
+    force = u + unknown + (dynamics.A.mT @ multiplier[..., None])[..., 0]
+    found = data.system.robot.inverse_dynamics(q, v, a)
+    np.testing.assert_allclose(found, force, rtol=0, atol=1e-10)
+
+
+def test_the_constraint_with_baumgarte_holds_in_every_row(data):
+    q, v, u, a = tensors(data, "q", "v", "u", "a")
+    dynamics = data.system.dynamics(q, v, u)
+    residual = (dynamics.A @ a[..., None])[..., 0] - dynamics.b
+    assert float(residual.abs().max()) < 1e-10
+
+
+def test_gauss_principle_gives_acceleration_and_multiplier_from_the_true_force(data):
+    q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
+    dynamics = data.system.dynamics(q, v, u)
+    np.testing.assert_allclose(dynamics.acceleration(unknown), a, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(dynamics.multiplier(unknown), multiplier, rtol=0, atol=1e-8)
+
+
+def test_the_unknown_force_is_viscous_friction_at_the_tool_point(data):
+    q, v, unknown = tensors(data, "q", "v", "Q_U")
+    point = torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
+    jacobian = data.system.robot.frame_jacobian(q, TOOL_LINK, point)[:, :3]
+    friction = -1.0 * (jacobian @ v[..., None])
+    np.testing.assert_allclose(unknown, (jacobian.mT @ friction)[..., 0], atol=1e-12)
+
+
+def test_the_tool_stays_on_the_plane_and_points_down(data):
+    (q,) = tensors(data, "q")
+    pose = data.system.robot.frame_pose(q, TOOL_LINK).numpy()
+    tool = pose[:, :3, :3] @ [0.0, 0.0, 0.1] + pose[:, :3, 3]
+    assert np.abs(tool[:, 2] - 0.055).max() < 1e-3
+    np.testing.assert_allclose(pose[:, 2, 2], -1.0, atol=1e-4)
+    assert (np.abs(tool[:, 0]) < 0.51).all()
+    assert ((tool[:, 1] > 0.39) & (tool[:, 1] < 0.61)).all()
+
+
+def test_rows_follow_each_other_by_symplectic_euler(data):
+    step = 1.0 / 240.0
+    np.testing.assert_allclose(np.diff(data.time), step, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(data.v, axis=0), step * data.truth["a"][:-1], atol=1e-12)
+    np.testing.assert_allclose(np.diff(data.q, axis=0), step * data.v[1:], atol=1e-13)
+
+
+def test_limits_of_torque_are_kept(data):
+    limits = np.array([320, 320, 176, 176, 110, 40, 40])
+    assert (np.abs(data.u + 0.5 * data.v) <= limits).all()
+
+
+# ---------------------------------------------------------------- the Dataset
+
+
+def test_it_describes_itself(data):
+    assert len(data) == 1200
+    assert data.units == REVOLUTE_UNITS
+    assert data.episodes == (0,)
+    assert data.time_ordered
+    np.testing.assert_array_equal(data.noise_std, np.full(7, 0.1))
+    (contact,) = data.system.contacts
+    assert (contact.frame, tuple(contact.point)) == (TOOL_LINK, (0.0, 0.0, 0.1))
+    assert contact.surface == Plane((0.0, 0.0, 1.0), 0.055)
+    assert (data.system.baumgarte.omega, data.system.baumgarte.zeta) == (10.0, 1.0)
+    assert data.metadata["scenario"] == "kuka-surface"
+    assert KukaSurfaceConfig(**data.metadata["config"]) == KukaSurfaceConfig(seconds=5.0, seed=3)
+
+
+def test_it_comes_back_from_a_file_with_its_robot(short, tmp_path):
+    short.save(tmp_path / "log.h5")
+    loaded = Dataset.load(tmp_path / "log.h5")
+    assert_equal(loaded, short)
+    assert loaded.system.to_json() == short.system.to_json()
+    q, v, u = tensors(short, "q", "v", "u")
+    np.testing.assert_array_equal(loaded.system.dynamics(q, v, u).M, short.system.dynamics(q, v, u).M)
+
+
+def test_noise_has_the_stated_distribution(data):
+    noise = data.a - data.truth["a"]
+    assert noise.std() == pytest.approx(0.1, rel=0.05)
+    assert abs(noise.mean()) < 0.005
+    assert np.abs(np.corrcoef(noise.T) - np.eye(7)).max() < 0.12
+    assert np.abs(np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1]) < 0.12
+
+
+# ---------------------------------------------------------------- seeds
+
+
+def test_equal_seeds_give_equal_data(short):
+    assert_equal(simulate_kuka_surface(SHORT), short)
+
+
+def test_the_noise_leaves_the_motion_as_it_is(short):
+    silent = simulate_kuka_surface(dataclasses.replace(SHORT, noise=0.0))
+    assert silent.noise_std is None
+    np.testing.assert_array_equal(silent.a, silent.truth["a"])
+    for name in ("q", "v", "u"):
+        np.testing.assert_array_equal(getattr(silent, name), getattr(short, name))
+    loud = simulate_kuka_surface(dataclasses.replace(SHORT, noise=0.2))
+    np.testing.assert_allclose(loud.a - silent.a, 2 * (short.a - silent.a), atol=1e-12)
+
+
+def test_other_seeds_and_episodes_are_other_trajectories(short):
+    two = simulate_kuka_surface(dataclasses.replace(SHORT, episodes=2))
+    first, second = two.split_by_episode([1])
+    assert_equal(dataclasses.replace(first, metadata={}), dataclasses.replace(short, metadata={}))
+    other = simulate_kuka_surface(dataclasses.replace(SHORT, seed=6))
+    for one, another in ((first, second), (short, other), (second, other)):
+        assert np.abs(one.q - another.q).max() > 0.1
+        assert abs(np.corrcoef((one.a - one.truth["a"]).ravel(), (another.a - another.truth["a"]).ravel())[0, 1]) < 0.1
+        require_disjoint(one, another)
+
+
+def test_two_samples_of_one_simulation_are_recognised(short):
+    with pytest.raises(DatasetError, match="same trajectory"):
+        require_disjoint(short.rows(slice(0, None, 2)), short.rows(slice(1, None, 2)))
+
+
+def test_a_longer_recording_begins_like_a_shorter_one(short):
+    longer = simulate_kuka_surface(dataclasses.replace(SHORT, seconds=1.5))
+    np.testing.assert_array_equal(longer.q[: len(short)], short.q)
+    np.testing.assert_array_equal(longer.a[: len(short)], short.a)
+
+
+def test_progress_is_reported_up_to_the_end():
+    reports = []
+    simulate_kuka_surface(dataclasses.replace(SHORT, episodes=2), lambda step, total: reports.append((step, total)))
+    steps = [step for step, _ in reports]
+    assert steps == sorted(steps)
+    assert {total for _, total in reports} == {960}
+    assert reports[-1] == (960, 960)
+
+
+# ---------------------------------------------------------------- what it refuses
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("seconds", 0.0, "from 0.1 to 1e5 s"),
+        ("seconds", float("nan"), "from 0.1 to 1e5 s"),
+        ("seconds", float("inf"), "from 0.1 to 1e5 s"),
+        ("seconds", "long", "from 0.1 to 1e5 s"),
+        ("noise", -0.1, ">= 0"),
+        ("seed", -1, "an integer from 0"),
+        ("seed", 1.5, "an integer from 0"),
+        ("episodes", 0, "an integer from 1"),
+        ("time_step", 0.1, "from 1e-5 to 0.01 s"),
+        ("settle_seconds", 0.0, "from 0.5"),
+        ("tool_mass", 0.0, "> 0"),
+        ("tool_mass", (1.0,), "one number"),
+        ("tool_point", 0.1, "3 numbers"),
+        ("tool_point", (0.0, 0.1), "3 numbers"),
+        ("tool_inertia", (0.1, -0.1, 0.1), "> 0"),
+        ("friction", -1.0, ">= 0"),
+        ("null_space_joints", (0,), "an integer from 1 to 7"),
+        ("waypoint_x", (0.5, -0.5), "must not exceed"),
+        ("segment_seconds", (0.0, 1.0), "from 0.05"),
+    ],
+)
+def test_wrong_numbers_are_named_with_their_range(field, value, message):
+    with pytest.raises(InvalidInput, match=message) as error:
+        KukaSurfaceConfig(**{field: value})
+    assert str(error.value).startswith(field)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"segment_seconds": (50.0, 50.0), "least_acceleration": 1e-3},
+            "episode 0: no contact within",
+        ),
+        ({"time_step": 0.01, "controller_omega": 400.0}, "episode 0 diverged after"),
+        ({"waypoint_x": (0.0, 0.1), "waypoint_y": (1.5, 1.6)}, "episode 0"),
+        ({"torque_limits": (320, 60, 176, 176, 110, 40, 40)}, "episode 0"),
+    ],
+)
+def test_data_of_no_use_are_not_returned(changes, message):
+    with pytest.raises(SimulationError, match=message):
+        simulate_kuka_surface(dataclasses.replace(SHORT, **changes))
+
+
+# ---------------------------------------------------------------- the registry
+
+
+def test_scenarios_are_found_by_name(short):
+    scenario = SCENARIOS["kuka-surface"]
+    assert scenario.config is KukaSurfaceConfig
+    assert_equal(scenario.simulate(SHORT), short)
+    with pytest.raises(InvalidInput, match="takes KukaSurfaceConfig"):
+        scenario.simulate({"seconds": 5})
+
+
+def test_listing_scenarios_and_their_options_loads_no_library():
+    code = (
+        "import sys; from forcegp.simulation import SCENARIOS; SCENARIOS['kuka-surface'].config(); "
+        "print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numpy", "torch", "h5py", "pybullet"} & set(run.stdout.split())
+
+
+# ---------------------------------------------------------------- the paper's data
+
+
+@pytest.fixture(scope="module")
+def paper(shared) -> dict[str, np.ndarray]:
+    with np.load(shared("reference/kuka_paper.npz")) as file:
+        return dict(file)
+
+
+def test_the_robot_of_the_scenario_is_the_papers(paper, data):
+    robot = Robot.from_urdf_text(urdf(tool_center_of_mass=(0.0, 0.0, 0.02)), gravity=(0.0, 0.0, -9.8))
+    q, v, u = (torch.tensor(paper[f"test_{name}"]) for name in "qvu")
+    np.testing.assert_allclose(robot.mass_matrix(q), paper["test_M"], atol=1e-9)
+    np.testing.assert_allclose(robot.bias_forces(q, v), -paper["test_f"] - paper["test_g"], atol=1e-9)
+    dynamics = data.system.dynamics(q, v, u)
+    np.testing.assert_allclose(dynamics.A, paper["test_A"], atol=1e-9)
+    np.testing.assert_allclose(dynamics.b, paper["test_b"], atol=1e-9)
+    unknown = torch.tensor(paper["test_Q_U"])
+    np.testing.assert_allclose(dynamics.acceleration(unknown), paper["test_a"], atol=1e-8)
+    np.testing.assert_allclose(dynamics.multiplier(unknown), paper["test_lambda"], atol=1e-8)
+
+
+def test_motion_and_forces_are_distributed_as_in_the_paper(paper):
+    data = simulate_kuka_surface(KukaSurfaceConfig(seconds=30.0, seed=0))
+    columns = {"q": data.q, "v": data.v, "u": data.u[:, :6], "a": data.truth["a"], "Q_U": data.truth["Q_U"][:, :6]}
+    for name, values in columns.items():
+        published = {part: paper[f"{part}_{name}"][:, : values.shape[1]] for part in ("train", "test")}
+        ratio = values.std(axis=0) / published["test"].std(axis=0)
+        assert ((ratio > 0.6) & (ratio < 1.7)).all(), (name, ratio)
+        # The training rows are the extremes of 218 s; 30 s must lie inside them, with a margin, and fill a part.
+        lower, upper = published["train"].min(axis=0), published["train"].max(axis=0)
+        margin = 0.15 * (upper - lower)
+        assert (values.min(axis=0) > lower - margin).all(), name
+        assert (values.max(axis=0) < upper + margin).all(), name
+        assert (np.ptp(values, axis=0) > 0.25 * (upper - lower)).all(), name
+    multiplier = data.truth["lambda"][:, 0]
+    assert np.median(multiplier) == pytest.approx(np.median(paper["test_lambda"]), abs=1.5)
+    assert 0.06 < (multiplier < 0).mean() < 0.20  # 11.6 % in the paper's data
