@@ -1,9 +1,9 @@
 """Small valid Datasets for the tests."""
 
 import numpy as np
-from forcegp.mechanics import MechanicalSystem
 
 from forcegp.data import REVOLUTE_UNITS, Dataset
+from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 
 NAMES = ("shoulder", "elbow")

@@ -89,7 +89,7 @@ def test_other_wrong_arguments_are_refused(rate, order):
 def test_too_few_rows_are_refused():
     # Poles of the analogue filter of order 2: 2 pi f_c at 45 degrees; log(1000) / (2 pi 0.01 / sqrt(2)) = 155 rows.
     zero_phase_low_pass(np.zeros((157, 1)), 1000.0, 10.0, 2)
-    with pytest.raises(DatasetError, match="154 rows are too few for a filter of order 2 with a cut-off at 10.0 Hz"):
+    with pytest.raises(DatasetError, match="154 rows are too few for a filter of order 2 with a cut-off"):
         zero_phase_low_pass(np.zeros((154, 1)), 1000.0, 10.0, 2)
 
 
