@@ -201,6 +201,15 @@ def test_nothing_outside_the_file_is_read(file, tmp_path):
             Dataset.load(file)
 
 
+def test_a_group_outside_the_file_is_not_read(file, tmp_path):
+    complete().save(tmp_path / "other.h5")
+    with h5py.File(file, "a") as opened:
+        del opened["truth"]
+        opened["truth"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/truth")
+    with pytest.raises(FileFormatError, match="'truth' must be a group in this file"):
+        Dataset.load(file)
+
+
 def test_a_shape_that_the_file_does_not_hold_is_refused_before_memory_is_taken(file):
     with h5py.File(file, "a") as opened:
         del opened["q"]

@@ -122,10 +122,9 @@ def _read(path: Path, file: h5py.File) -> dict[str, Any]:
 def _truth_names(path: Path, file: h5py.File) -> list[str]:
     if "truth" not in file:
         return []
-    group = file["truth"]
-    if not isinstance(group, h5py.Group):
-        raise FileFormatError(f"{path}: 'truth' must be a group.")
-    return list(group)
+    if not isinstance(file.get("truth", getlink=True), h5py.HardLink) or not isinstance(file["truth"], h5py.Group):
+        raise FileFormatError(f"{path}: 'truth' must be a group in this file.")
+    return list(file["truth"])
 
 
 def _stored(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
