@@ -214,6 +214,7 @@ def test_wrong_numbers_are_named_with_their_range(field, value, message):
         ),
         ({"time_step": 0.01, "controller_omega": 400.0}, "episode 0 diverged after"),
         ({"waypoint_x": (0.0, 0.1), "waypoint_y": (1.5, 1.6)}, "episode 0"),
+        ({"start_degrees": (0,) * 7}, "episode 0"),
         ({"torque_limits": (320, 60, 176, 176, 110, 40, 40)}, "episode 0"),
     ],
 )

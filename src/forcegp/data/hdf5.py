@@ -122,9 +122,10 @@ def _read(path: Path, file: h5py.File) -> dict[str, Any]:
 def _truth_names(path: Path, file: h5py.File) -> list[str]:
     if "truth" not in file:
         return []
-    if not isinstance(file.get("truth", getlink=True), h5py.HardLink) or not isinstance(file["truth"], h5py.Group):
+    group = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
+    if not isinstance(group, h5py.Group):
         raise FileFormatError(f"{path}: 'truth' must be a group in this file.")
-    return list(file["truth"])
+    return list(group)
 
 
 def _stored(path: Path, file: h5py.File, name: str) -> h5py.Dataset:

@@ -119,16 +119,17 @@ def _simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report
         reference = path.sample(config.time_step * np.arange(steps))
         for step in range(steps):
             q, v = arm.state()
-            if not np.abs(v).max() < DIVERGED:
-                raise SimulationError(
-                    f"episode {episode} diverged after {step * config.time_step:.3g} s (joint velocity "
-                    f"{np.abs(v).max():.3g} rad/s). "
-                    "Use the published constants, a shorter time_step or a softer controller."
-                )
+            _require_bounded(config, v, episode, step)
             mass, bias = arm.mass_matrix(q), arm.bias_forces(q, v)
             position, quaternion, jacobian, bias_acceleration = arm.tool(v)
             aim = (reference[0][step], reference[1][step], reference[2][step])
-            wanted = controller.joint_acceleration(q, v, jacobian, bias_acceleration, position, quaternion, aim)
+            try:
+                wanted = controller.joint_acceleration(q, v, jacobian, bias_acceleration, position, quaternion, aim)
+            except np.linalg.LinAlgError as error:
+                raise SimulationError(
+                    f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
+                    "Start from another posture (start_degrees) or keep the way-points nearer."
+                ) from error
             asked = mass @ wanted + bias + config.joint_damping * v
             commanded = np.clip(asked, -limits, limits)
             u = commanded - config.joint_damping * v
@@ -148,6 +149,7 @@ def _simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report
             if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
                 report(step + 1)
         columns["q"][steps], columns["v"][steps] = arm.state()
+        _require_bounded(config, columns["v"][steps], episode, steps)
 
     if touched_at is None or touched_at > settle:
         raise SimulationError(
@@ -167,6 +169,14 @@ def _simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report
         saturated=saturated[recorded],
         time=config.time_step * np.arange(settle, steps),
     )
+
+
+def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:
+    if not np.abs(v).max() < DIVERGED:  # also NaN
+        raise SimulationError(
+            f"episode {episode} diverged after {step * config.time_step:.3g} s (joint velocity {np.abs(v).max():.3g} "
+            "rad/s). Use the published constants, a shorter time_step or a softer controller."
+        )
 
 
 def _multiplier(
