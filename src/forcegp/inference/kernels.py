@@ -15,7 +15,9 @@ from gpytorch.kernels import Kernel, RBFKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
-from torch.utils.checkpoint import checkpoint
+from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
+
+from forcegp.errors import InvalidInput
 
 
 def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N"]:
@@ -27,12 +29,14 @@ def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N
     dense = _DenseKernel(kernel)
     # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own ones back.
     names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
-    return checkpoint(
-        lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
-        z,
-        *values,
-        use_reentrant=False,
-    )
+    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims` back.
+    with set_checkpoint_early_stop(False):
+        return checkpoint(
+            lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
+            z,
+            *values,
+            use_reentrant=False,
+        )
 
 
 def kernel_cross(kernel: Kernel, z: Float[Tensor, "n d"], z_train: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
@@ -49,11 +53,17 @@ def kernel_diagonal(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n
 
 
 class LatentKernels(torch.nn.Module):
-    """One GPyTorch kernel per latent; parameters are read and replaced as one dictionary of unconstrained tensors."""
+    """One GPyTorch kernel per latent; parameters are read and replaced as one dictionary of unconstrained tensors.
+
+    Raises InvalidInput for kernels that are not float64 (GPyTorch makes them float32).
+    """
 
     def __init__(self, kernels: Iterable[Kernel]) -> None:
         super().__init__()
         self.kernels = torch.nn.ModuleList(kernels)
+        for name, value in self.named_parameters():
+            if value.dtype != torch.float64:
+                raise InvalidInput(f"{name} is {value.dtype}; inference needs float64, call .double() on the kernel.")
 
     def forward(self, features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
         """One dense matrix per latent."""
@@ -116,11 +126,14 @@ class _SquaredExponential(torch.autograd.Function):
         return K
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        if torch.is_grad_enabled():  # create_graph=True: `once_differentiable` lets it pass where upstream is a constant
+            raise NotImplementedError(
+                "this kernel matrix has first derivatives only; for a Hessian take finite differences of its gradient"
+            )
         z, lengthscale, outputscale, K = ctx.saved_tensors
         weighted = upstream * K
-        scaled = z / lengthscale
+        scaled = (z - z.mean(0)) / lengthscale  # centred, or features far from zero cancel below
         product = weighted @ scaled
         rows, columns = weighted.sum(1), weighted.sum(0)
         z_gradient = lengthscale_gradient = None

@@ -69,8 +69,9 @@ class LatentPosterior:
                 for k, z, z_train in zip(self.kernels.kernels, features, self.features, strict=True)
             ]
         )
-        V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, -1)
-        V = self.system.factor.solve_lower(V).reshape(count * rank, latents, -1).permute(2, 1, 0)
+        points = cross.shape[1]
+        V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, latents * points)
+        V = self.system.factor.solve_lower(V).reshape(count * rank, latents, points).permute(2, 1, 0)
         prior = torch.stack(
             [kernel_diagonal(k, z) for k, z in zip(self.kernels.kernels, features, strict=True)], dim=-1
         )
