@@ -29,7 +29,7 @@ def dense_negative_log_likelihood(W, residual, noise, kernel_matrices):
 
 def precise_value_and_gradients(W, residual, noise, kernel_matrices):
     """Value and gradients with respect to W, residual, noise (1, D) and each kernel matrix, from S^-1 in 40 digits."""
-    count, outputs, latents = W.shape
+    count, outputs, _ = W.shape
     with mpmath.workdps(40):
         exact = np.vectorize(lambda number: mpmath.mpf(float(number)), otypes=[object])
         w, y, variances = (exact(tensor.detach().numpy()) for tensor in (W, residual, noise))
@@ -51,7 +51,7 @@ def precise_value_and_gradients(W, residual, noise, kernel_matrices):
 
 
 def dense_posterior(W, residual, noise, kernel_matrices, cross, prior):
-    """Mean (n, C) and covariance (n, C, C) of the latents, from k_c(z*, z_j) in `cross` (C, n, N) and k_c(z*, z*) in `prior` (n, C)."""
+    """Mean (n, C) and covariance (n, C, C) of the latents from k_c(z*, z_j) (C, n, N) and k_c(z*, z*) (n, C)."""
     count, outputs, _ = W.shape
     S = dense_covariance(W, noise, kernel_matrices)
     with_data = torch.einsum("cnj,jdc->ncjd", cross, W).reshape(prior.shape[0], prior.shape[1], count * outputs)

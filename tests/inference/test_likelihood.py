@@ -115,7 +115,7 @@ def test_points_of_differing_rank(panel_bytes, monkeypatch):
 
 
 def test_an_arm_with_a_light_wrist_keeps_its_precision():
-    """H_77 ~ 1000 at noise 0.01, as on the iiwa, makes the dense covariance lose digits; 40 digits are the oracle here."""
+    """H_77 ~ 1000 at noise 0.01, as on the iiwa, makes the dense covariance lose digits: 40 digits are the oracle."""
     given_problem = problem(count=5, outputs=3, constraints=1)
     scale = torch.tensor([1.0, 5.0, 40.0], dtype=torch.float64)
     given_problem.W = scale[:, None] * given_problem.W * scale

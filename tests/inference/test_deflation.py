@@ -1,0 +1,111 @@
+"""Deflation is a change of variables: nothing may depend on the basis, and nothing may get lost."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.inference.dense import dense_covariance
+from tests.inference.problems import constrained_inverse_mass, normal, problem
+
+from forcegp.inference.deflation import Deflation, deflate, whiten
+from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
+
+seeds = st.integers(0, 10_000)
+shapes = st.tuples(st.integers(1, 6), st.integers(1, 5), st.integers(1, 6))
+
+
+def quadratic_and_log_determinant(system: DeflatedSystem) -> torch.Tensor:
+    quadratic = (system.deflation.t * system.alpha).sum() + system.deflation.remainder.square().sum()
+    return torch.stack([quadratic, system.factor.log_determinant()])
+
+
+@settings(max_examples=50)
+@given(shape=shapes, seed=seeds)
+def test_it_is_exact_and_orthonormal(shape, seed):
+    count, outputs, latents = shape
+    W, y = normal(*shape, seed=seed), normal(count, outputs, seed=seed + 1)
+    deflation = deflate(W, y)
+    U = deflation.U
+    assert deflation.rank == min(outputs, latents)
+    identity = torch.eye(deflation.rank, dtype=torch.float64).expand(count, -1, -1)
+    torch.testing.assert_close(U.mT @ U, identity, rtol=0.0, atol=1e-13)
+    torch.testing.assert_close(U @ deflation.C, W, rtol=0.0, atol=1e-13)
+    torch.testing.assert_close((U @ deflation.t[..., None])[..., 0] + deflation.remainder, y, rtol=0.0, atol=1e-13)
+    assert float((U.mT @ deflation.remainder[..., None]).abs().max()) < 1e-13
+
+
+@settings(max_examples=30)
+@given(seed=seeds)
+def test_any_other_basis_gives_the_same(seed):
+    given_problem = problem(count=5, outputs=4, constraints=1, seed=seed)
+    W_white, y_white, _ = whiten(*given_problem.data)
+    with torch.no_grad():
+        deflation = deflate(W_white, y_white)
+        matrices = given_problem.kernels(given_problem.features)
+        Q = torch.linalg.qr(normal(5, deflation.rank, deflation.rank, seed=seed)).Q
+        turned = Deflation(
+            deflation.U @ Q.mT, Q @ deflation.C, (Q @ deflation.t[..., None])[..., 0], deflation.remainder
+        )
+        here, there = (solve_deflated(basis, matrices) for basis in (deflation, turned))
+        torch.testing.assert_close(quadratic_and_log_determinant(here), quadratic_and_log_determinant(there))
+        torch.testing.assert_close(here.beta, there.beta, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("constraints", [0, 1, 2, 3])
+def test_each_constraint_saves_one_dimension(constraints):
+    """H A^T = 0 up to rounding, also where H is large."""
+    H = 1e3 * constrained_inverse_mass(20, 4, constraints)
+    assert deflate(H, normal(20, 4)).rank == 4 - constraints
+
+
+def test_points_of_lower_rank_keep_an_orthonormal_basis():
+    W = constrained_inverse_mass(4, 3, 0)
+    W[1] = constrained_inverse_mass(1, 3, 2)[0]
+    W[2] = 0.0
+    y = normal(4, 3)
+    deflation = deflate(W, y)
+    assert deflation.rank == 3
+    torch.testing.assert_close(deflation.U.mT @ deflation.U, torch.eye(3, dtype=torch.float64).expand(4, -1, -1))
+    torch.testing.assert_close(deflation.U @ deflation.C, W)
+    assert not deflation.C[2].any()
+
+
+def test_nothing_to_deflate():
+    deflation = deflate(torch.zeros(4, 3, 2, dtype=torch.float64), normal(4, 3))
+    assert deflation.rank == 0
+    assert torch.equal(deflation.remainder, normal(4, 3))
+    assert deflate(torch.zeros(0, 3, 2, dtype=torch.float64), normal(0, 3)).U.shape[0] == 0
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["one per point", "shared"])
+@pytest.mark.parametrize("covariances", [False, True], ids=["variances", "covariances"])
+def test_whitening(covariances, shared):
+    given_problem = problem(count=6, outputs=3)
+    noise = given_problem.noise[:1] if shared else given_problem.noise
+    R = torch.diag_embed(noise)
+    if covariances:
+        factor = 0.2 * normal(len(noise), 3, 3, seed=4)
+        noise = R = R + factor @ factor.mT
+    W_white, y_white, half_log_determinant = whiten(given_problem.W, given_problem.residual, noise)
+    R = R.expand(6, 3, 3)
+    expected = given_problem.W.mT @ torch.linalg.solve(R, given_problem.W)
+    torch.testing.assert_close(W_white.mT @ W_white, expected)
+    torch.testing.assert_close(
+        W_white.mT @ y_white[..., None], given_problem.W.mT @ torch.linalg.solve(R, given_problem.residual[..., None])
+    )
+    torch.testing.assert_close(half_log_determinant, 0.5 * torch.logdet(R).sum())
+
+
+def test_the_deflated_covariance_has_the_spectrum_of_the_dense_one():
+    """S~ = U T U^T + (I - U U^T) U^T: eigenvalues of T, and ones."""
+    given_problem = problem(count=5, outputs=4, constraints=2)
+    W_white, y_white, _ = whiten(*given_problem.data)
+    with torch.no_grad():
+        matrices = given_problem.kernels(given_problem.features)
+        system = solve_deflated(deflate(W_white, y_white), matrices)
+        lower = system.factor.lower.tril()
+        deflated = torch.linalg.eigvalsh(lower @ lower.mT)
+        dense = torch.linalg.eigvalsh(dense_covariance(W_white, torch.ones(1, 4, dtype=torch.float64), matrices))
+    assert deflated.shape == (10,)
+    expected = torch.cat([deflated, torch.ones(10, dtype=torch.float64)]).sort().values
+    torch.testing.assert_close(dense, expected, rtol=1e-10, atol=1e-10)

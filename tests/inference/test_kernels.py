@@ -1,0 +1,199 @@
+import gpytorch.kernels as gk
+import pytest
+import torch
+from gpytorch.constraints import Positive
+from tests.inference.dense import squared_exponential
+from tests.inference.problems import normal
+
+from forcegp.errors import InvalidInput
+from forcegp.inference import LatentKernels
+from forcegp.inference.kernels import kernel_cross, kernel_diagonal, kernel_matrix
+
+
+def scaled_rbf(dimension: int | None = None) -> gk.ScaleKernel:
+    kernel = gk.ScaleKernel(gk.RBFKernel(ard_num_dims=dimension)).double()
+    kernel.base_kernel.lengthscale = 0.7 + 0.3 * torch.arange(dimension or 1, dtype=torch.float64)
+    kernel.outputscale = 1.7
+    return kernel
+
+
+def log_scaled_rbf() -> gk.ScaleKernel:
+    def positive() -> Positive:
+        return Positive(transform=torch.exp, inv_transform=torch.log)
+
+    base = gk.RBFKernel(ard_num_dims=3, lengthscale_constraint=positive())
+    return gk.ScaleKernel(base, outputscale_constraint=positive()).double()
+
+
+def periodic() -> gk.Kernel:
+    kernel = gk.PeriodicKernel().double()
+    kernel.period_length = 4.0
+    return kernel
+
+
+KERNELS = {
+    "SE, one length scale": scaled_rbf,
+    "SE, one length scale per input": lambda: scaled_rbf(3),
+    "SE, logarithmic": log_scaled_rbf,
+    "SE, some inputs": lambda: gk.ScaleKernel(gk.RBFKernel(ard_num_dims=2, active_dims=(0, 2))).double(),
+    "SE, some inputs, one length scale": lambda: gk.ScaleKernel(gk.RBFKernel(active_dims=(0, 2))).double(),
+    "RBF alone": lambda: gk.RBFKernel(ard_num_dims=3).double(),
+    "Matern 5/2": lambda: gk.ScaleKernel(gk.MaternKernel(2.5, ard_num_dims=3)).double(),
+    "rational quadratic": lambda: gk.ScaleKernel(gk.RQKernel()).double(),
+    "periodic": lambda: gk.ScaleKernel(periodic()).double(),
+    "linear": lambda: gk.LinearKernel().double(),
+    "sum": lambda: (gk.ScaleKernel(gk.RBFKernel()) + gk.LinearKernel()).double(),
+}
+
+
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+def test_matrix_cross_and_diagonal_agree_with_gpytorch_and_each_other(kernel):
+    kernel, z, other = kernel(), normal(7, 3), normal(4, 3, seed=1)
+    matrix = kernel_matrix(kernel, z)
+    torch.testing.assert_close(matrix, kernel(z, z).to_dense(), rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(matrix, matrix.mT, rtol=0.0, atol=1e-15)
+    torch.testing.assert_close(kernel_cross(kernel, other, z), kernel(other, z).to_dense(), rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(kernel_cross(kernel, z, z), matrix, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(kernel_diagonal(kernel, z), matrix.diagonal(), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+def test_gradients_are_those_of_gpytorch(kernel):
+    """With a weight that is not symmetric, as any upstream gradient may be."""
+    kernel, z, weight = kernel(), normal(7, 3).requires_grad_(), normal(7, 7, seed=1)
+    leaves = [z, *kernel.parameters()]
+    gradients = torch.autograd.grad((weight * kernel_matrix(kernel, z)).sum(), leaves)
+    expected = torch.autograd.grad((weight * kernel(z, z).to_dense()).sum(), leaves)
+    for gradient, reference in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(gradient, reference, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+def test_a_backward_pass_leaves_the_kernel_as_it_was(kernel):
+    """GPyTorch takes `active_dims` off during its own call; a recomputation that is cut short must not lose them."""
+    kernel, z = kernel(), normal(7, 3)
+    first = kernel_matrix(kernel, z)
+    first.sum().backward()
+    assert torch.equal(kernel_matrix(kernel, z), first)
+
+
+@pytest.mark.parametrize("dimension", [None, 1, 3])
+def test_squared_exponential_against_its_definition(dimension):
+    kernel = scaled_rbf(dimension)
+    z, other = normal(6, dimension or 3), normal(4, dimension or 3, seed=1)
+    arguments = kernel.base_kernel.lengthscale.detach(), kernel.outputscale.detach()
+    with torch.no_grad():
+        torch.testing.assert_close(
+            kernel_matrix(kernel, z), squared_exponential(z, z, *arguments), rtol=1e-14, atol=0.0
+        )
+        torch.testing.assert_close(kernel_cross(kernel, other, z), squared_exponential(other, z, *arguments))
+
+
+@pytest.mark.parametrize("dimension", [None, 1, 3])
+def test_squared_exponential_gradcheck(dimension):
+    kernel = scaled_rbf(dimension)
+    z = normal(4, dimension or 2).requires_grad_()
+    names, parameters = zip(*kernel.named_parameters(), strict=True)
+
+    def matrix(z, *parameters):
+        latent = LatentKernels([kernel])
+        given = {f"kernels.0.{name}": value for name, value in zip(names, parameters, strict=True)}
+        return latent.matrices(given, [z])[0]
+
+    assert torch.autograd.gradcheck(matrix, (z, *parameters))
+
+
+def test_duplicate_points_are_perfectly_correlated():
+    z = normal(5, 3)[[0, 1, 1, 0, 2]]
+    K = kernel_matrix(scaled_rbf(3), z).detach()
+    torch.testing.assert_close(K[0, 3], K[0, 0], rtol=1e-14, atol=0.0)
+    assert torch.linalg.eigvalsh(K)[0] > -1e-13
+
+
+@pytest.mark.parametrize("shift", [1e3, 1e6])
+def test_features_far_from_zero_lose_nothing(shift):
+    """Differences alone count, so neither values nor gradients may cancel; the rounding of the shift itself remains."""
+    kernel, weight = scaled_rbf(3), normal(6, 6, seed=1)
+    near = (normal(6, 3) * 2**10).round() / 2**10  # so that near + shift is exact
+    leaves = [near.clone().requires_grad_(), *kernel.parameters()]
+    expected = torch.autograd.grad((weight * kernel(leaves[0], leaves[0]).to_dense()).sum(), leaves)
+    far = (near + shift).requires_grad_()
+    gradients = torch.autograd.grad((weight * kernel_matrix(kernel, far)).sum(), [far, *kernel.parameters()])
+    for gradient, reference in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(gradient, reference, rtol=0.0, atol=1e-15 * shift + 1e-13)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            kernel_cross(kernel, near[:2] + shift, far),
+            kernel_cross(kernel, near[:2], near),
+            rtol=0.0,
+            atol=1e-15 * shift,
+        )
+
+
+def test_second_derivatives_are_refused_and_never_silently_wrong():
+    z = normal(4, 3).requires_grad_()
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        torch.autograd.grad(kernel_matrix(scaled_rbf(3), z).sum(), z, create_graph=True)
+
+
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+def test_no_points(kernel):
+    kernel, z = kernel(), normal(0, 3)
+    assert kernel_matrix(kernel, z).shape == (0, 0)
+    assert kernel_diagonal(kernel, z).shape == (0,)
+    assert kernel_cross(kernel, normal(2, 3), z).shape == (2, 0)
+
+
+# ---------------------------------------------------------------- several latents
+
+
+def three_kernels() -> LatentKernels:
+    return LatentKernels([scaled_rbf(3), gk.MaternKernel(2.5).double(), gk.LinearKernel().double()])
+
+
+def test_matrices_at_other_parameters_and_their_gradients():
+    """`functional_call` and the recomputation of checkpointed kernels meet here: both must see the given parameters."""
+    kernels, features = three_kernels(), [normal(5, 3, seed=c) for c in range(3)]
+    kept = kernels.initial_parameters()
+    moved = {name: (value + 0.3).requires_grad_() for name, value in kept.items()}
+    matrices = kernels.matrices(moved, features)
+    weights = [normal(5, 5, seed=10 + c) for c in range(3)]
+    total = sum((weight * K).sum() for weight, K in zip(weights, matrices, strict=True))
+    gradients = torch.autograd.grad(total, list(moved.values()))
+    for name, value in kernels.named_parameters():
+        assert torch.equal(value, kept[name])
+        value.data += 0.3
+    plain = [kernel(z, z).to_dense() for kernel, z in zip(kernels.kernels, features, strict=True)]
+    expected = torch.autograd.grad(
+        sum((weight * K).sum() for weight, K in zip(weights, plain, strict=True)), list(kernels.parameters())
+    )
+    for K, reference in zip(matrices, plain, strict=True):
+        torch.testing.assert_close(K, reference)
+    for gradient, reference in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(gradient, reference)
+
+
+def test_a_copy_at_other_parameters_leaves_the_original_alone():
+    kernels = three_kernels()
+    before = kernels.initial_parameters()
+    moved = {name: value + 1.0 for name, value in before.items()}
+    copy = kernels.at(moved)
+    for name, value in copy.named_parameters():
+        assert torch.equal(value, moved[name])
+        assert not value.requires_grad
+        value.data += 1.0
+    for name, value in kernels.named_parameters():
+        assert torch.equal(value, before[name])
+        assert value.requires_grad
+    for name, value in before.items():
+        assert torch.equal(moved[name], value + 1.0)
+
+
+def test_float32_kernels_are_refused():
+    with pytest.raises(InvalidInput, match=r"kernels.1.raw_outputscale is torch.float32; .* call .double\(\)"):
+        LatentKernels([scaled_rbf(), gk.ScaleKernel(gk.RBFKernel())])
+
+
+def test_as_many_features_as_kernels():
+    with pytest.raises(ValueError, match="shorter"):
+        three_kernels()([normal(5, 3)] * 2)

@@ -1,0 +1,300 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forcegp.errors import FitError, InvalidInput, NumericalError
+from forcegp.inference import OptimizerOptions, best_of, minimize_objective
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def rosenbrock(parameters):
+    x = parameters["x"]
+    return (100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2).sum()
+
+
+def start() -> dict[str, torch.Tensor]:
+    return {"x": tensor(-1.2, 1.0)}
+
+
+def falling(values) -> bool:
+    return bool((np.diff(values) <= 0.0).all())
+
+
+# ---------------------------------------------------------------- it finds optima
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000), size=st.integers(1, 6))
+def test_a_convex_quadratic(seed, size):
+    rng = np.random.default_rng(seed)
+    factor = rng.normal(size=(size, size))
+    P, optimum = torch.as_tensor(factor @ factor.T + 0.1 * np.eye(size)), torch.as_tensor(rng.normal(size=size))
+    result = minimize_objective(
+        lambda p: 0.5 * (p["x"] - optimum) @ P @ (p["x"] - optimum) + 7.0,
+        {"x": torch.as_tensor(rng.normal(size=size))},
+        OptimizerOptions(tolerance=0.0, gradient_tolerance=1e-8),
+    )
+    assert result.converged
+    assert result.value == pytest.approx(7.0)
+    torch.testing.assert_close(result.parameters["x"], optimum, rtol=0.0, atol=1e-6)
+
+
+def test_rosenbrock():
+    result = minimize_objective(rosenbrock, start(), OptimizerOptions(gradient_tolerance=1e-6))
+    assert result.converged
+    assert "CONVERGENCE" in result.status
+    torch.testing.assert_close(result.parameters["x"], tensor(1.0, 1.0), rtol=0.0, atol=1e-5)
+    assert falling(result.history)
+    assert result.history[0] == float(rosenbrock(start()))
+    assert result.history[-1] == pytest.approx(result.value)
+    assert result.evaluations >= len(result.history)
+    assert result.cpu_seconds >= 0.0
+
+
+def test_several_parameters_of_any_shape_come_back_in_shape():
+    initial = {"scalar": tensor(3.0)[0], "matrix": torch.ones(2, 3, dtype=torch.float64), "empty": tensor()}
+    result = minimize_objective(lambda p: (p["scalar"] - 1.0) ** 2 + (p["matrix"] + 2.0).square().sum(), initial)
+    assert {name: value.shape for name, value in result.parameters.items()} == {
+        name: value.shape for name, value in initial.items()
+    }
+    assert float(result.parameters["scalar"]) == pytest.approx(1.0, abs=1e-4)
+    torch.testing.assert_close(result.parameters["matrix"], torch.full((2, 3), -2.0).double(), rtol=0.0, atol=1e-4)
+
+
+def test_what_the_caller_owns_is_not_changed():
+    initial = {"x": start()["x"].requires_grad_()}
+    result = minimize_objective(rosenbrock, initial, OptimizerOptions(adam_steps=3))
+    assert torch.equal(initial["x"].detach(), start()["x"])
+    assert initial["x"].grad is None
+    assert not result.parameters["x"].requires_grad
+    result.parameters["x"].zero_()
+    assert torch.equal(initial["x"].detach(), start()["x"])
+
+
+def test_the_same_start_gives_the_same_end():
+    one, other = (minimize_objective(rosenbrock, start()) for _ in range(2))
+    assert torch.equal(one.parameters["x"], other.parameters["x"])
+    assert one.history == other.history
+
+
+def test_progress_is_told_every_iteration():
+    told = []
+    result = minimize_objective(
+        rosenbrock,
+        start(),
+        OptimizerOptions(adam_steps=4),
+        progress=lambda iteration, value: told.append((iteration, value)),
+    )
+    assert told == list(enumerate(result.history))[1:]
+
+
+def test_iterations_are_limited():
+    result = minimize_objective(rosenbrock, start(), OptimizerOptions(iterations=5))
+    assert len(result.history) == 6
+    assert not result.converged
+    assert "LIMIT" in result.status
+    assert falling(result.history)
+
+
+def test_no_iterations_returns_the_start():
+    result = minimize_objective(rosenbrock, start(), OptimizerOptions(iterations=0))
+    assert torch.equal(result.parameters["x"], start()["x"])
+    assert not result.converged
+    assert result.status == "no iterations asked for"
+
+
+def test_it_also_searches_where_gradients_are_switched_off():
+    with torch.no_grad():
+        assert minimize_objective(rosenbrock, start()).value < 1e-6
+
+
+# ---------------------------------------------------------------- parameters without effect
+
+
+def test_a_parameter_that_the_objective_ignores_stays():
+    result = minimize_objective(rosenbrock, {**start(), "unused": tensor(4.0, 5.0)})
+    assert result.converged
+    assert torch.equal(result.parameters["unused"], tensor(4.0, 5.0))
+
+
+def test_an_objective_that_ignores_everything():
+    result = minimize_objective(lambda parameters: tensor(3.0)[0], start())
+    assert result.value == 3.0
+    assert torch.equal(result.parameters["x"], start()["x"])
+
+
+def test_no_parameters_at_all():
+    """A model with everything fixed: the value is still wanted."""
+    result = minimize_objective(lambda parameters: tensor(3.0)[0], {}, OptimizerOptions(adam_steps=2))
+    assert result.value == 3.0
+    assert result.parameters == {}
+
+
+# ---------------------------------------------------------------- Adam
+
+
+def test_adam_warms_up():
+    result = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=30, adam_rate=0.02, iterations=0))
+    assert len(result.history) == 31
+    assert result.value < result.history[0]
+    assert result.value == min(result.history)
+
+
+def test_adam_is_that_of_torch():
+    x = start()["x"].requires_grad_()
+    adam, values = torch.optim.Adam([x], lr=0.05), []
+    for _ in range(8):
+        adam.zero_grad()
+        value = rosenbrock({"x": x})
+        values.append(float(value.detach()))
+        value.backward()
+        adam.step()
+    result = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=8, adam_rate=0.05, iterations=0))
+    assert result.history[1:] == pytest.approx(values)
+
+
+def test_lbfgs_goes_on_from_the_best_point_of_adam():
+    """Adam with a huge rate jumps about; what it found best is not lost."""
+    options = OptimizerOptions(adam_steps=10, adam_rate=2.0)
+    wild = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=10, adam_rate=2.0, iterations=0))
+    result = minimize_objective(rosenbrock, start(), options)
+    assert not falling(result.history[:11])
+    assert result.history[11] <= wild.value
+    assert falling(result.history[11:])
+    assert result.value < 1e-6
+
+
+def test_adam_ends_where_the_objective_cannot_be_evaluated():
+    def half(parameters):
+        if parameters["x"][0] < 0.0:
+            raise NumericalError("left of zero")
+        return (parameters["x"] - 0.5).square().sum()
+
+    result = minimize_objective(half, {"x": tensor(3.0)}, OptimizerOptions(adam_steps=20, adam_rate=2.0))
+    assert len(result.history) < 20
+    assert float(result.parameters["x"][0]) == pytest.approx(0.5, abs=1e-4)
+
+
+# ---------------------------------------------------------------- where the objective cannot be evaluated
+
+
+def barrier_that_raises(parameters):
+    x = parameters["x"]
+    if bool((x <= 0.0).any()):
+        raise NumericalError("the covariance matrix is not positive definite")
+    return 1e3 * (x - x.log()).sum()
+
+
+def barrier_that_gives_nan(parameters):
+    return 1e3 * (parameters["x"] - parameters["x"].log()).sum()
+
+
+def barrier_in_torch(parameters):
+    x = parameters["x"]
+    return 1e3 * (x.sum() - torch.logdet(torch.linalg.cholesky(torch.diag(x))) * 2.0)
+
+
+def steep_valley(parameters):
+    x = parameters["x"]
+    if float(x.detach().norm()) > 4.0:
+        raise NumericalError("too far")
+    return 1e4 * (x**4).sum() + (x - 1.0).square().sum()
+
+
+@pytest.mark.parametrize("objective", [barrier_that_raises, barrier_that_gives_nan, barrier_in_torch])
+@pytest.mark.parametrize("begin", [(5.0,), (1000.0,), (3.0, 0.2, 40.0), (0.01, 100.0)], ids=str)
+def test_failures_shorten_the_step_and_do_not_end_the_search(objective, begin):
+    """The optimum is 1; a long first step lands where the logarithm does not exist."""
+    result = minimize_objective(objective, {"x": tensor(*begin)}, OptimizerOptions(tolerance=1e-14))
+    torch.testing.assert_close(result.parameters["x"], torch.ones(len(begin)).double(), rtol=0.0, atol=1e-4)
+    assert result.value == pytest.approx(1e3 * len(begin))
+    assert all(math.isfinite(value) for value in result.history)
+    assert falling(result.history)
+
+
+def test_failures_are_counted_and_named():
+    result = minimize_objective(barrier_that_raises, {"x": tensor(1000.0)})
+    assert result.converged
+    assert "evaluations failed, the last because the covariance matrix is not positive definite" in result.status
+    assert "failed" not in minimize_objective(rosenbrock, start()).status
+
+
+def test_a_wall_in_front_of_the_optimum_ends_the_search_at_the_wall():
+    def downhill(parameters):
+        if float(parameters["x"].detach().norm()) > 1.0:
+            raise NumericalError("outside of the disc")
+        return -100.0 * parameters["x"].sum()
+
+    result = minimize_objective(downhill, {"x": tensor(0.0, 0.0)})
+    assert not result.converged
+    assert "rolled back to the best point" in result.status
+    assert "outside of the disc" in result.status
+    assert result.value == pytest.approx(-100.0 * math.sqrt(2.0), rel=1e-3)
+    assert result.value == float(downhill(result.parameters))
+
+
+def test_a_gradient_that_is_not_finite_counts_as_a_failure():
+    def square_root(parameters):
+        return parameters["x"].abs().sqrt().sum()
+
+    with pytest.raises(FitError, match="gradient is not finite"):
+        minimize_objective(square_root, {"x": tensor(0.0)})
+
+
+@pytest.mark.parametrize(
+    ("objective", "cause"),
+    [
+        (barrier_that_raises, "the covariance matrix is not positive definite"),
+        (barrier_that_gives_nan, "not finite"),
+        (barrier_in_torch, "cholesky"),
+    ],
+)
+def test_a_start_that_cannot_be_evaluated_is_an_error_with_its_cause(objective, cause):
+    with pytest.raises(FitError, match=f"cannot be evaluated at the start values: .*{cause}"):
+        minimize_objective(objective, {"x": tensor(-1.0)})
+
+
+def test_other_errors_pass():
+    def broken(parameters):
+        raise InvalidInput("a mistake of the caller")
+
+    with pytest.raises(InvalidInput, match="mistake"):
+        minimize_objective(broken, start())
+
+
+# ---------------------------------------------------------------- options and restarts
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"iterations": -1},
+        {"adam_steps": -1},
+        {"tolerance": -1.0},
+        {"tolerance": math.nan},
+        {"adam_rate": 0.0},
+        {"memory": 0},
+    ],
+    ids=str,
+)
+def test_options_are_checked(wrong):
+    with pytest.raises(InvalidInput):
+        OptimizerOptions(**wrong)
+
+
+def test_the_best_of_several_starts_says_so():
+    far, near = (
+        minimize_objective(rosenbrock, {"x": x}, OptimizerOptions(iterations=3))
+        for x in (tensor(-3.0, 3.0), tensor(0.9, 0.8))
+    )
+    chosen = best_of([far, near])
+    assert chosen.value == near.value < far.value
+    assert chosen.status.endswith("(best of 2 starts)")
+    assert best_of([far]) is far

@@ -1,0 +1,191 @@
+"""The posterior of the latents against dense Gaussian conditioning."""
+
+import pytest
+import torch
+from gpytorch.kernels import LinearKernel, MaternKernel, RBFKernel, ScaleKernel
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.inference.dense import dense_posterior
+from tests.inference.problems import Problem, normal, problem
+
+from forcegp.errors import NumericalError
+from forcegp.inference import LatentKernels, LatentPosterior, posterior
+
+SHAPES = {
+    "no constraint": {"constraints": 0},
+    "one constraint": {"constraints": 1},
+    "three constraints": {"constraints": 3},
+    "fewer latents than outputs": {"latents": 2},
+    "more latents than outputs": {"latents": 6, "outputs": 3},
+    "one point": {"count": 1},
+}
+
+
+def condition(given_problem: Problem) -> LatentPosterior:
+    return LatentPosterior.condition(given_problem.kernels, given_problem.features, *given_problem.data)
+
+
+def new_features(given_problem: Problem, points: int = 6) -> list[torch.Tensor]:
+    return [normal(points, z.shape[1], seed=100 + c) for c, z in enumerate(given_problem.features)]
+
+
+def dense(given_problem: Problem, features: list[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    kernels = given_problem.kernels.kernels
+    with torch.no_grad():
+        matrices = [k(z, z).to_dense() for k, z in zip(kernels, given_problem.features, strict=True)]
+        pairs = zip(kernels, features, given_problem.features, strict=True)
+        cross = torch.stack([k(new, old).to_dense() for k, new, old in pairs])
+        prior = torch.stack([k(new, diag=True) for k, new in zip(kernels, features, strict=True)], dim=-1)
+        return dense_posterior(*given_problem.data, matrices, cross, prior)
+
+
+def assert_equals_dense(given_problem: Problem, features: list[torch.Tensor] | None = None) -> None:
+    features = new_features(given_problem) if features is None else features
+    conditioned = condition(given_problem)
+    mean, covariance = dense(given_problem, features)
+    with torch.no_grad():
+        torch.testing.assert_close(conditioned.mean(features), mean, rtol=1e-8, atol=1e-9)
+        torch.testing.assert_close(conditioned.covariance(features), covariance, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("block_bytes", [64 * 2**20, 2000, 1], ids=["one block", "some blocks", "one point per block"])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_mean_and_covariance(shape, block_bytes, monkeypatch):
+    monkeypatch.setattr(posterior, "BLOCK_BYTES", block_bytes)
+    assert_equals_dense(problem(**shape))
+
+
+def test_noise_covariances_and_force_level_noise():
+    given_problem = problem(constraints=1)
+    W = given_problem.W
+    given_problem.noise = torch.diag_embed(given_problem.noise) + 0.02 * W @ W.mT
+    assert_equals_dense(given_problem)
+
+
+def test_points_of_differing_rank():
+    given_problem = problem(count=6, outputs=4, constraints=0)
+    given_problem.W[1] = problem(outputs=4, constraints=3).W[0]
+    given_problem.W[4] = 0.0
+    assert_equals_dense(given_problem)
+
+
+def test_other_kernels_and_features_of_several_dimensions():
+    given_problem = problem(count=8, outputs=3, constraints=1)
+    given_problem.features = [normal(8, d, seed=d) for d in (1, 2, 3)]
+    given_problem.kernels = LatentKernels(
+        [ScaleKernel(RBFKernel()).double(), MaternKernel(2.5, ard_num_dims=2).double(), LinearKernel().double()]
+    )
+    assert_equals_dense(given_problem)
+
+
+def test_at_the_training_points_themselves():
+    given_problem = problem(constraints=1)
+    assert_equals_dense(given_problem, given_problem.features)
+
+
+def test_no_data_leaves_the_prior():
+    given_problem = problem(count=0)
+    features = new_features(given_problem)
+    with torch.no_grad():
+        mean, covariance = condition(given_problem).mean(features), condition(given_problem).covariance(features)
+        variances = torch.stack([kernel.outputscale for kernel in given_problem.kernels.kernels])
+    assert not mean.any()
+    torch.testing.assert_close(covariance, torch.diag(variances).expand_as(covariance))
+
+
+def test_data_that_say_nothing_leave_the_prior():
+    given_problem = problem(count=5)
+    given_problem.W = torch.zeros_like(given_problem.W)
+    features = new_features(given_problem)
+    with torch.no_grad():
+        mean, covariance = condition(given_problem).mean(features), condition(given_problem).covariance(features)
+    assert not mean.any()
+    torch.testing.assert_close(covariance, dense(given_problem, features)[1])
+
+
+def test_no_new_points():
+    given_problem = problem(outputs=4)
+    features = new_features(given_problem, points=0)
+    assert condition(given_problem).mean(features).shape == (0, 4)
+    assert condition(given_problem).covariance(features).shape == (0, 4, 4)
+
+
+def test_far_away_the_prior_returns():
+    given_problem = problem()
+    features = [z + 1e3 for z in new_features(given_problem)]
+    with torch.no_grad():
+        mean, covariance = condition(given_problem).mean(features), condition(given_problem).covariance(features)
+        variances = torch.stack([kernel.outputscale for kernel in given_problem.kernels.kernels])
+    assert not mean.any()
+    torch.testing.assert_close(covariance, torch.diag(variances).expand_as(covariance))
+
+
+def test_data_without_noise_are_reproduced():
+    given_problem = problem(constraints=0)
+    given_problem.noise = torch.full((1, 5), 1e-10, dtype=torch.float64)
+    with torch.no_grad():
+        mean = condition(given_problem).mean(given_problem.features)
+    residual = (given_problem.W @ mean[..., None])[..., 0]
+    torch.testing.assert_close(residual, given_problem.residual, rtol=0.0, atol=1e-5)
+
+
+def test_mean_is_differentiable_in_the_features():
+    given_problem = problem(count=5, outputs=2, constraints=0)
+    conditioned = condition(given_problem)
+    features = [z.requires_grad_() for z in new_features(given_problem, points=2)]
+    assert torch.autograd.gradcheck(lambda *z: conditioned.mean(z), features)
+    assert torch.autograd.gradcheck(lambda *z: conditioned.covariance(z), features)
+
+
+def test_conditioning_keeps_no_graph_of_the_data():
+    given_problem = problem(count=4)
+    for tensor in (*given_problem.data, *given_problem.features):
+        tensor.requires_grad_()
+    conditioned = condition(given_problem)
+    kept = (*conditioned.features, conditioned.system.beta, conditioned.system.factor.lower)
+    assert not any(tensor.requires_grad for tensor in kept)
+
+
+def test_data_that_are_not_finite_are_refused():
+    given_problem = problem(count=4)
+    given_problem.residual[2, 0] = torch.nan
+    with pytest.raises(NumericalError, match="row 2"):
+        condition(given_problem)
+
+
+# ---------------------------------------------------------------- properties
+
+
+@settings(max_examples=30)
+@given(
+    count=st.integers(1, 8),
+    outputs=st.integers(1, 4),
+    latents=st.integers(1, 5),
+    seed=st.integers(0, 10_000),
+    log_noise=st.floats(-12.0, 2.0),
+)
+def test_covariance_is_positive_semi_definite_and_below_the_prior(count, outputs, latents, seed, log_noise):
+    given_problem = problem(count=count, outputs=outputs, constraints=0, latents=latents, seed=seed)
+    given_problem.noise = torch.full((1, outputs), 10.0**log_noise, dtype=torch.float64)
+    features = [torch.cat([z, normal(3, 3, seed=seed + c)]) for c, z in enumerate(given_problem.features)]
+    with torch.no_grad():
+        covariance = condition(given_problem).covariance(features)
+        prior = torch.diag(torch.stack([kernel.outputscale for kernel in given_problem.kernels.kernels]))
+    torch.testing.assert_close(covariance, covariance.mT)
+    scale = float(prior.max())
+    assert torch.linalg.eigvalsh(covariance).min() > -1e-8 * scale
+    assert torch.linalg.eigvalsh(prior - covariance).min() > -1e-8 * scale
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_conditioning_in_two_halves_is_conditioning_at_once(seed):
+    """Adding points never widens the posterior."""
+    given_problem = problem(count=8, outputs=3, seed=seed)
+    features = new_features(given_problem)
+    half = Problem(
+        *(tensor[:4] for tensor in given_problem.data), [z[:4] for z in given_problem.features], given_problem.kernels
+    )
+    with torch.no_grad():
+        wide, narrow = condition(half).covariance(features), condition(given_problem).covariance(features)
+    assert torch.linalg.eigvalsh(wide - narrow).min() > -1e-9
