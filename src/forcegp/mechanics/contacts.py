@@ -17,7 +17,7 @@ from forcegp.robots import Kinematics
 
 @dataclass(frozen=True)
 class Baumgarte:
-    """Stabilisation of c(q) = 0: c'' = -2 zeta omega c' - omega^2 c (Baumgarte 1972); omega in rad/s, zeta dimensionless."""
+    """Stabilisation of c(q) = 0: c'' = -2 zeta omega c' - omega^2 c (Baumgarte 1972), omega in rad/s."""
 
     omega: float
     zeta: float = 1.0
@@ -31,19 +31,25 @@ class Baumgarte:
 
 @dataclass(frozen=True)
 class Contact:
-    """The point `point` (m, in the axes of link frame `frame`) stays on `surface`: one bilateral constraint s(p(q)) = 0."""
+    """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
+
+    `point` is given in m in the axes of the link frame `frame`.
+    """
 
     frame: str
     point: tuple[float, float, float]
     surface: Surface
 
     def __post_init__(self) -> None:
+        if not isinstance(self.frame, str):
+            raise InvalidInput(f"Contact frame is {self.frame!r}; give the name of a link.")
         if not isinstance(self.surface, Surface):
             raise InvalidInput(
-                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, Cylinder, ImplicitSurface ..."
+                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, Cylinder, "
+                "ImplicitSurface ..."
             )
         try:
-            point = tuple(float(entry) for entry in self.point)
+            point = () if isinstance(self.point, str) else tuple(float(entry) for entry in self.point)
         except (TypeError, ValueError):
             point = ()
         if len(point) != 3 or not all(math.isfinite(entry) for entry in point):
@@ -67,8 +73,8 @@ class Contact:
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
-        A = s_p J_p and b = -(s_p Jdot_p v + (J_p v)^T s_pp (J_p v)) - 2 zeta omega A v - omega^2 s: the second time derivative of s(p(q)) = 0
-        (Rath et al. 2021, section 2).
+        A = s_p J_p and b = -(s_p Jdot_p v + (J_p v)^T s_pp (J_p v)) - 2 zeta omega A v - omega^2 s: the second time
+        derivative of s(p(q)) = 0 (Rath et al. 2021, section 2).
         """
         kinematics = state.kinematics
         p = self.position(kinematics)

@@ -3,8 +3,9 @@
     M a = Q + Q_I,  A a = b   gives   a = M^-1 Q_b + H Q,   lambda = (A M^-1 A^T)^+ (b - A M^-1 Q),   Q_I = A^T lambda
     H = M^-1 - M^-1 A^T (A M^-1 A^T)^+ A M^-1,   Q_b = A^T (A M^-1 A^T)^+ b
 
-(Udwadia & Kalaba 1992; Rath et al. 2021, eqs. 2-4.) With the Cholesky factor M = L L^T and A~ = A L^-T everything is read from the one
-small pseudo-inverse A~^+, which also covers redundant constraints: (A M^-1 A^T)^+ = (A~^+)^T A~^+ and H = L^-T (I - A~^+ A~) L^-1.
+(Udwadia & Kalaba 1992; Rath et al. 2021, eqs. 2-4.) With the Cholesky factor M = L L^T and A~ = A L^-T everything is
+read from the one small pseudo-inverse A~^+, which also covers redundant constraints: (A M^-1 A^T)^+ = (A~^+)^T A~^+ and
+H = L^-T (I - A~^+ A~) L^-1.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ class AffineMap(NamedTuple):
     matrix: Tensor  # (..., k, nv)
 
     def __call__(self, Q: Float[Tensor, "*batch nv"]) -> Tensor:
+        """The value y at joint forces Q."""
         return self.offset + (self.matrix @ Q[..., None])[..., 0]
 
 
@@ -37,8 +39,9 @@ class AffineMap(NamedTuple):
 class ConstrainedDynamics:
     """The dynamics at a batch of states, affine in the joint forces that are still unknown.
 
-    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_b`, `Q_K` (..., nv); `normals` (..., m, 3) are the surface gradients s_p, so that
-    the contact force on the robot in N is s_p^T lambda. `state` holds (q, v, u) themselves.
+    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_b`, `Q_K` (..., nv); `normals` (..., m, 3) are the
+    surface gradients s_p, so that the contact force on the robot in N is s_p^T lambda. `state` holds (q, v, u)
+    themselves.
     """
 
     state: State
@@ -63,7 +66,10 @@ class ConstrainedDynamics:
         normals: Float[Tensor, "*batch m 3"],
         Q_K: Float[Tensor, "*batch nv"],
     ) -> ConstrainedDynamics:
-        """Gauss' principle for M (..., nv, nv) and A a = b. Raises NumericalError when M is not positive definite."""
+        """Gauss' principle for M (..., nv, nv) and A a = b.
+
+        Raises NumericalError when M is not positive definite or A is not finite.
+        """
         try:
             lower = torch.linalg.cholesky(M)
         except torch.linalg.LinAlgError:
@@ -74,7 +80,12 @@ class ConstrainedDynamics:
         inverse_lower = torch.linalg.solve_triangular(lower, identity.expand_as(M), upper=False)
         A_white = A @ inverse_lower.mT
         if A.shape[-2]:
-            pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
+            try:
+                pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
+            except torch.linalg.LinAlgError:
+                raise NumericalError(
+                    "the constraint matrix A is not finite; MechanicalSystem.check_states names the row and the contact"
+                ) from None
         else:
             pseudo_inverse = A_white.mT
         H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower
@@ -85,7 +96,10 @@ class ConstrainedDynamics:
         return cls(state, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse)
 
     def acceleration_map(self, known: bool = True) -> AffineMap:
-        """a = offset + H Q_U, with offset = M^-1 Q_b + H Q_K, or M^-1 Q_b alone when `known` is false (then Q_U must carry Q_K too)."""
+        """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K.
+
+        When `known` is false the offset is M^-1 Q_b alone, and Q_U must carry Q_K too.
+        """
         offset = self.constrained_offset
         if known:
             offset = offset + (self.H @ self.Q_K[..., None])[..., 0]

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint, unknown_name_message
 from forcegp.mechanics.state import State
@@ -37,6 +38,8 @@ class KnownForce(ABC):
 
     def bound_to(self, robot: Robot) -> KnownForce:
         """The same with per-joint numbers as tensors (nv,) in the order of robot.joint_names, checked."""
+        if not self.per_joint:
+            return self
         bound = {
             name: _per_joint(f"{type(self).__name__} {name}", getattr(self, name), robot) for name in self.per_joint
         }
@@ -47,6 +50,7 @@ class KnownForce(ABC):
 class Actuation(KnownForce):
     """What the actuators deliver: u itself."""
 
+    @override
     def force(self, state: State) -> Tensor:
         return state.u
 
@@ -55,6 +59,7 @@ class Actuation(KnownForce):
 class RigidBodyBias(KnownForce):
     """Coriolis, centrifugal and gravity forces of the rigid bodies: -bias(q, v)."""
 
+    @override
     def force(self, state: State) -> Tensor:
         return -state.kinematics.bias_forces(state.inertials)
 
@@ -71,6 +76,7 @@ class ViscousJointFriction(KnownForce):
         """The <dynamics damping> of the URDF."""
         return cls([joint.damping for joint in robot.joints])
 
+    @override
     def force(self, state: State) -> Tensor:
         return -self.coefficients * state.v  # type: ignore[operator]
 
@@ -88,12 +94,14 @@ class CoulombJointFriction(KnownForce):
         """The <dynamics friction> of the URDF."""
         return cls([joint.friction for joint in robot.joints], velocity_scale)
 
+    @override
     def bound_to(self, robot: Robot) -> KnownForce:
         bound = super().bound_to(robot)
         if bool((torch.as_tensor(bound.velocity_scale) <= 0).any()):  # type: ignore[attr-defined]
             raise InvalidInput("CoulombJointFriction velocity_scale must be positive for every joint (rad/s or m/s).")
         return bound
 
+    @override
     def force(self, state: State) -> Tensor:
         return -self.coefficients * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]
 
@@ -105,9 +113,11 @@ class Armature(KnownForce):
     inertia: PerJoint
     per_joint: ClassVar[tuple[str, ...]] = ("inertia",)
 
+    @override
     def force(self, state: State) -> Tensor:
         return torch.zeros_like(state.q)
 
+    @override
     def added_inertia(self) -> Tensor:
         return self.inertia  # type: ignore[return-value]
 
@@ -135,9 +145,11 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
 
 def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
     """The force that `known_force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
+    if not isinstance(stored, Mapping):
+        raise FileFormatError(f"a stored known force is {stored!r}; expected an object with a type")
     values = dict(stored)
     name = values.pop("type", None)
-    if name not in KNOWN_FORCES:
+    if not isinstance(name, str) or name not in KNOWN_FORCES:
         raise FileFormatError(f"unknown known force {name!r}; known: {', '.join(KNOWN_FORCES)}")
     try:
         return KNOWN_FORCES[name](**values)
@@ -162,8 +174,9 @@ def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
         values = values.expand(robot.nv)
     if values.shape != (robot.nv,):
         raise InvalidInput(
-            f"{name} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: {', '.join(robot.joint_names)}"
+            f"{name} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
+            f"{', '.join(robot.joint_names)}"
         )
-    if not bool((values >= 0).all()):
+    if not bool(((values >= 0) & torch.isfinite(values)).all()):
         raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number >= 0.")
     return values

@@ -1,9 +1,9 @@
 """Surfaces s(p) = 0 that a point of the robot can be held on.
 
-A surface returns its value, gradient and Hessian at points p (..., 3) in m, world axes. The built-in surfaces are signed distances, so
-their gradient is a unit normal and the multiplier of a contact is the normal force in N. A new surface is one subclass of `Surface` that
-defines `value`; the derivatives follow by autograd unless it knows better. To be stored with a dataset or a model it also needs an
-entry in `SURFACES` and plain numbers as its fields.
+A surface returns its value, gradient and Hessian at points p (..., 3) in m, world axes. The built-in surfaces are
+signed distances, so their gradient is a unit normal and the multiplier of a contact is the normal force in N. A new
+surface is one subclass of `Surface` that defines `value`; the derivatives follow by autograd unless it knows better. To
+be stored with a dataset or a model it also needs an entry in `SURFACES` and plain numbers as its fields.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
 
@@ -54,19 +55,19 @@ class Plane(Surface):
     offset: float
 
     def __post_init__(self) -> None:
-        normal = _vector("Plane normal", self.normal)
-        length = math.hypot(*normal)
-        if length == 0.0:
-            raise InvalidInput("Plane normal is (0, 0, 0); give a direction, for example (0, 0, 1).")
-        object.__setattr__(self, "normal", tuple(entry / length for entry in normal))
+        normal, length = _direction("Plane normal", self.normal)
+        object.__setattr__(self, "normal", normal)
         object.__setattr__(self, "offset", _number("Plane offset", self.offset) / length)
 
+    @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return p @ _tensor(self.normal, p) - self.offset
 
+    @override
     def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         return _tensor(self.normal, p).expand(p.shape)
 
+    @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         return p.new_zeros(*p.shape[:-1], 3, 3)
 
@@ -82,13 +83,16 @@ class Sphere(Surface):
         object.__setattr__(self, "center", _vector("Sphere center", self.center))
         object.__setattr__(self, "radius", _positive("Sphere radius", self.radius))
 
+    @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1) - self.radius
 
+    @override
     def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         ray = p - _tensor(self.center, p)
         return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
 
+    @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         ray = p - _tensor(self.center, p)
         return _distance_hessian(ray, torch.eye(3, dtype=p.dtype, device=p.device))
@@ -103,21 +107,20 @@ class Cylinder(Surface):
     radius: float
 
     def __post_init__(self) -> None:
-        axis = _vector("Cylinder axis", self.axis)
-        length = math.hypot(*axis)
-        if length == 0.0:
-            raise InvalidInput("Cylinder axis is (0, 0, 0); give a direction, for example (1, 0, 0).")
-        object.__setattr__(self, "axis", tuple(entry / length for entry in axis))
+        object.__setattr__(self, "axis", _direction("Cylinder axis", self.axis)[0])
         object.__setattr__(self, "point", _vector("Cylinder point", self.point))
         object.__setattr__(self, "radius", _positive("Cylinder radius", self.radius))
 
+    @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return torch.linalg.vector_norm(self._radial(p)[0], dim=-1) - self.radius
 
+    @override
     def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         ray = self._radial(p)[0]
         return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
 
+    @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         return _distance_hessian(*self._radial(p))
 
@@ -132,14 +135,26 @@ class Cylinder(Surface):
 class ImplicitSurface(Surface):
     """s(p) = function(p) for any twice differentiable `function` of one point (3,) -> scalar, written in torch.
 
-    The multiplier of a contact is then the normal force divided by |s_p|. A function cannot be stored in a file (files never carry code):
-    pass the surface again when loading.
+    The multiplier of a contact is then the normal force divided by |s_p|. A function cannot be stored in a file (files
+    never carry code): pass the surface again when loading.
     """
 
     function: Callable[[Tensor], Tensor] = field(compare=True)
 
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise InvalidInput(f"ImplicitSurface function is {self.function!r}; give a function of one point (3,).")
+
+    @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self._over_batch(self.function, p, ()) if p.dim() > 1 else self.function(p)
+        return self._over_batch(self._at_one_point, p, ()) if p.dim() > 1 else self._at_one_point(p)
+
+    def _at_one_point(self, p: Tensor) -> Tensor:
+        value = self.function(p)
+        if not isinstance(value, Tensor) or value.dim():
+            given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            raise ContactError(f"ImplicitSurface function returned {given} for one point (3,); return a scalar tensor.")
+        return value
 
 
 SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder}
@@ -147,11 +162,15 @@ SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinde
 
 
 def surface_to_dict(surface: Surface) -> dict[str, Any]:
-    """Plain numbers that `surface_from_dict` turns back into the surface. Raises ContactError for a surface that holds code."""
+    """Plain numbers that `surface_from_dict` turns back into the surface.
+
+    Raises ContactError for a surface that holds code.
+    """
     name = next((name for name, kind in SURFACES.items() if type(surface) is kind), None)
     if name is None:
         raise ContactError(
-            f"a {type(surface).__name__} cannot be stored: files carry numbers, never code. Use one of {', '.join(SURFACES)}, or save "
+            f"a {type(surface).__name__} cannot be stored: files carry numbers, never code. Use one of "
+            f"{', '.join(SURFACES)}, or save "
             "without contacts and pass them again when loading."
         )
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]
@@ -159,9 +178,11 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
 
 def surface_from_dict(stored: dict[str, Any]) -> Surface:
     """The surface that `surface_to_dict` stored. Raises FileFormatError for an unknown type or missing fields."""
+    if not isinstance(stored, dict):
+        raise FileFormatError(f"a stored surface is {stored!r}; expected an object with a type")
     fields = dict(stored)
     name = fields.pop("type", None)
-    if name not in SURFACES:
+    if not isinstance(name, str) or name not in SURFACES:
         raise FileFormatError(f"unknown surface type {name!r}; known types: {', '.join(SURFACES)}")
     try:
         return SURFACES[name](
@@ -184,11 +205,11 @@ def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
 
 def _number(name: str, value: object) -> float:
     try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+        number = math.nan if isinstance(value, str) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, RuntimeError):
         raise InvalidInput(f"{name} is {value!r}; give a number.") from None
     if not math.isfinite(number):
-        raise InvalidInput(f"{name} is {number}; give a finite number.")
+        raise InvalidInput(f"{name} is {value!r}; give a finite number.")
     return number
 
 
@@ -207,3 +228,17 @@ def _vector(name: str, values: object) -> Vector:
     if len(entries) != 3:
         raise InvalidInput(f"{name} is {values!r}; give three numbers x, y, z.")
     return entries  # type: ignore[return-value]
+
+
+def _direction(name: str, values: object) -> tuple[Vector, float]:
+    """The unit vector along three numbers, and their length.
+
+    The length is 1 where it is so already up to rounding, so that storing changes nothing.
+    """
+    entries = _vector(name, values)
+    length = math.hypot(*entries)
+    if not 0.0 < length < math.inf:
+        raise InvalidInput(f"{name} is {values!r}; give a direction, for example (0, 0, 1).")
+    if abs(length - 1.0) < 1e-15:
+        return entries, 1.0
+    return tuple(entry / length for entry in entries), length  # type: ignore[return-value]

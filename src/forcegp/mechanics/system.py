@@ -1,9 +1,9 @@
-"""`MechanicalSystem`: a robot, its contacts and the forces that are known, as one immutable value that files can carry."""
+"""`MechanicalSystem`: a robot, its contacts and the known forces, as one immutable value that files can carry."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput
 from forcegp.mechanics.contacts import Baumgarte, Contact
 from forcegp.mechanics.gauss_principle import ConstrainedDynamics
 from forcegp.mechanics.known_forces import (
@@ -32,10 +32,10 @@ CONSISTENCY_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class MechanicalSystem:
-    """What is known: the robot, the contacts that hold it, the known forces, and Baumgarte's terms if the motion has them.
+    """What is known: the robot, its contacts, the known forces, and Baumgarte's terms if the motion has them.
 
-    `known_forces` is the complete list; the default is actuation and rigid-body bias. Joint damping and friction of the URDF enter only
-    where listed, for example `ViscousJointFriction.from_robot(robot)`.
+    `known_forces` is the complete list; the default is actuation and rigid-body bias. Joint damping and friction of the
+    URDF enter only where listed, for example `ViscousJointFriction.from_robot(robot)`.
     Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
     """
 
@@ -45,13 +45,19 @@ class MechanicalSystem:
     baumgarte: Baumgarte | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "contacts", tuple(self.contacts))
+        for name, kind in (("contacts", Contact), ("known_forces", KnownForce)):
+            given = getattr(self, name)
+            values = tuple(given) if isinstance(given, Iterable) else (given,)
+            if not isinstance(given, Iterable) or not all(isinstance(value, kind) for value in values):
+                raise InvalidInput(f"{name} is {given!r}; give a sequence of {kind.__name__} objects.")
+            object.__setattr__(self, name, values)
         object.__setattr__(self, "known_forces", tuple(force.bound_to(self.robot) for force in self.known_forces))
         for contact in self.contacts:
             body, _ = self.robot.frame(contact.frame)
             if body < 0:
                 raise ContactError(
-                    f"frame {contact.frame!r} of {self.robot.name} is fixed in the world, so a contact there constrains nothing; name a frame "
+                    f"frame {contact.frame!r} of {self.robot.name} is fixed in the world, so a contact there "
+                    "constrains nothing; name a frame "
                     "that moves."
                 )
 
@@ -62,9 +68,11 @@ class MechanicalSystem:
         u: Float[Tensor, "*#batch nv"],
         inertials: Mapping[str, Tensor] | None = None,
     ) -> ConstrainedDynamics:
-        """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable in all arguments.
+        """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
 
-        `inertials` maps link names to log-Cholesky parameters (..., 10). Contact points are kinematic: no inertial parameter moves them.
+        Differentiable in all arguments.
+        `inertials` maps link names to log-Cholesky parameters (..., 10). Contact points are kinematic: no inertial
+        parameter moves them.
         """
         state = State.of(self.robot, q, v, u, inertials)
         M = state.kinematics.mass_matrix(inertials)
@@ -90,24 +98,25 @@ class MechanicalSystem:
         return torch.stack(rows, dim=-2), torch.stack(right, dim=-1), torch.stack(normals, dim=-2)
 
     def check_states(self, q: Float[Tensor, "N nv"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nv"]) -> None:
-        """Raise ContactError, naming row and contact, where a contact cannot constrain the motion or contacts contradict each other."""
-        dynamics = self.dynamics(q, v, u)
-        if not self.contacts:
-            return
-        size = torch.linalg.vector_norm(dynamics.A, dim=-1)
+        """Raise ContactError, naming row and contact, where contacts cannot constrain or contradict each other."""
+        A, b, _ = self._constraint(State.of(self.robot, q, v, u))
+        size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         bad = torch.nonzero(~(size > 1e-12))
         if len(bad):
             row, index = (int(entry) for entry in bad[0])
             raise ContactError(
-                f"contact {index} (frame {self.contacts[index].frame!r}) has no direction at row {row}: the gradient of its surface vanishes "
+                f"contact {index} (frame {self.contacts[index].frame!r}) has no direction at row {row}: the "
+                "gradient of its surface vanishes "
                 "or the point cannot move along it; check the surface, the contact point and q."
             )
+        dynamics = self.dynamics(q, v, u)
         a = dynamics.acceleration_map().offset
         violation = ((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs() / (1.0 + dynamics.b.abs())
-        if bool((violation > CONSISTENCY_TOLERANCE).any()):
+        if not bool((violation <= CONSISTENCY_TOLERANCE).all()):
             row, index = divmod(int(violation.argmax()), violation.shape[-1])
             raise ContactError(
-                f"the contacts contradict each other at row {row}: |A a - b| = {float(violation.max()):.2e} for contact {index} although redundant "
+                f"the contacts contradict each other at row {row}: |A a - b| = {float(violation.max()):.2e} for "
+                f"contact {index} although redundant "
                 "contacts are solved in the least-squares sense; remove one of them or check their surfaces."
             )
 
@@ -120,7 +129,10 @@ class MechanicalSystem:
         return replace(self, contacts=tuple(contacts))
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain JSON values, the robot as URDF text. Raises ContactError for a surface that holds code."""
+        """Everything as plain JSON values, the robot as URDF text.
+
+        Raises ContactError for a surface that holds code.
+        """
         return {
             "format": FORMAT_VERSION,
             "urdf": self.robot.urdf_text,
@@ -141,7 +153,10 @@ class MechanicalSystem:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any], contacts: Sequence[Contact] | None = None) -> MechanicalSystem:
-        """The system that `to_dict` stored; `contacts` replaces the stored ones. Raises FileFormatError for anything else."""
+        """The system that `to_dict` stored; `contacts` replaces the stored ones.
+
+        Raises FileFormatError for anything else.
+        """
         if stored.get("format") != FORMAT_VERSION:
             raise FileFormatError(
                 f"stored system has format {stored.get('format')!r}; this forcegp reads {FORMAT_VERSION}"
@@ -161,8 +176,10 @@ class MechanicalSystem:
                 ]
             baumgarte = None if stored["baumgarte"] is None else Baumgarte(**stored["baumgarte"])
             forces = tuple(known_force_from_dict(entry) for entry in stored["known_forces"])
-        except (KeyError, TypeError) as error:
-            raise FileFormatError(f"stored system is incomplete or damaged: {error}") from None
+        except FileFormatError:
+            raise
+        except (ForceGPError, KeyError, TypeError, ValueError, AttributeError) as error:
+            raise FileFormatError(f"stored system is incomplete or damaged: {type(error).__name__}: {error}") from error
         return cls(robot, tuple(contacts), forces, baumgarte)
 
     @classmethod
@@ -170,8 +187,8 @@ class MechanicalSystem:
         """The system that `to_json` stored."""
         try:
             stored = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (json.JSONDecodeError, RecursionError) as error:
             raise FileFormatError(f"stored system is not JSON: {error}") from None
         if not isinstance(stored, dict):
-            raise InvalidInput(f"stored system is a {type(stored).__name__}, expected a JSON object")
+            raise FileFormatError(f"stored system is a {type(stored).__name__}, expected a JSON object")
         return cls.from_dict(stored)
