@@ -135,6 +135,8 @@ def test_no_parameters_at_all():
     result = minimize_objective(lambda parameters: tensor(3.0)[0], {}, OptimizerOptions(adam_steps=2))
     assert result.value == 3.0
     assert result.parameters == {}
+    assert result.converged
+    assert result.status == "no parameters to search for"
 
 
 # ---------------------------------------------------------------- Adam

@@ -1,4 +1,4 @@
-"""Minimise an objective over a dictionary of named tensors: L-BFGS with an optional Adam warm-up, rollback and a named cause."""
+"""Minimise an objective over named tensors: L-BFGS, an optional Adam warm-up, rollback and a named cause."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ LINE_SEARCH_FAILED = 2
 class OptimizerOptions:
     """How to search.
 
-    `iterations`: most L-BFGS iterations; `tolerance`: stop when an iteration lowers the objective by less than this fraction of it;
-    `gradient_tolerance`: stop when the largest gradient entry is below this; `adam_steps`, `adam_rate`: optional warm-up.
+    `iterations`: most L-BFGS iterations; `tolerance`: stop when an iteration lowers the objective by less than this
+    fraction of it;
+    `gradient_tolerance`: stop when the largest gradient entry is below this; `adam_steps`, `adam_rate`: optional warm-
+    up.
     """
 
     iterations: int = 200
@@ -110,8 +112,9 @@ class _Search:
     def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """Objective and gradient for a line search.
 
-        Where they do not exist, a parabola about the best point stands in, which rises by as much as the objective was to fall: the line
-        search then shortens its step, and never accepts the point. (An infinite value would end the whole search.)
+        Where they do not exist, a parabola about the best point stands in, which rises by as much as the objective was
+        to fall: the line search then shortens its step, and never accepts the point. (An infinite value would end the
+        whole search.)
         """
         evaluated = self.evaluate(point)
         if evaluated is not None:
@@ -129,9 +132,9 @@ def minimize_objective(
 ) -> OptimizationResult:
     """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed).
 
-    L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). Where the objective cannot be evaluated, the line search shortens its step.
-    If it finds none that helps, the search rolls back to the best point seen and starts again from there with an empty memory, twice at
-    most; then it ends there and says why.
+    L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). Where the objective cannot be evaluated, the line search
+    shortens its step. If it finds none that helps, the search rolls back to the best point seen and starts again from
+    there with an empty memory, twice at most; then it ends there and says why.
     `progress(iteration, value)` is called after every iteration.
 
     Raises
@@ -153,7 +156,10 @@ def minimize_objective(
 
     if options.adam_steps:
         _adam(search, options, record)
-    status, converged = "no iterations asked for", False
+    if search.best_point.size:
+        status, converged = "no iterations asked for", False
+    else:
+        status, converged = "no parameters to search for", True
     remaining = options.iterations
     for _attempt in range(3):
         if remaining <= 0 or not search.best_point.size:
