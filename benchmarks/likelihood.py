@@ -1,9 +1,10 @@
 """What do the likelihood and all its gradients cost, against the dense formulation of the paper?
 
-The dense side forms the DN x DN covariance and lets autograd differentiate `torch.linalg.solve` and `torch.logdet` (two LU
-factorisations), as the paper's formulation does. Both sides get the same kernels, mixing vectors and residuals and return the same
-154 + 7 gradients (7 x (21 length scales + 1 output scale) + 7 noise levels). One process, one thread, CPU seconds, medians; each side's
-peak memory is measured in a child process of its own, above the memory that process had before the first evaluation.
+The dense side forms the DN x DN covariance and lets autograd differentiate `torch.linalg.solve` and `torch.logdet` (two
+LU factorisations), as the paper's formulation does. Both sides get the same kernels, mixing vectors and residuals and
+return the same 154 + 7 gradients (7 x (21 length scales + 1 output scale) + 7 noise levels). One process, one thread,
+CPU seconds, medians; each side's peak memory is measured in a child process of its own, above the memory that process
+had before the first evaluation.
 
     python -m benchmarks.likelihood
 """
@@ -97,7 +98,8 @@ def run() -> dict[str, float]:
     """Measure and print; returns the keys of results.json that this question answers."""
     results: dict[str, float] = {}
     print(
-        f"{'N':>5} {'constraints':>11} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} {'value diff':>10} {'gradient diff':>13}"
+        f"{'N':>5} {'constraints':>11} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} {'value diff':>10} "
+        f"{'gradient diff':>13}"
     )
     for count, constraints, repeats, key in (
         (400, 1, 5, "nll_speedup_n400"),
@@ -114,12 +116,14 @@ def run() -> dict[str, float]:
         deflated = median_cpu_seconds(problem.deflated, repeats)
         results[key] = dense / deflated
         print(
-            f"{count:5d} {constraints:11d} {dense:10.3f} {deflated:13.3f} {dense / deflated:6.2f} {value_error:10.1e} {gradient_error:13.1e}"
+            f"{count:5d} {constraints:11d} {dense:10.3f} {deflated:13.3f} {dense / deflated:6.2f} "
+            f"{value_error:10.1e} {gradient_error:13.1e}"
         )
     dense_peak, deflated_peak = (peak_mebibytes(side, 1000, 1) for side in ("dense", "deflated"))
     results["nll_memory_ratio_n1000"] = deflated_peak / dense_peak
     print(
-        f"peak memory at N=1000: dense {dense_peak:.0f} MiB, deflated {deflated_peak:.0f} MiB, ratio {deflated_peak / dense_peak:.3f}"
+        f"peak memory at N=1000: dense {dense_peak:.0f} MiB, deflated {deflated_peak:.0f} MiB, ratio "
+        f"{deflated_peak / dense_peak:.3f}"
     )
     return results
 

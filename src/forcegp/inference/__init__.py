@@ -1,4 +1,7 @@
-"""Exact Gaussian-process inference by deflation. Knows mixing vectors, kernels, noise and targets; nothing of robots."""
+"""Exact Gaussian-process inference by deflation.
+
+Knows mixing vectors, kernels, noise and targets; nothing of robots.
+"""
 
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import negative_log_likelihood

@@ -1,7 +1,8 @@
 """Cholesky factors computed in place, with a bounded jitter ladder that reports itself.
 
-On the CPU the factor is made by LAPACK through scipy, inside the memory of the matrix itself: at 6000 x 6000 that saves two copies of
-288 MB, and scipy's `dpotri` was measured 1.8 times faster than `torch.cholesky_inverse`. Other devices use torch.linalg.
+On the CPU the factor is made by LAPACK through scipy, inside the memory of the matrix itself: at 6000 x 6000 that saves
+two copies of 288 MB, and scipy's `dpotri` was measured 1.8 times faster than `torch.cholesky_inverse`. Other devices
+use torch.linalg.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ class CholeskyFactor:
         """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
         if not _is_for_lapack(self.lower):
             return torch.cholesky_inverse(self.lower.tril_(), out=self.lower)
-        # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a copy.
+        # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a
+        # copy.
         inverse, info = lapack.dpotri(self.lower.numpy().T, lower=0, overwrite_c=1)
         if info != 0:
             raise NumericalError(
@@ -63,8 +65,8 @@ class CholeskyFactor:
 def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
     """Cholesky factor of the matrix that `build` returns; its memory is overwritten.
 
-    Only the lower triangle is read. A matrix that is not positive definite in floating point is built again with a larger
-    multiple of its mean diagonal added (`JITTER_LADDER`), and a NumericalWarning says how much.
+    Only the lower triangle is read. A matrix that is not positive definite in floating point is built again with a
+    larger multiple of its mean diagonal added (`JITTER_LADDER`), and a NumericalWarning says how much.
 
     Raises
     ------
@@ -77,7 +79,8 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
         mean_diagonal = float(matrix.diagonal().mean()) if matrix.shape[0] else 1.0
         if not bool(torch.isfinite(matrix.diagonal()).all()):
             raise NumericalError(
-                "the covariance matrix has entries that are not finite; check the data for huge or constant columns and the start values "
+                "the covariance matrix has entries that are not finite; check the data for huge or constant columns "
+                "and the start values "
                 "of the hyper-parameters"
             )
         jitter = relative * mean_diagonal
@@ -87,14 +90,16 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
         if ok:
             if jitter:
                 warnings.warn(
-                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {matrix.shape[0]} x {matrix.shape[0]} covariance "
+                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {matrix.shape[0]} x "
+                    f"{matrix.shape[0]} covariance "
                     "positive definite; larger noise or fewer duplicate points avoid this",
                     NumericalWarning,
                     stacklevel=2,
                 )
             return CholeskyFactor(lower, jitter)
     raise NumericalError(
-        f"the covariance matrix is not positive definite even with {jitter:.2e} added to its diagonal; raise the noise level, remove "
+        f"the covariance matrix is not positive definite even with {jitter:.2e} added to its diagonal; raise the "
+        "noise level, remove "
         "duplicate points, or check that the inputs are finite and of similar scale"
     )
 

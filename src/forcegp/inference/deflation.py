@@ -1,8 +1,9 @@
 """Deflation: an exact change of variables that shrinks the covariance from DN x DN to rN x rN.
 
-The model is y_i = m_i + W_i f(x_i) + noise_i with D outputs, C latent functions and noise covariance R_i = L_i L_i^T. In whitened
-coordinates, y~_i = L_i^-1 (y_i - m_i) and W~_i = L_i^-1 W_i = U_i C_i with orthonormal U_i (D x r). The part of y~_i orthogonal to U_i
-does not depend on the latents and is standard normal; U_i^T y~_i carries everything that the data say about them.
+The model is y_i = m_i + W_i f(x_i) + noise_i with D outputs, C latent functions and noise covariance R_i = L_i L_i^T.
+In whitened coordinates, y~_i = L_i^-1 (y_i - m_i) and W~_i = L_i^-1 W_i = U_i C_i with orthonormal U_i (D x r). The
+part of y~_i orthogonal to U_i does not depend on the latents and is standard normal; U_i^T y~_i carries everything that
+the data say about them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from torch import Tensor
 from forcegp.errors import NumericalError
 
 RANK_TOLERANCE = 1e-10
-"""Singular values of W~_i below this fraction of the largest one count as zero (they come from rounding in H A^T = 0)."""
+"""Singular values of W~_i below this fraction of the largest one count as zero (they come from rounding in H A^T =
+0).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,8 @@ def whiten(
     lower, info = torch.linalg.cholesky_ex(noise)
     if bool((info != 0).any()):
         raise NumericalError(
-            f"the noise covariance of row {int(torch.nonzero(info)[0])} is not positive definite; raise the acceleration noise"
+            f"the noise covariance of row {int(torch.nonzero(info)[0])} is not positive definite; raise the "
+            "acceleration noise"
         )
     logdet = lower.diagonal(dim1=-2, dim2=-1).log().sum(-1).expand(count).sum()
     W_white = torch.linalg.solve_triangular(lower, W, upper=False)
@@ -59,11 +63,12 @@ def whiten(
 
 
 def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> Deflation:
-    """Split whitened data into the r-dimensional part that depends on the latents and the rest; r is found from the data.
+    """Split whitened data into what depends on the latents and what does not.
 
-    U_i comes from the singular value decomposition of W~_i. Points of lower rank than the largest keep orthonormal columns with zero
-    rows in C_i, which is exact too. Not differentiable on its own: `deflated_negative_log_likelihood` carries the gradients, which do
-    not depend on the choice of basis. Raises NumericalError where W~ or y~ is not finite.
+    The rank r is found from the data. U_i comes from the singular value decomposition of W~_i. Points of lower rank
+    than the largest keep orthonormal columns with zero rows in C_i, which is exact too. Not differentiable on its own:
+    `deflated_negative_log_likelihood` carries the gradients, which do not depend on the choice of basis. Raises
+    NumericalError where W~ or y~ is not finite.
     """
     with torch.no_grad():
         _require_finite(W_white, "the mixing vectors W", "check q, v, u and the contact geometry")

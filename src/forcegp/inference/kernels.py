@@ -1,14 +1,16 @@
 """Kernel matrices of GPyTorch kernels, evaluated lean in memory.
 
-GPyTorch's own lazy paths are not used: above N D = 800 they switch silently to conjugate gradients (measured error of the predictive mean
-7.9 rad/s^2 on the iiwa). Kernels are called densely. The squared exponential, which almost every model uses, has hand-written gradients:
-one N x N by N x d product per latent and no N x N x d tensor; other kernels are recomputed in the backward pass, one latent at a time.
+GPyTorch's own lazy paths are not used: above N D = 800 they switch silently to conjugate gradients (measured error of
+the predictive mean 7.9 rad/s^2 on the iiwa). Kernels are called densely. The squared exponential, which almost every
+model uses, has hand- written gradients: one N x N by N x d product per latent and no N x N x d tensor; other kernels
+are recomputed in the backward pass, one latent at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
+from typing import cast
 
 import torch
 from gpytorch.kernels import Kernel, RBFKernel, ScaleKernel
@@ -22,14 +24,17 @@ from forcegp.errors import InvalidInput
 
 def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N"]:
     """k(z_i, z_j), dense and differentiable in the kernel's parameters and in z."""
-    if _is_squared_exponential(kernel):
-        return _SquaredExponential.apply(z, kernel.base_kernel.lengthscale.reshape(-1), kernel.outputscale)
+    squared_exponential = _squared_exponential_parameters(kernel)
+    if squared_exponential is not None:
+        return cast(Tensor, _SquaredExponential.apply(z, *squared_exponential))
     if not torch.is_grad_enabled():
         return kernel(z, z).to_dense()
     dense = _DenseKernel(kernel)
-    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own ones back.
+    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own
+    # ones back.
     names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
-    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims` back.
+    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims`
+    # back.
     with set_checkpoint_early_stop(False):
         return checkpoint(
             lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
@@ -41,15 +46,16 @@ def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N
 
 def kernel_cross(kernel: Kernel, z: Float[Tensor, "n d"], z_train: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
     """k(z_i, z_train_j), dense."""
-    if _is_squared_exponential(kernel):
-        lengthscale = kernel.base_kernel.lengthscale.reshape(-1)
-        return kernel.outputscale * torch.exp(-0.5 * _squared_distance(z / lengthscale, z_train / lengthscale))
+    squared_exponential = _squared_exponential_parameters(kernel)
+    if squared_exponential is not None:
+        lengthscale, outputscale = squared_exponential
+        return outputscale * torch.exp(-0.5 * _squared_distance(z / lengthscale, z_train / lengthscale))
     return kernel(z, z_train).to_dense()
 
 
 def kernel_diagonal(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
     """k(z_i, z_i)."""
-    return kernel(z, z, diag=True)
+    return cast(Tensor, kernel(z, z, diag=True))
 
 
 class LatentKernels(torch.nn.Module):
@@ -65,15 +71,22 @@ class LatentKernels(torch.nn.Module):
             if value.dtype != torch.float64:
                 raise InvalidInput(f"{name} is {value.dtype}; inference needs float64, call .double() on the kernel.")
 
+    def __iter__(self) -> Iterator[Kernel]:
+        return iter(cast("list[Kernel]", list(self.kernels)))
+
     def forward(self, features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
         """One dense matrix per latent."""
-        return [kernel_matrix(kernel, z) for kernel, z in zip(self.kernels, features, strict=True)]
+        return [kernel_matrix(kernel, z) for kernel, z in zip(self, features, strict=True)]
 
     def matrices(
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
     ) -> list[Float[Tensor, "N N"]]:
         """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
         return functional_call(self, {name: parameters[name] for name, _ in self.named_parameters()}, (features,))
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """Log density of the GPyTorch priors registered on the kernels, at `parameters`; 0 where there are none."""
+        return functional_call(_LogPrior(self), {n: parameters[n] for n, _ in self.named_parameters()}, ())
 
     def initial_parameters(self) -> dict[str, Tensor]:
         """The unconstrained parameters by name, detached copies."""
@@ -88,6 +101,22 @@ class LatentKernels(torch.nn.Module):
         return copy
 
 
+class _LogPrior(torch.nn.Module):
+    """Sum of the log densities of all priors that are registered on some kernels."""
+
+    def __init__(self, latent: LatentKernels) -> None:
+        super().__init__()
+        self.kernels = latent.kernels
+        self.named = [entry for kernel in latent for entry in kernel.named_priors()]
+
+    def forward(self) -> Tensor:
+        total = torch.zeros((), dtype=torch.float64)
+        for _, module, prior, closure, _ in self.named:
+            value = prior.log_prob(closure(module)).sum()
+            total = total.to(value.device) + value
+        return total
+
+
 class _DenseKernel(torch.nn.Module):
     """A kernel whose call returns the dense matrix at once, so that `functional_call` covers the whole evaluation."""
 
@@ -99,15 +128,18 @@ class _DenseKernel(torch.nn.Module):
         return self.kernel(z, z).to_dense()
 
 
-def _is_squared_exponential(kernel: Kernel) -> bool:
+def _squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
+    """Length scales and output scale of a plain scaled squared exponential; None for every other kernel."""
     if type(kernel) is not ScaleKernel or type(kernel.base_kernel) is not RBFKernel:
-        return False
+        return None
     base = kernel.base_kernel
-    return kernel.active_dims is None and base.active_dims is None and not kernel.batch_shape and not base.batch_shape
+    if kernel.active_dims is not None or base.active_dims is not None or kernel.batch_shape or base.batch_shape:
+        return None
+    return cast(Tensor, base.lengthscale).reshape(-1), cast(Tensor, kernel.outputscale)
 
 
 def _squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
-    """|x_i - y_j|^2 by one matrix product; centred first, which keeps the cancellation error below 1e-14 for standardised inputs."""
+    """|x_i - y_j|^2 by one matrix product, centred first: cancellation stays below 1e-14 for standardised inputs."""
     centre = y.mean(dim=0, keepdim=True) if y.shape[0] else 0.0
     x, y = x - centre, y - centre
     return (x.square().sum(-1)[:, None] + y.square().sum(-1)[None, :]).addmm(x, y.mT, alpha=-2.0).clamp_min(0.0)
@@ -127,7 +159,8 @@ class _SquaredExponential(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
-        if torch.is_grad_enabled():  # create_graph=True: `once_differentiable` lets it pass where upstream is a constant
+        # With create_graph=True: `once_differentiable` would let it pass where upstream is a constant.
+        if torch.is_grad_enabled():
             raise NotImplementedError(
                 "this kernel matrix has first derivatives only; for a Hessian take finite differences of its gradient"
             )

@@ -1,14 +1,16 @@
 """Negative log marginal likelihood of the deflated model, with hand-written gradients.
 
-With S~ the whitened covariance, T = (c_ic . c_jc k_c(x_i, x_j))_ij + I its deflated part, alpha = T^-1 t, beta_c = sum_a C_iac alpha_ia:
+With S~ the whitened covariance, T = (c_ic . c_jc k_c(x_i, x_j))_ij + I its deflated part, alpha = T^-1 t, beta_c =
+sum_a C_iac alpha_ia:
 
     NLL = 1/2 t^T alpha + 1/2 log|T| + 1/2 |remainder|^2 + sum_i log|L_i| + D N / 2 log 2 pi
     dNLL/dk_c[i,j] = 1/2 (c_ic^T T^-1_ij c_jc - beta_ci beta_cj)
     dNLL/dC_iac    = sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] - alpha_ia (K_c beta_c)_i
     dNLL/dW~_i     = U_i dNLL/dC_i - remainder_i (K_c beta_c)_i^T           dNLL/dy~_i = U_i alpha_i + remainder_i
 
-The last line follows from S~^-1 = U T^-1 U^T + (I - U U^T), so nothing is differentiated through the basis U. T lives in one buffer of
-(rN)^2 doubles that becomes its own factor and its own inverse; it is written and read in panels of rows, lower triangle only.
+The last line follows from S~^-1 = U T^-1 U^T + (I - U U^T), so nothing is differentiated through the basis U. T lives
+in one buffer of (rN)^2 doubles that becomes its own factor and its own inverse; it is written and read in panels of
+rows, lower triangle only.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ def negative_log_likelihood(
 ) -> Float[Tensor, ""]:
     """Exact -log p(y) of y = m + sum_c W_c f_c + noise, residual = y - m; differentiable in every argument.
 
-    `noise` holds variances (N or 1, D) or covariance matrices (N or 1, D, D); `kernel_matrices` one N x N matrix per latent.
+    `noise` holds variances (N or 1, D) or covariance matrices (N or 1, D, D); `kernel_matrices` one N x N matrix per
+    latent.
     Source: Rasmussen & Williams (2006), eq. 2.30, after the change of variables of `deflation`.
     Raises NumericalError when a covariance cannot be factorised.
     """
@@ -128,7 +131,8 @@ class _DeflatedNLL(torch.autograd.Function):
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
         if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
             raise NotImplementedError(
-                "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its gradient"
+                "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its "
+                "gradient"
             )
         return tuple(None if g is None else upstream * g for g in ctx.gradients)
 
@@ -138,7 +142,7 @@ def _inverse_contractions(
 ) -> tuple[Tensor | None, list[Tensor | None]]:
     """sum_jb T^-1 C k and dNLL/dK from one sweep over T^-1; the factor's memory is used up."""
     C, beta = system.deflation.C, system.beta
-    count, rank, latents = C.shape
+    rank, latents = C.shape[1:]
     inverse = system.factor.into_inverse()
     C_by_latent = C.permute(2, 0, 1).contiguous()
     C_gradient = torch.zeros_like(C) if W_needed else None

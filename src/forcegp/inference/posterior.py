@@ -1,4 +1,4 @@
-"""Posterior of the latent functions given the deflated data: mean (n, C) and joint covariance (n, C, C) at new points."""
+"""Posterior of the latent functions given the deflated data: mean (n, C) and covariance (n, C, C) at new points."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class LatentPosterior:
         residual: Float[Tensor, "N D"],
         noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
     ) -> LatentPosterior:
-        """Condition on residual = y - m with mixing W and noise variances or covariances (see `negative_log_likelihood`)."""
+        """Condition on residual = y - m; the arguments are those of `negative_log_likelihood`."""
         with torch.no_grad():
             W_white, y_white, _ = whiten(W, residual, noise)
             system = solve_deflated(deflate(W_white, y_white), kernels(features))
@@ -45,12 +45,15 @@ class LatentPosterior:
         beta = self.system.beta
         columns = [
             kernel_cross(kernel, z, z_train) @ beta[:, c]
-            for c, (kernel, z, z_train) in enumerate(zip(self.kernels.kernels, features, self.features, strict=True))
+            for c, (kernel, z, z_train) in enumerate(zip(self.kernels, features, self.features, strict=True))
         ]
         return torch.stack(columns, dim=-1)
 
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        """Cov(f_c, f_d) = k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 [k_c(z, z_j) C_jac] (Rasmussen & Williams 2006, eq. 2.26)."""
+        """Cov(f_c, f_d) = k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 [k_c(z, z_j) C_jac].
+
+        Source: Rasmussen & Williams (2006), eq. 2.26.
+        """
         C = self.system.deflation.C
         count, rank, latents = C.shape
         points = features[0].shape[0]
@@ -64,15 +67,10 @@ class LatentPosterior:
         C = self.system.deflation.C
         count, rank, latents = C.shape
         cross = torch.stack(
-            [
-                kernel_cross(k, z, z_train)
-                for k, z, z_train in zip(self.kernels.kernels, features, self.features, strict=True)
-            ]
+            [kernel_cross(k, z, z_train) for k, z, z_train in zip(self.kernels, features, self.features, strict=True)]
         )
         points = cross.shape[1]
         V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, latents * points)
         V = self.system.factor.solve_lower(V).reshape(count * rank, latents, points).permute(2, 1, 0)
-        prior = torch.stack(
-            [kernel_diagonal(k, z) for k, z in zip(self.kernels.kernels, features, strict=True)], dim=-1
-        )
+        prior = torch.stack([kernel_diagonal(k, z) for k, z in zip(self.kernels, features, strict=True)], dim=-1)
         return torch.diag_embed(prior) - V @ V.mT

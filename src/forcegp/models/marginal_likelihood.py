@@ -1,4 +1,4 @@
-"""The one place where physics and Gaussian processes meet: from states and a prior to (m, W), features, start values and the NLL."""
+"""Where physics and Gaussian processes meet: from states and a prior to (m, W), features, start values and NLL."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from forcegp.priors import ForcePrior
 Mean = Literal["analytical", "zero"]
 INERTIALS = "inertials."
 RESIDUAL_FLOOR = 1e-6
-"""Smallest start variance of a latent as a fraction of the largest: a latent that the start residual does not excite can still grow."""
+"""Smallest start variance of a latent as a fraction of the largest: a latent that the start residual does not
+excite can still grow.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +61,11 @@ class Standardization:
 
 @dataclass(frozen=True, eq=False)
 class MarginalLikelihood:
-    """-log p(a | q, v, u, parameters) of one model on one training set; call it with a dictionary of unconstrained parameters.
+    """-log p(a | q, v, u, parameters) of one model on one training set, as a function of unconstrained parameters.
 
-    Parameters by name: those of the kernels, `noise.log_acceleration` (nv,), optionally `noise.log_force` (nv,), and optionally
-    `inertials.<link>` (10,) log-Cholesky parameters of links. All of them receive gradients in one backward pass.
+    Parameters by name: those of the kernels, `noise.log_acceleration` (nv,), optionally `noise.log_force` (nv,), and
+    optionally `inertials.<link>` (10,) log-Cholesky parameters of links. All of them receive gradients in one backward
+    pass.
     """
 
     system: MechanicalSystem
@@ -107,7 +110,8 @@ class MarginalLikelihood:
     def kernels(self) -> LatentKernels:
         """Kernels with moment-based start values.
 
-        Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force residual.
+        Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force
+        residual.
         """
         offset = self._nominal_dynamics.acceleration_map(known=self.mean == "analytical").offset
         W = self._nominal_mixing
@@ -116,7 +120,8 @@ class MarginalLikelihood:
         largest = float(variances.max()) if variances.numel() else 0.0
         if not largest > 0.0:
             raise InvalidInput(
-                "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was measured and not computed from "
+                "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was "
+                "measured and not computed from "
                 "the model itself"
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)

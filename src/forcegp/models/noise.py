@@ -29,14 +29,9 @@ class Noise:
     learn: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("acceleration", "force"):
-            value = getattr(self, name)
-            if value is None and name == "force":
-                continue
-            numbers = tuple(float(entry) for entry in value) if isinstance(value, Sequence) else (float(value),)
-            if not numbers or not all(0.0 < number < float("inf") for number in numbers):
-                raise InvalidInput(f"Noise {name} is {value!r}; standard deviations must be positive and finite.")
-            object.__setattr__(self, name, numbers if isinstance(value, Sequence) else numbers[0])
+        object.__setattr__(self, "acceleration", _positive("acceleration", self.acceleration))
+        if self.force is not None:
+            object.__setattr__(self, "force", _positive("force", self.force))
 
     def parameters(self, nv: int) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint. Raises InvalidInput for a wrong number of values."""
@@ -71,4 +66,17 @@ class Noise:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Noise:
         """The noise that `to_dict` stored."""
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()})
+        force = stored["force"]
+        return cls(
+            tuple(stored["acceleration"]) if isinstance(stored["acceleration"], list) else stored["acceleration"],
+            tuple(force) if isinstance(force, list) else force,
+            bool(stored["learn"]),
+        )
+
+
+def _positive(name: str, given: float | Sequence[float]) -> float | tuple[float, ...]:
+    several = isinstance(given, Sequence)
+    numbers = tuple(float(entry) for entry in given) if several else (float(given),)
+    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
+        raise InvalidInput(f"Noise {name} is {given!r}; standard deviations must be positive and finite.")
+    return numbers if several else numbers[0]

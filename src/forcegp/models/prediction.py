@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """A normal distribution per state: `mean` (..., k) and `covariance` (..., k, k), or None where only the mean was asked for."""
+    """A normal distribution per state; `covariance` is None where only the mean was asked for."""
 
     mean: Float[Tensor, "*batch k"]
     covariance: Float[Tensor, "*batch k k"] | None
@@ -32,9 +32,10 @@ class Gaussian:
 class Prediction(Gaussian):
     """The acceleration (`mean` in rad/s^2 or m/s^2, `covariance`), without measurement noise, and the forces behind it.
 
-    `multiplier` is lambda (..., m); `contact_force` the world force on the robot at each contact in turn (..., 3 m) in N;
-    `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean includes Q_K.
-    `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with noisy data.
+    `multiplier` is lambda (..., m); `contact_force` the world force on the robot at each contact in turn (..., 3 m) in
+    N; `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean
+    includes Q_K. `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with
+    noisy data.
     """
 
     multiplier: Gaussian

@@ -1,6 +1,7 @@
 """Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
 
-The folder holds the training points and parameters; loading runs the same conditioning as fitting, so predictions are the same.
+The folder holds the training points and parameters; loading runs the same conditioning as fitting, so predictions are
+the same.
 """
 
 from __future__ import annotations
@@ -94,7 +95,9 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
 
 
 def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> StructuredPosterior:
-    """Read a folder that `save_posterior` wrote; it predicts without the training file. `contacts` replaces the stored ones.
+    """Read a folder that `save_posterior` wrote; it predicts without the training file.
+
+    `contacts` replaces the stored ones.
 
     Raises
     ------
@@ -160,7 +163,8 @@ def _document(path: Path) -> dict[str, Any]:
     version = document.get("format_version")
     if version != FORMAT_VERSION:
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}; use the version that wrote it "
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}; use the "
+            "version that wrote it "
             f"({document.get('forcegp_version')}) or fit again"
         )
     return document

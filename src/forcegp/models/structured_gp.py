@@ -28,7 +28,9 @@ from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
 
 RESTART_SPREAD = 0.7
-"""Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has none."""
+"""Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
+none.
+"""
 
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
@@ -66,18 +68,22 @@ class StructuredGP:
         restarts: int = 1,
         seed: int = 0,
         jobs: int = 1,
+        hyperprior: bool = True,
         options: OptimizerOptions | None = None,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
-        """Type-II maximum likelihood of all kernel (and, if learned, noise) parameters, then the posterior on the same points.
+        """Find all kernel and learned noise parameters by marginal likelihood, then condition on the same points.
 
         Parameters
         ----------
         dataset: rows with the joints of the robot in its order; nothing in it is changed.
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
-        restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random factors.
+        restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
+        factors.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
+        hyperprior: maximise the marginal likelihood times the priors that the kernels carry (type-II maximum a
+            posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
         options: the search itself.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
 
@@ -104,7 +110,7 @@ class StructuredGP:
             first = _perturbed(start, seed, index) if index else start
             note = None if report is None else (lambda iteration, value: report(index, iteration, value))
             try:
-                return minimize_objective(_Objective(likelihood, kernels, fixed), first, options, note)
+                return minimize_objective(_Objective(likelihood, kernels, fixed, hyperprior), first, options, note)
             except FitError as error:
                 return error
 
@@ -118,13 +124,15 @@ class StructuredGP:
         settings = {
             "points": len(rows),
             "rows_available": len(dataset),
+            "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
             "restarts": restarts,
             "seed": seed,
             "mean": self.mean,
             "prior": prior_to_dict(self.prior),
             "noise": noise.to_dict(),
             "optimizer": {name: getattr(options, name) for name in options.__dataclass_fields__},
-            "restart_nll": [r.value if isinstance(r, OptimizationResult) else None for r in results],
+            "hyperprior": hyperprior,
+            "restart_objective": [r.value if isinstance(r, OptimizationResult) else None for r in results],
         }
         fitted = StructuredGP(self.system, self.prior, self.mean, noise)
         return fitted._posterior(likelihood, kernels, result.parameters | fixed, result, settings)
@@ -166,7 +174,8 @@ class StructuredGP:
             return self.noise
         if dataset.noise_std is None:
             raise InvalidInput(
-                "the dataset does not know its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or noise=Noise(0.1, learn=True) "
+                "the dataset does not know its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
+                "noise=Noise(0.1, learn=True) "
                 "to learn it from there"
             )
         return Noise(tuple(float(std) for std in dataset.noise_std))
@@ -193,13 +202,15 @@ class _Objective:
     likelihood: MarginalLikelihood
     kernels: LatentKernels
     fixed: Mapping[str, Tensor]
+    hyperprior: bool
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        return self.likelihood(self.kernels, {**self.fixed, **parameters})
+        value = self.likelihood(self.kernels, {**self.fixed, **parameters})
+        return value - self.kernels.log_prior(parameters) if self.hyperprior else value
 
 
 def _perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
-    """Kernel parameters shifted by seeded normal numbers on their unconstrained (log) scale; the noise keeps its start."""
+    """Kernel parameters shifted by seeded normal numbers on their log scale; the noise keeps its start."""
     generator = np.random.default_rng((seed, index))
     return {
         name: value
@@ -210,7 +221,7 @@ def _perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, 
 
 
 def _blas_threads(likelihood: MarginalLikelihood) -> AbstractContextManager[Any]:
-    """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times the work then."""
+    """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times as much."""
     rows, joints = likelihood.training.q.shape
     return threadpool_limits(1) if rows * joints <= SMALL_COVARIANCE else nullcontext()
 

@@ -31,9 +31,10 @@ Array = Tensor | np.ndarray | Sequence[Any]
 
 @dataclass(frozen=True, eq=False)
 class StructuredPosterior:
-    """A `StructuredGP` conditioned on training data at fixed parameters. Made by `StructuredGP.fit` or `load_posterior`.
+    """A `StructuredGP` conditioned on training data; made by `StructuredGP.fit` or `load_posterior`.
 
-    `result` holds the history of the optimisation, `settings` the resolved configuration of the fit (plain JSON values).
+    `result` holds the history of the optimisation, `settings` the resolved configuration of the fit (plain JSON
+    values).
     """
 
     model: StructuredGP
@@ -59,25 +60,27 @@ class StructuredPosterior:
         return self.system.robot.joint_names
 
     def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Prediction:
-        """Distribution of the acceleration, and of the forces behind it, at states (..., nv) in rad, rad/s, Nm (m, m/s, N).
+        """Distribution of the acceleration and of the forces behind it.
 
-        Arrays, lists and tensors are taken; results are float64 tensors. With `covariance=False` only means are computed, much faster.
-        Differentiable in q, v and u where these are tensors that require gradients.
-        Raises InvalidInput for wrong shapes or values that are not finite.
+        States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints).         Arrays, lists and tensors
+        are taken; results are float64 tensors. With `covariance=False` only means are computed, much faster.
+        Differentiable in q, v and u where these are tensors that require gradients. Raises InvalidInput for wrong
+        shapes or values that are not finite.
         """
         nv = self.system.robot.nv
-        states = torch.broadcast_tensors(*(_tensor(name, x, nv) for name, x in (("q", q), ("v", v), ("u", u))))
+        states = _broadcast(_tensor("q", q, nv), _tensor("v", v, nv), _tensor("u", u, nv))
         batch = states[0].shape[:-1]
         flat = [x.reshape(-1, nv) for x in states]
         rows = flat[0].shape[0]
         blocks = [
-            self._predict_rows(*(x[start : start + ROWS_PER_BLOCK] for x in flat), covariance)
+            self._predict_rows([x[start : start + ROWS_PER_BLOCK] for x in flat], covariance)
             for start in range(0, max(rows, 1), ROWS_PER_BLOCK)
         ]
         return _join(blocks, batch)
 
-    def _predict_rows(self, q: Tensor, v: Tensor, u: Tensor, covariance: bool) -> Prediction:
-        dynamics = self.system.dynamics(q, v, u, inertials_of(self.parameters))
+    def _predict_rows(self, states: Sequence[Tensor], covariance: bool) -> Prediction:
+        q, v, u = states
+        dynamics = self.system.dynamics(q, v, u, inertials_of(self.parameters) or None)
         known = self.model.mean == "analytical"
         features = self.likelihood.standardization(self.model.prior.features(dynamics))
         B = self.model.prior.mixing(dynamics)
@@ -98,6 +101,12 @@ class StructuredPosterior:
             unknown_force=through(_identity_map(dynamics)),
             noise_covariance=_noise_covariance(self.parameters, dynamics),
         )
+
+    @cached_property
+    def negative_log_likelihood(self) -> float:
+        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
+        with torch.no_grad():
+            return float(self.likelihood(self.kernels, self.parameters))
 
     @property
     def noise_std(self) -> Float[Tensor, "nv"]:
@@ -126,6 +135,14 @@ def _tensor(name: str, values: Array, nv: int) -> Tensor:
     if not bool(torch.isfinite(tensor).all()):
         raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
     return tensor
+
+
+def _broadcast(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+    try:
+        return list(torch.broadcast_tensors(q, v, u))
+    except RuntimeError:
+        shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
+        raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state.") from None
 
 
 def _identity_map(dynamics: ConstrainedDynamics) -> AffineMap:

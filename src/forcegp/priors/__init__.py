@@ -18,7 +18,8 @@ def prior_to_dict(prior: ForcePrior) -> dict[str, Any]:
     name = next((name for name, kind in PRIORS.items() if type(prior) is kind), None)
     if name is None:
         raise InvalidInput(
-            f"a {type(prior).__name__} cannot be stored: register it first, PRIORS['my-prior'] = {type(prior).__name__}; "
+            f"a {type(prior).__name__} cannot be stored: register it first, PRIORS['my-prior'] = "
+            f"{type(prior).__name__}; "
             f"registered: {', '.join(PRIORS)}"
         )
     return {"type": name, **prior.to_dict()}

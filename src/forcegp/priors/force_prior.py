@@ -16,8 +16,8 @@ from forcegp.robots import Robot
 class ForcePrior(ABC):
     """A prior on the joint force that nobody modelled.
 
-    A new prior is one subclass with the four methods below, and an entry in `forcegp.priors.PRIORS` so that models with it can be stored.
-    All methods are pure: the same states give the same answer.
+    A new prior is one subclass with the four methods below, and an entry in `forcegp.priors.PRIORS` so that models with
+    it can be stored. All methods are pure: the same states give the same answer.
     """
 
     @abstractmethod
@@ -34,7 +34,7 @@ class ForcePrior(ABC):
 
     @abstractmethod
     def kernels(self, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        """Fresh kernels with start values, for standardised features of these dimensions and latents of these variances."""
+        """Fresh kernels with start values, for standardised features and latents of these variances."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import torch
 from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics
@@ -22,9 +23,10 @@ INPUTS = ("q", "v", "u")
 
 @dataclass(frozen=True)
 class JointForces(ForcePrior):
-    """Q_U = f(x) with f_j ~ GP(0, k_j), j = 1 ... nv (Rath et al. 2021, eqs. 5-7); squared exponential, one length scale per input.
+    """Q_U = f(x) with independent f_j ~ GP(0, k_j), one per joint (Rath et al. 2021, eqs. 5-7).
 
-    `inputs` chooses which of q, v and u the force may depend on.
+    The kernels are squared exponentials with one length scale per input. `inputs` chooses which of q, v and u the
+    force may depend on.
     """
 
     inputs: tuple[str, ...] = INPUTS
@@ -38,25 +40,30 @@ class JointForces(ForcePrior):
         ):
             raise InvalidInput(f"JointForces inputs are {self.inputs!r}; give one or more of 'q', 'v', 'u', each once.")
 
+    @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
         return robot.joint_names
 
+    @override
     def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
-        return torch.eye(
-            dynamics.state.u.shape[-1], dtype=dynamics.state.u.dtype, device=dynamics.state.u.device
-        ).expand_as(dynamics.H)
+        u = dynamics.state.u
+        return torch.eye(u.shape[-1], dtype=u.dtype, device=u.device).expand_as(dynamics.H)
 
+    @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         states = {"q": dynamics.state.q, "v": dynamics.state.v, "u": dynamics.state.u}
         z = torch.cat([states[name] for name in self.inputs], dim=-1)
         return (z,) * dynamics.state.u.shape[-1]
 
+    @override
     def kernels(self, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        # Standardised points in d dimensions are about sqrt(2 d) apart: shorter length scales start with a vanishing gradient.
+        # Standardised points in d dimensions are about sqrt(2 d) apart: shorter length scales start with a vanishing
+        # gradient.
         return tuple(
             squared_exponential_kernel(dimension, math.sqrt(dimension), variance)
             for dimension, variance in zip(dimensions, variances, strict=True)
         )
 
+    @override
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
