@@ -1,0 +1,111 @@
+"""What every surface must do. A new surface is tested by one subclass whose name begins with `Test`:
+
+class TestTorus(SurfaceConformance):
+    surface = Torus(...)
+"""
+
+import json
+
+import pytest
+import torch
+
+from forcegp.errors import ContactError
+from forcegp.mechanics import ImplicitSurface, Surface
+from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
+
+BATCHES = [(), (1,), (0,), (4,), (2, 3), (3, 0, 2)]
+STEP = 1e-5
+
+
+class SurfaceConformance:
+    """Value, gradient, Hessian, batches, transforms and storage of `surface`."""
+
+    surface: Surface
+    storable = True  # False for surfaces that hold code
+    signed_distance = True  # |s_p| = 1 everywhere
+
+    def points(self, *batch: int) -> torch.Tensor:
+        """Points at which the surface is smooth; override where random ones within 1 m of the origin are not."""
+        return torch.randn(*batch, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    @pytest.mark.parametrize("batch", BATCHES, ids=str)
+    def test_batch_dimensions_are_arbitrary(self, batch):
+        p = self.points(*batch)
+        shapes = {"value": (), "gradient": (3,), "hessian": (3, 3)}
+        for name, trailing in shapes.items():
+            function = getattr(self.surface, name)
+            result = function(p)
+            assert result.shape == (*batch, *trailing)
+            assert result.dtype == torch.float64
+            one_by_one = [function(point) for point in p.reshape(-1, 3)]
+            if one_by_one:
+                torch.testing.assert_close(result.reshape(-1, *trailing), torch.stack(one_by_one), rtol=0.0, atol=1e-14)
+
+    def test_points_in_any_memory_layout(self):
+        p = self.points(4, 5)
+        scattered = p.transpose(0, 1).contiguous().transpose(0, 1)
+        for name in ("value", "gradient", "hessian"):
+            assert torch.equal(getattr(self.surface, name)(scattered), getattr(self.surface, name)(p))
+        assert torch.equal(p, self.points(4, 5))
+
+    def test_gradient_and_hessian_against_finite_differences(self):
+        p = self.points(20)
+        steps = STEP * torch.eye(3, dtype=torch.float64)[:, None, :]
+        ahead, behind = p + steps, p - steps
+        gradient = (self.surface.value(ahead) - self.surface.value(behind)).mT / (2.0 * STEP)
+        torch.testing.assert_close(self.surface.gradient(p), gradient, rtol=1e-8, atol=1e-8)
+        hessian = (self.surface.gradient(ahead) - self.surface.gradient(behind)).permute(1, 2, 0) / (2.0 * STEP)
+        torch.testing.assert_close(self.surface.hessian(p), hessian, rtol=1e-8, atol=1e-8)
+
+    def test_gradient_and_hessian_against_autograd(self):
+        for point in self.points(10):
+            gradient = torch.autograd.functional.jacobian(self.surface.value, point)
+            torch.testing.assert_close(self.surface.gradient(point), gradient, rtol=1e-12, atol=1e-12)
+            hessian = torch.autograd.functional.hessian(self.surface.value, point)
+            torch.testing.assert_close(self.surface.hessian(point), hessian, rtol=1e-12, atol=1e-12)
+
+    def test_hessian_is_symmetric(self):
+        hessian = self.surface.hessian(self.points(20))
+        torch.testing.assert_close(hessian, hessian.mT, rtol=0.0, atol=1e-14)
+
+    def test_everything_is_differentiable_in_the_points(self):
+        for name in ("value", "gradient", "hessian"):
+            p = self.points(2).requires_grad_()
+            assert torch.autograd.gradcheck(getattr(self.surface, name), (p,)), name
+
+    def test_vmap_and_jacrev(self):
+        p = self.points(4, 2)
+        for name in ("value", "gradient", "hessian"):
+            function = getattr(self.surface, name)
+            mapped = torch.func.vmap(torch.func.vmap(function))(p)
+            torch.testing.assert_close(mapped, function(p), rtol=0.0, atol=1e-14)
+            torch.testing.assert_close(torch.func.vmap(function)(p), function(p), rtol=0.0, atol=1e-14)
+        hessians = torch.func.vmap(torch.func.jacrev(self.surface.gradient))(p[:, 0])
+        torch.testing.assert_close(hessians, self.surface.hessian(p[:, 0]), rtol=1e-12, atol=1e-12)
+
+    def test_an_implicit_surface_of_the_same_function_is_the_same(self):
+        implicit, p = ImplicitSurface(self.surface.value), self.points(5)
+        for name in ("value", "gradient", "hessian"):
+            torch.testing.assert_close(
+                getattr(implicit, name)(p), getattr(self.surface, name)(p), rtol=1e-12, atol=1e-12
+            )
+
+    def test_a_signed_distance_has_unit_normals(self):
+        p = self.points(20)
+        normal = self.surface.gradient(p)
+        assert bool(((normal.norm(dim=-1) - 1.0).abs() < 1e-12).all()) == self.signed_distance
+        if self.signed_distance:
+            assert float((self.surface.hessian(p) @ normal[..., None]).abs().max()) < 1e-12
+            foot = p - self.surface.value(p)[:, None] * normal
+            assert float(self.surface.value(foot).abs().max()) < 1e-12
+
+    def test_it_survives_a_file_exactly_or_says_that_it_cannot(self):
+        if self.storable:
+            stored = json.loads(json.dumps(surface_to_dict(self.surface)))
+            again = surface_from_dict(stored)
+            assert again == self.surface
+            assert type(again) is type(self.surface)
+            assert surface_to_dict(again) == surface_to_dict(self.surface)
+        else:
+            with pytest.raises(ContactError, match="cannot be stored: files carry numbers, never code"):
+                surface_to_dict(self.surface)

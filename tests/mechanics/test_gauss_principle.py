@@ -1,0 +1,285 @@
+"""Gauss' principle against the KKT equations solved densely, and the identities of H."""
+
+import pytest
+import torch
+from tests.mechanics.systems import (
+    INDEPENDENT,
+    REDUNDANT,
+    assert_close,
+    assert_derivatives,
+    normal,
+    regular_states,
+    robot,
+    solve_kkt,
+    states,
+    system,
+)
+from tests.robots.robot_models import FRAMES, MODELS
+
+from forcegp.errors import NumericalError
+from forcegp.mechanics import Actuation, Baumgarte, Contact, MechanicalSystem, Plane, Sphere
+
+TOLERANCE = 1e-10
+ALL = [*INDEPENDENT, *REDUNDANT]
+LINKS = {"iiwa": ("lbr_iiwa_link_7", "lbr_iiwa_link_4"), "tree": ("right_hand", "body"), "chain": ("wrist", "bracket")}
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("model", MODELS)
+class TestAgainstDenseEquations:
+    @pytest.fixture
+    def solved(self, model, kind):
+        built = system(model, kind, baumgarte=Baumgarte(10.0, 1.0))
+        dynamics = built.dynamics(*regular_states(built, 20))
+        return dynamics, normal(20, built.robot.nv, seed=9)
+
+    def test_acceleration_and_multiplier(self, solved):
+        dynamics, Q_U = solved
+        a, multiplier = solve_kkt(dynamics.M, dynamics.Q_K + Q_U, dynamics.A, dynamics.b)
+        assert_close(dynamics.acceleration(Q_U), a, TOLERANCE)
+        assert_close(dynamics.multiplier(Q_U), multiplier, TOLERANCE)
+
+    def test_H_and_Q_b(self, solved):
+        """H is the response to unit forces; Q_b the constraint force that b needs when nothing else acts."""
+        dynamics, Q_U = solved
+        nothing = torch.zeros_like(Q_U)
+        at_rest, multiplier = solve_kkt(dynamics.M, nothing, dynamics.A, dynamics.b)
+        assert_close(dynamics.Q_b, (dynamics.A.mT @ multiplier[..., None])[..., 0], TOLERANCE)
+        columns = []
+        for unit in torch.eye(Q_U.shape[-1], dtype=torch.float64):
+            response, _ = solve_kkt(dynamics.M, unit.expand_as(Q_U), dynamics.A, torch.zeros_like(dynamics.b))
+            columns.append(response)
+        assert_close(dynamics.H, torch.stack(columns, dim=-1), TOLERANCE)
+        assert_close(dynamics.acceleration_map(known=False)(nothing), at_rest, TOLERANCE)
+
+    def test_identities(self, solved):
+        dynamics, Q_U = solved
+        H, M, A, a = dynamics.H, dynamics.M, dynamics.A, dynamics.acceleration(Q_U)
+        assert_close((A @ a[..., None])[..., 0], dynamics.b, TOLERANCE)
+        assert_close(H @ M @ H, H, TOLERANCE)
+        assert torch.equal(H, H.mT)
+        scale = float(H.abs().max())
+        assert float((H @ A.mT / scale).abs().sum()) < TOLERANCE
+        assert float(torch.linalg.eigvalsh(H).min()) > -TOLERANCE * scale
+        rank = int(torch.linalg.matrix_rank(A, rtol=1e-9).min()) if A.shape[-2] else 0
+        assert_close(
+            (H @ M).diagonal(dim1=-2, dim2=-1).sum(-1), torch.full((20,), float(M.shape[-1] - rank)).double(), 1e-9
+        )
+        forces = dynamics.Q_K + Q_U + (A.mT @ dynamics.multiplier(Q_U)[..., None])[..., 0]
+        assert_close((M @ a[..., None])[..., 0], forces, TOLERANCE)
+
+    def test_affine_maps(self, solved):
+        dynamics, Q_U = solved
+        for affine, value in (
+            (dynamics.acceleration_map(), dynamics.acceleration(Q_U)),
+            (dynamics.multiplier_map(), dynamics.multiplier(Q_U)),
+        ):
+            assert_close(affine(Q_U), value, 1e-14)
+            assert_close(affine.offset + (affine.matrix @ Q_U[..., None])[..., 0], value, 1e-14)
+        everything = dynamics.Q_K + Q_U
+        assert_close(dynamics.acceleration_map(known=False)(everything), dynamics.acceleration(Q_U), TOLERANCE)
+        assert_close(dynamics.multiplier_map(known=False)(everything), dynamics.multiplier(Q_U), TOLERANCE)
+        assert_close(dynamics.contact_force_map(known=False)(everything), dynamics.contact_force_map()(Q_U), TOLERANCE)
+
+    def test_contact_forces_do_the_work_of_the_multiplier(self, solved, model):
+        """sum_k J_k^T F_k = A^T lambda, with every F_k along the normal of its surface."""
+        dynamics, Q_U = solved
+        built = system(model, "none")
+        forces = dynamics.contact_force_map()(Q_U).unflatten(-1, (-1, 3)) if dynamics.b.shape[-1] else None
+        multiplier = dynamics.multiplier(Q_U)
+        total = torch.zeros_like(Q_U)
+        for index in range(dynamics.b.shape[-1]):
+            force = forces[:, index]
+            assert_close(force, dynamics.normals[:, index] * multiplier[:, index, None], 1e-14)
+            point = self.point_of(dynamics, index, model)
+            J = built.robot.frame_jacobian(dynamics.state.q, FRAMES[model], point)[:, :3]
+            total = total + (J.mT @ force[..., None])[..., 0]
+        assert_close(total, (dynamics.A.mT @ multiplier[..., None])[..., 0], TOLERANCE)
+        if not dynamics.b.shape[-1]:
+            assert dynamics.contact_force_map()(Q_U).shape == (20, 0)
+
+    @staticmethod
+    def point_of(dynamics, index, model):
+        kinds = {1: "one", 2: "same twice", 3: "three", 4: "four corners"}
+        return system(model, kinds[dynamics.b.shape[-1]]).contacts[index].point
+
+    def test_least_constraint(self, solved):
+        """Among all accelerations with A a = b, a is nearest to the free one in the metric of M (Gauss 1829)."""
+        dynamics, Q_U = solved
+        M, a = dynamics.M, dynamics.acceleration(Q_U)
+        free = torch.linalg.solve(M, dynamics.Q_K + Q_U)
+        allowed = dynamics.H @ M @ normal(20, M.shape[-1], seed=11)[..., None]  # A H = 0
+
+        def constraint(acceleration):
+            difference = (acceleration - free)[..., None]
+            return (difference.mT @ M @ difference)[..., 0, 0]
+
+        for step in (-0.1, 0.1):
+            assert bool((constraint(a + step * allowed[..., 0]) > constraint(a)).all())
+
+
+def test_redundant_contacts_share_the_force_equally():
+    once, twice = system("iiwa", "one"), system("iiwa", "one")
+    twice = twice.with_contacts(once.contacts * 2)
+    q_v_u, Q_U = states(7, 5), normal(5, 7)
+    single, shared = once.dynamics(*q_v_u), twice.dynamics(*q_v_u)
+    assert_close(shared.acceleration(Q_U), single.acceleration(Q_U), TOLERANCE)
+    assert_close(shared.multiplier(Q_U), single.multiplier(Q_U).expand(5, 2) / 2.0, TOLERANCE)
+
+
+def test_without_contacts_it_is_forward_dynamics():
+    built = system("tree", "none")
+    q, v, u = states(built.robot.nv, 6)
+    Q_U = normal(6, built.robot.nv)
+    dynamics = built.dynamics(q, v, u)
+    assert_close(dynamics.acceleration(Q_U), built.robot.forward_dynamics(q, v, u + Q_U), 1e-12)
+    assert_close(dynamics.H, torch.linalg.inv(dynamics.M), TOLERANCE)
+    assert dynamics.A.shape == (6, 0, built.robot.nv)
+    assert dynamics.b.shape == dynamics.multiplier(Q_U).shape == (6, 0)
+    assert not dynamics.Q_b.any()
+
+
+def test_as_many_constraints_as_joints_leave_nothing_to_move():
+    """H = 0: the acceleration is what the constraints say, whatever the forces."""
+    built = system("chain", "three")
+    frame = FRAMES["chain"]
+    fixed = tuple(
+        Contact(frame, point, Plane(axis, 0.1))
+        for point, axis in (((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), ((0.1, 0.1, 0.0), (0.0, 0.0, 1.0)))
+    )
+    built = built.with_contacts((*built.contacts, *fixed)[: built.robot.nv])
+    dynamics = built.dynamics(*states(built.robot.nv, 4))
+    assert float(dynamics.H.abs().max()) < 1e-8 * float(torch.linalg.inv(dynamics.M).abs().max())
+    assert_close(dynamics.acceleration(normal(4, built.robot.nv)), torch.linalg.solve(dynamics.A, dynamics.b), 1e-8)
+
+
+# ---------------------------------------------------------------- batches
+
+
+@pytest.mark.parametrize("kind", ["none", "one", "four corners"])
+@pytest.mark.parametrize("batch", [(), (1,), (0,), (3,), (2, 3)], ids=str)
+def test_batch_dimensions_are_arbitrary(batch, kind):
+    built = system("iiwa", kind, baumgarte=Baumgarte(3.0))
+    q, v, u = states(7, *batch)
+    Q_U, m = normal(*batch, 7, seed=4), len(built.contacts)
+    dynamics = built.dynamics(q, v, u)
+    shapes = {"M": (7, 7), "H": (7, 7), "A": (m, 7), "b": (m,), "Q_b": (7,), "Q_K": (7,), "normals": (m, 3)}
+    for name, shape in shapes.items():
+        assert getattr(dynamics, name).shape == (*batch, *shape), name
+    assert dynamics.acceleration(Q_U).shape == (*batch, 7)
+    assert dynamics.multiplier(Q_U).shape == (*batch, m)
+    assert dynamics.contact_force_map()(Q_U).shape == (*batch, 3 * m)
+    rows = [
+        built.dynamics(*row[:-1]).acceleration(row[-1])
+        for row in zip(*(x.reshape(-1, 7) for x in (q, v, u, Q_U)), strict=True)
+    ]
+    if rows:
+        assert_close(dynamics.acceleration(Q_U).reshape(-1, 7), torch.stack(rows), TOLERANCE)
+
+
+def test_states_broadcast():
+    built = system("iiwa", "one")
+    q, v, u = states(7, 4)
+    for given in ((q[0], v, u), (q, v[:1], u), (q, v, u[2]), (q[:, None], v, u)):
+        dynamics = built.dynamics(*given)
+        assert_close(dynamics.H, built.dynamics(*torch.broadcast_tensors(*given)).H, 1e-14)
+    many = built.dynamics(q[0], v[0], u[0]).acceleration(normal(5, 7))
+    assert many.shape == (5, 7)
+
+
+@pytest.mark.parametrize("known", ["default", "actuation only"])
+@pytest.mark.parametrize("kind", ["none", "three"])
+def test_inertial_parameters_may_have_batch_dimensions_of_their_own(kind, known):
+    options = {} if known == "default" else {"known_forces": (Actuation(),)}
+    built = system("iiwa", kind, **options)
+    link = LINKS["iiwa"][0]
+    parameters = built.robot.inertial_parameters(link)[link] + 0.1 * normal(5, 10)
+    q, v, u = states(7)
+    Q_U = normal(7, seed=5)
+    dynamics = built.dynamics(q, v, u, {link: parameters})
+    expected = [built.dynamics(q, v, u, {link: row}).acceleration(Q_U) for row in parameters]
+    assert_close(dynamics.acceleration(Q_U.expand(5, 7)), torch.stack(expected), TOLERANCE)
+    assert dynamics.H.shape == (5, 7, 7)
+    assert dynamics.Q_K.shape == (5, 7)
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("model", ["tree", "chain"])
+def test_derivatives(model, kind):
+    """With respect to q, v, u and the inertial parameters of two links, also where contacts are redundant.
+
+    Rotor inertia makes the light wrists heavier, so that finite differences keep their digits.
+    """
+    built = system(model, kind, baumgarte=Baumgarte(2.0, 0.7))
+    built = built.with_robot(built.robot.with_armature([0.5] * built.robot.nv))
+    parameters = built.robot.inertial_parameters(*LINKS[model])
+    Q_U = normal(built.robot.nv)
+
+    def function(q, v, u, *inertials):
+        dynamics = built.dynamics(q, v, u, dict(zip(parameters, inertials, strict=True)))
+        parts = dynamics.acceleration(Q_U), dynamics.multiplier(Q_U), dynamics.Q_b, dynamics.H
+        return torch.cat([part.flatten() for part in parts])
+
+    assert_derivatives(function, *(x[0] for x in regular_states(built, 1)), *parameters.values())
+
+
+@pytest.mark.parametrize("kind", ["none", "one", "four corners"])
+def test_vmap_and_jacrev(kind):
+    built = system("chain", kind, baumgarte=Baumgarte(2.0))
+    nv = built.robot.nv
+    q, v, u = states(nv, 3)
+    Q_U = normal(3, nv)
+
+    def acceleration(q, v, u, Q_U):
+        return built.dynamics(q, v, u).acceleration(Q_U)
+
+    assert_close(torch.func.vmap(acceleration)(q, v, u, Q_U), acceleration(q, v, u, Q_U), TOLERANCE)
+    jacobians = torch.func.vmap(torch.func.jacrev(acceleration, argnums=(0, 1, 2, 3)))(q, v, u, Q_U)
+    for row in range(3):
+        expected = torch.autograd.functional.jacobian(acceleration, (q[row], v[row], u[row], Q_U[row]))
+        for jacobian, reference in zip(jacobians, expected, strict=True):
+            assert_close(jacobian[row], reference, TOLERANCE)
+    dynamics = built.dynamics(q, v, u)
+    assert_close(jacobians[2], dynamics.H, TOLERANCE)  # actuation enters like any other force
+    assert_close(jacobians[3], dynamics.H, TOLERANCE)
+
+
+def test_inertial_parameters_do_not_move_the_contact():
+    """A centre of mass that moved the contact point would tell the answer through the constraint (A and b)."""
+    built = system("iiwa", "three", baumgarte=Baumgarte(10.0))
+    link = FRAMES["iiwa"]
+    q, v, u = states(7, 3)
+    parameters = built.robot.inertial_parameters(link)[link].requires_grad_()
+    dynamics = built.dynamics(q, v, u, {link: parameters})
+    nominal = built.dynamics(q, v, u)
+    assert torch.equal(dynamics.A, nominal.A)
+    assert torch.equal(dynamics.b, nominal.b)
+    assert not dynamics.A.requires_grad
+    assert not dynamics.b.requires_grad
+    moved = built.dynamics(q, v, u, {link: parameters.detach() + torch.tensor([0.0] * 7 + [0.3] * 3).double()})
+    assert torch.equal(moved.A, nominal.A)
+    assert torch.equal(moved.b, nominal.b)
+    assert not torch.allclose(moved.H, nominal.H)
+
+
+# ---------------------------------------------------------------- what it refuses
+
+
+def test_states_that_are_not_finite():
+    q, v, u = states(7, 3)
+    q[1, 2] = torch.nan
+    with pytest.raises(NumericalError, match="mass matrix is not positive definite"):
+        system("iiwa", "one").dynamics(q, v, u)
+
+
+def test_a_constraint_that_is_not_finite():
+    """At the centre of a sphere there is no normal."""
+    built = robot("iiwa")
+    q, v, u = states(7)
+    center = tuple(built.frame_pose(q, FRAMES["iiwa"])[:3, 3].tolist())
+    held = MechanicalSystem(built, (Contact(FRAMES["iiwa"], (0.0, 0.0, 0.0), Sphere(center, 0.1)),))
+    with pytest.raises(NumericalError, match="constraint matrix A is not finite"):
+        held.dynamics(q, v, u)

@@ -1,0 +1,180 @@
+import json
+import math
+from dataclasses import FrozenInstanceError
+
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from tests.mechanics.surface_conformance import SurfaceConformance
+
+from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.mechanics import Cylinder, ImplicitSurface, Plane, Sphere, Surface
+from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
+
+
+class TestPlane(SurfaceConformance):
+    surface = Plane((0.0, 0.0, 1.0), 0.055)
+
+
+class TestSkewPlane(SurfaceConformance):
+    surface = Plane((1.0, -2.0, 0.3), -0.4)
+
+
+class TestSphere(SurfaceConformance):
+    surface = Sphere((0.3, -0.2, 0.5), 0.7)
+
+
+class TestCylinder(SurfaceConformance):
+    surface = Cylinder((0.1, 0.2, -0.3), (0.5, 1.0, -2.0), 0.25)
+
+
+class TestWavyFloor(SurfaceConformance):
+    surface = ImplicitSurface(lambda p: p[2] - 0.1 * torch.sin(3.0 * p[0]) * torch.cos(2.0 * p[1]))
+    storable = False
+    signed_distance = False
+
+
+class TestQuadric(SurfaceConformance):
+    """An ellipsoid that is no signed distance, and whose gradient vanishes at the centre."""
+
+    surface = ImplicitSurface(lambda p: (p.square() * torch.tensor([1.0, 2.0, 4.0]).double()).sum() - 1.0)
+    storable = False
+    signed_distance = False
+
+
+class Paraboloid(Surface):
+    """A surface of the user: only `value`, no dataclass, nothing registered."""
+
+    def value(self, p):
+        return p[..., 2] - p[..., 0] ** 2 - 0.5 * p[..., 1] ** 2
+
+
+class TestSubclassWithValueOnly(SurfaceConformance):
+    surface = Paraboloid()
+    storable = False
+    signed_distance = False
+
+
+# ---------------------------------------------------------------- what they mean
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_signs_and_distances():
+    p = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 0.5]], dtype=torch.float64)
+    for surface, expected in (
+        (Plane((0, 0, 2), 2), [2.0, -0.5]),
+        (Sphere((0, 0, 0), 1), [2.0, -0.5]),
+        (Cylinder((5, 0, 0), (-1, 0, 0), 1), [2.0, -0.5]),
+    ):
+        torch.testing.assert_close(surface.value(p), torch.tensor(expected, dtype=torch.float64))
+        torch.testing.assert_close(surface.gradient(p), torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_curvatures():
+    """The Hessian of a signed distance holds the principal curvatures of the parallel surface: 0, 1 / r, 1 / r^2 ..."""
+    p = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    for surface, curvatures in (
+        (Plane((0, 0, 1), 0), [0.0, 0.0, 0.0]),
+        (Sphere((0, 0, 0), 1), [0.5, 0.5, 0.0]),
+        (Cylinder((0, 0, 0), (1, 0, 0), 1), [0.0, 0.5, 0.0]),
+    ):
+        torch.testing.assert_close(surface.hessian(p), torch.diag(torch.tensor(curvatures, dtype=torch.float64)))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_directions_need_not_be_unit_vectors():
+    assert Plane((0, 0, 4), 2) == Plane((0, 0, 1), 0.5)
+    assert Plane((0, 0, -1), 0.5) != Plane((0, 0, 1), -0.5)  # the other side is positive
+    assert Cylinder((0, 0, 0), (0, 3, 4), 1).axis == (0.0, 0.6, 0.8)
+
+
+finite = st.floats(-1e3, 1e3)
+
+
+@given(direction=st.tuples(finite, finite, finite), number=finite)
+def test_storing_changes_no_bit(direction, number):
+    assume(math.hypot(*direction) > 1e-3)
+    surfaces = (
+        Plane(direction, number),
+        Cylinder((0.0, 0.0, number), direction, 0.1),
+        Sphere(direction, 0.1 + abs(number)),
+    )
+    for surface in surfaces:
+        assert surface_from_dict(json.loads(json.dumps(surface_to_dict(surface)))) == surface
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_they_cannot_be_changed():
+    plane = Plane((0, 0, 1), 0)
+    with pytest.raises(FrozenInstanceError):
+        plane.offset = 1.0  # type: ignore[misc]
+    assert hash(plane) == hash(Plane((0, 0, 1), 0))
+
+
+def test_an_implicit_surface_may_hold_a_parameter_to_learn():
+    height = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    p = torch.zeros(4, 3, dtype=torch.float64)
+    ImplicitSurface(lambda point: point[2] - height).value(p).sum().backward()
+    assert float(height.grad) == -4.0
+
+
+# ---------------------------------------------------------------- what they refuse
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Plane((0, 0, 0), 1), r"Plane normal is \(0, 0, 0\); give a direction"),
+        (lambda: Plane((1.7e308, 1.7e308, 0), 1), "give a direction"),
+        (lambda: Plane((0, 0), 1), "Plane normal is .* three numbers"),
+        (lambda: Plane((0, 0, math.nan), 1), "Plane normal is nan; give a finite number"),
+        (lambda: Plane((0, 0, 1), math.inf), "Plane offset is inf"),
+        (lambda: Plane((0, 0, 1), None), "Plane offset is None; give a number"),
+        (lambda: Plane("001", 1.0), "Plane normal is '0'"),
+        (lambda: Plane((0, 0, 1), "1"), "Plane offset is '1'"),
+        (lambda: Sphere((0, 0, 0), 0.0), "Sphere radius is 0.0; it must be positive"),
+        (lambda: Sphere((0, 0, 0), -1.0), "Sphere radius is -1.0"),
+        (lambda: Sphere(3.0, 1.0), "Sphere center is 3.0; give three numbers"),
+        (lambda: Cylinder((0, 0, 0), (0, 0, 0), 1), "Cylinder axis"),
+        (lambda: Cylinder((0, 0, 0, 0), (0, 0, 1), 1), "Cylinder point"),
+        (lambda: Cylinder((0, 0, 0), (0, 0, 1), math.nan), "Cylinder radius is nan"),
+        (lambda: ImplicitSurface(3.0), "ImplicitSurface function is 3.0"),
+    ],
+)
+def test_wrong_numbers_are_named(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make()
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "function", [lambda p: p, lambda p: p[:1], lambda p: 3.0], ids=["vector", "one entry", "number"]
+)
+@pytest.mark.parametrize("batch", [(), (2,)], ids=str)
+@pytest.mark.parametrize("what", ["value", "gradient", "hessian"])
+def test_a_function_must_return_a_scalar_tensor(function, batch, what):
+    with pytest.raises(ContactError, match="return a scalar tensor"):
+        getattr(ImplicitSurface(function), what)(torch.ones(*batch, 3, dtype=torch.float64))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"type": "torus", "radius": 1.0},
+        {"type": ["plane"]},
+        {"normal": [0, 0, 1], "offset": 0.0},
+        {"type": "plane", "normal": [0, 0, 1]},
+        {"type": "plane", "normal": [0, 0, 1], "offset": 0.0, "color": "red"},
+        "plane",
+        None,
+        [["type", "plane"]],
+    ],
+    ids=str,
+)
+def test_damaged_surfaces_are_refused(stored):
+    with pytest.raises(FileFormatError, match="surface"):
+        surface_from_dict(stored)
