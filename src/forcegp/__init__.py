@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         Sphere,
         ViscousJointFriction,
     )
-    from forcegp.models import Noise, StructuredGP
+    from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
     from forcegp.priors import JointForces
     from forcegp.robots import Robot
 
@@ -50,6 +50,8 @@ __all__ = [
     "JointForces",
     "Noise",
     "StructuredGP",
+    "save_posterior",
+    "load_posterior",
 ]
 
 _ROOMS = {
@@ -58,7 +60,7 @@ _ROOMS = {
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"},
     "data": {"Dataset"},
     "priors": {"JointForces"},
-    "models": {"StructuredGP", "Noise"},
+    "models": {"StructuredGP", "Noise", "save_posterior", "load_posterior"},
 }
 
 

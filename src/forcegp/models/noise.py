@@ -20,7 +20,8 @@ FORCE = "noise.log_force"
 class Noise:
     """Standard deviations: `acceleration` in rad/s^2 or m/s^2, `force` in Nm or N (None: no force-level noise).
 
-    Each is one number or one per joint. With `learn` they are start values of the optimisation, else they stay fixed.
+    Each is one number or one per joint. With `learn` they are start values of the optimisation, else they stay fixed;
+    the hyperprior of a learned one is log-normal around its start value, with a factor of e as one standard deviation.
     The covariance of one row is diag(acceleration^2) + H diag(force^2) H^T.
     """
 
@@ -54,6 +55,18 @@ class Noise:
             return acceleration[None]
         force = (2.0 * parameters[FORCE]).exp()
         return torch.diag_embed(acceleration) + (H * force) @ H.mT
+
+    def log_prior(self, parameters: Mapping[str, Tensor], nv: int) -> Float[Tensor, ""]:
+        """Log density (up to a constant) of the noise among `parameters` under its hyperprior.
+
+        Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint arm with
+        60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
+        """
+        total = torch.zeros((), dtype=torch.float64)
+        for name, start in self.parameters(nv).items():
+            if name in parameters:
+                total = total - 0.5 * (parameters[name] - start.to(parameters[name].device)).square().sum()
+        return total
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""

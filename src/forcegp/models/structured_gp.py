@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 import torch
@@ -51,6 +51,9 @@ class StructuredGP:
         `Noise(0.1, learn=True)` to learn it.
     """
 
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
     system: MechanicalSystem
     prior: ForcePrior = field(default_factory=JointForces)
     mean: Mean = "analytical"
@@ -82,7 +85,7 @@ class StructuredGP:
         factors.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
-        hyperprior: maximise the marginal likelihood times the priors that the kernels carry (type-II maximum a
+        hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II maximum a
             posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
         options: the search itself.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
@@ -105,15 +108,7 @@ class StructuredGP:
         fixed = {} if noise.learn else noise_parameters
         start = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
         options = options or OptimizerOptions()
-
-        def search(index: int, report: FitProgress | None = None) -> OptimizationResult | FitError:
-            first = _perturbed(start, seed, index) if index else start
-            note = None if report is None else (lambda iteration, value: report(index, iteration, value))
-            try:
-                return minimize_objective(_Objective(likelihood, kernels, fixed, hyperprior), first, options, note)
-            except FitError as error:
-                return error
-
+        search = _Search(_Objective(likelihood, kernels, noise, fixed, hyperprior), start, seed, options)
         with _blas_threads(likelihood):
             results = _run_restarts(search, restarts, jobs, progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
@@ -201,12 +196,34 @@ class _Objective:
 
     likelihood: MarginalLikelihood
     kernels: LatentKernels
+    noise: Noise
     fixed: Mapping[str, Tensor]
     hyperprior: bool
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         value = self.likelihood(self.kernels, {**self.fixed, **parameters})
-        return value - self.kernels.log_prior(parameters) if self.hyperprior else value
+        if not self.hyperprior:
+            return value
+        nv = self.likelihood.system.robot.nv
+        return value - self.kernels.log_prior(parameters) - self.noise.log_prior(parameters, nv)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """One optimisation from start number `index`."""
+
+    objective: _Objective
+    start: Mapping[str, Tensor]
+    seed: int
+    options: OptimizerOptions
+
+    def __call__(self, index: int, progress: FitProgress | None = None) -> OptimizationResult | FitError:
+        first = _perturbed(self.start, self.seed, index) if index else self.start
+        note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
+        try:
+            return minimize_objective(self.objective, first, self.options, note)
+        except FitError as error:
+            return error
 
 
 def _perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
@@ -227,7 +244,7 @@ def _blas_threads(likelihood: MarginalLikelihood) -> AbstractContextManager[Any]
 
 
 def _run_restarts(
-    search: Callable[..., OptimizationResult | FitError], restarts: int, jobs: int, progress: FitProgress | None
+    search: _Search, restarts: int, jobs: int, progress: FitProgress | None
 ) -> Sequence[OptimizationResult | FitError]:
     if jobs == 1 or restarts == 1:
         return [search(index, progress) for index in range(restarts)]

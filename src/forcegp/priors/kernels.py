@@ -35,7 +35,7 @@ def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outp
     ).double()
     kernel.base_kernel.register_prior(
         "lengthscale_prior",
-        NormalPrior(0.5 * math.log(dimension) + LOG_LENGTHSCALE_SHIFT, LOG_LENGTHSCALE_SPREAD).double(),
+        NormalPrior(_scalar(0.5 * math.log(dimension) + LOG_LENGTHSCALE_SHIFT), _scalar(LOG_LENGTHSCALE_SPREAD)),
         _log_lengthscale,
     )
     kernel.base_kernel.lengthscale = torch.as_tensor(lengthscale, dtype=torch.float64).expand(1, dimension)
@@ -45,3 +45,7 @@ def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outp
 
 def _log_lengthscale(kernel: RBFKernel) -> Tensor:
     return kernel.lengthscale.log()
+
+
+def _scalar(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)  # a Python number would be rounded to float32 on the way

@@ -1,0 +1,96 @@
+"""The joined model against a plain dense Gaussian process, and its gradients in every kind of parameter."""
+
+import numpy as np
+import pytest
+import torch
+from tests.inference.dense import dense_negative_log_likelihood
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.errors import InvalidInput
+from forcegp.models import MarginalLikelihood, Noise, TrainingData
+from forcegp.priors import JointForces
+
+
+def likelihood(mean="analytical", rows=8, contacts=1):
+    system = arm_system(contacts)
+    data = arm_data(rows, seed=0, system=system)
+    training = TrainingData(*(torch.tensor(x) for x in (data.q, data.v, data.u, data.a)))
+    return MarginalLikelihood(system, JointForces(), mean, training)
+
+
+def all_parameters(model, kernels, force=True):
+    noise = Noise(0.1, 0.05 if force else None).parameters(3)
+    return (
+        kernels.initial_parameters()
+        | noise
+        | {f"inertials.{link}": value for link, value in model.system.robot.inertial_parameters("hand", "fore").items()}
+    )
+
+
+@pytest.mark.parametrize("mean", ["analytical", "zero"])
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_equals_the_dense_formula_with_all_gradients(mean, force, contacts):
+    model = likelihood(mean, contacts=contacts)
+    kernels = model.kernels()
+    parameters = {name: value.requires_grad_() for name, value in all_parameters(model, kernels, force).items()}
+    data = model.training
+
+    value = model(kernels, parameters)
+    gradients = torch.autograd.grad(value, list(parameters.values()))
+
+    inertials = {name.removeprefix("inertials."): p for name, p in parameters.items() if name.startswith("inertials.")}
+    dynamics = model.system.dynamics(data.q, data.v, data.u, inertials)
+    force_known = dynamics.Q_K if mean == "analytical" else torch.zeros_like(data.u)
+    m = torch.linalg.solve(dynamics.M, dynamics.Q_b[..., None])[..., 0] + (dynamics.H @ force_known[..., None])[..., 0]
+    z = torch.cat([data.q, data.v, data.u], -1)
+    z = (z - z.mean(0)) / z.std(0, correction=0)
+    matrices = []
+    for joint in range(3):
+        lengthscale = parameters[f"kernels.{joint}.base_kernel.raw_lengthscale"].exp()
+        outputscale = parameters[f"kernels.{joint}.raw_outputscale"].exp()
+        difference = (z[:, None] - z[None, :]) / lengthscale
+        matrices.append(outputscale * torch.exp(-0.5 * difference.square().sum(-1)))
+    noise = torch.diag_embed((2 * parameters["noise.log_acceleration"]).exp())
+    if force:
+        H = dynamics.H
+        noise = noise + H @ torch.diag_embed((2 * parameters["noise.log_force"]).exp()) @ H.mT
+    expected = dense_negative_log_likelihood(dynamics.H, data.a - m, noise.expand(8, 3, 3), matrices)
+    expected_gradients = torch.autograd.grad(expected, list(parameters.values()))
+
+    assert float((value - expected).detach().abs()) < 1e-6
+    for name, given, wanted in zip(parameters, gradients, expected_gradients, strict=True):
+        error = (given - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
+        assert float(error) < 1e-7, name
+
+
+def test_start_values_are_the_moments_of_the_pseudo_inverse_force_residual():
+    model = likelihood(rows=20)
+    data = model.training
+    dynamics = model.system.dynamics(data.q, data.v, data.u)
+    residual = data.a - dynamics.acceleration(torch.zeros_like(data.u))
+    # minimum norm: H is singular along the contact normal, where no data speak
+    force = np.stack(
+        [np.linalg.lstsq(H, r, rcond=1e-8)[0] for H, r in zip(dynamics.H.numpy(), residual.numpy(), strict=True)]
+    )
+    for joint, kernel in enumerate(model.kernels()):
+        assert kernel.outputscale.item() == pytest.approx(np.square(force[:, joint]).mean(), rel=1e-6)
+        assert torch.allclose(kernel.base_kernel.lengthscale, torch.full((1, 9), 3.0).double())
+
+
+def test_a_constant_feature_keeps_its_scale():
+    model = likelihood(rows=6)
+    data = model.training
+    constant = TrainingData(data.q, data.v, torch.full_like(data.u, 2.0), data.a)
+    model = MarginalLikelihood(model.system, model.prior, "analytical", constant)
+    assert torch.equal(model.standardization.scale[0][6:], torch.ones(3).double())
+    assert bool(torch.isfinite(model(model.kernels(), all_parameters(model, model.kernels()))))
+
+
+def test_data_that_equal_the_mean_have_nothing_to_learn():
+    model = likelihood(rows=6)
+    data = model.training
+    a = model.system.dynamics(data.q, data.v, data.u).acceleration(torch.zeros_like(data.u))
+    exact = MarginalLikelihood(model.system, model.prior, "analytical", TrainingData(data.q, data.v, data.u, a))
+    with pytest.raises(InvalidInput, match="equal the mean exactly"):
+        exact.kernels()

@@ -1,0 +1,135 @@
+"""A fitted model on disk: what comes back predicts the same, and damage is named."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.errors import ContactError, FileFormatError
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, ImplicitSurface
+from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
+
+FILES = {"model.json", "tensors.safetensors", "robot.urdf"}
+OPTIONS = OptimizerOptions(iterations=3)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(20, seed=5)
+
+
+@pytest.fixture(scope="module")
+def posterior(data):
+    model = StructuredGP(data.system, mean="zero", noise=Noise((0.05, 0.06, 0.07), 0.02, learn=True))
+    return model.fit(data, points=15, options=OPTIONS)
+
+
+@pytest.fixture
+def run(posterior, tmp_path):
+    save_posterior(posterior, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_what_comes_back_is_the_same(posterior, run, data):
+    loaded = load_posterior(run)
+    states = data.q, data.v, data.u
+    mine, theirs = posterior.predict(*states), loaded.predict(*states)
+    for name in ("acceleration", "multiplier", "contact_force", "unknown_force", "measurement"):
+        assert torch.equal(getattr(mine, name).mean, getattr(theirs, name).mean), name
+        assert torch.equal(getattr(mine, name).covariance, getattr(theirs, name).covariance), name
+    assert loaded.result.history == posterior.result.history
+    assert json.loads(json.dumps(posterior.settings)) == loaded.settings
+    assert loaded.model.mean == "zero"
+    assert loaded.model.noise == posterior.model.noise
+
+
+def test_the_folder_predicts_in_a_new_process_without_the_data(run):
+    code = (
+        "import sys; from forcegp import load_posterior; p = load_posterior(sys.argv[1]); "
+        "print(p.predict([0.1, 0.5, 0.5], [0.0, 0.1, 0.2], [0.0, 0.0, 0.0]).mean.tolist())"
+    )
+    answer = subprocess.run([sys.executable, "-c", code, str(run)], capture_output=True, text=True, check=True)
+    expected = load_posterior(run).predict([0.1, 0.5, 0.5], [0.0, 0.1, 0.2], [0.0, 0.0, 0.0]).mean
+    assert json.loads(answer.stdout) == pytest.approx(expected.tolist(), rel=1e-9)
+
+
+def test_the_folder_says_what_it_is(run):
+    assert {path.name for path in run.iterdir()} == FILES
+    document = json.loads((run / "model.json").read_text())
+    assert document["joint_names"] == ["pan", "lift", "bend"]
+    assert document["units"]["q"] == "rad"
+    assert all(document[key] for key in ("forcegp_version", "torch_version", "urdf_sha256"))
+
+
+def test_nothing_is_overwritten_unasked_and_only_models_ever(posterior, run, tmp_path):
+    with pytest.raises(FileFormatError, match="exists already"):
+        save_posterior(posterior, run)
+    save_posterior(posterior, run, overwrite=True)
+    other = tmp_path / "thesis"
+    other.mkdir()
+    (other / "chapter.txt").write_text("mine")
+    with pytest.raises(FileFormatError, match="not a folder written by forcegp"):
+        save_posterior(posterior, other, overwrite=True)
+    assert (other / "chapter.txt").read_text() == "mine"
+
+
+def test_an_interrupted_save_leaves_nothing(posterior, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("forcegp.models.storage.save_file", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_posterior(posterior, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_a_missing_or_damaged_file_is_named(run, name):
+    content = (run / name).read_bytes()
+    (run / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(FileFormatError, match=r"run"):
+        load_posterior(run)
+    (run / name).unlink()
+    with pytest.raises(FileFormatError, match=r"run"):
+        load_posterior(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "diary"}, "not a stored forcegp"),
+        ({"format_version": 99}, "format version 99"),
+        ({"joint_names": ["a", "b", "c"]}, "trained on joints a, b, c"),
+        ({"model": {}}, "incomplete or damaged"),
+        ({"urdf_sha256": "0"}, "hash differs"),
+    ],
+)
+def test_a_changed_document_is_refused(run, change, message):
+    document = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(document | change))
+    with pytest.raises(FileFormatError, match=message):
+        load_posterior(run)
+
+
+def test_not_a_folder(tmp_path):
+    with pytest.raises(FileFormatError, match="does not exist"):
+        load_posterior(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileFormatError, match="is a file"):
+        load_posterior(tmp_path / "file")
+    with pytest.raises(FileFormatError, match=r"holds no model\.json"):
+        load_posterior(tmp_path)
+
+
+def test_a_surface_that_is_code_cannot_be_stored(tmp_path):
+    surface = ImplicitSurface(lambda p: p[2] + 0.2 * p[0] - 0.4)
+    system = arm_system().with_contacts((Contact("hand", (0.0, 0.0, 0.2), surface),))
+    data = arm_data(12, 6, system)
+    fitted = StructuredGP(system).fit(data, options=OPTIONS)
+    with pytest.raises(ContactError, match="never code"):
+        save_posterior(fitted, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,258 @@
+"""Fitting and predicting with the structured model."""
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import NOISE, URDF, arm_data, arm_system
+
+from forcegp.data import Dataset
+from forcegp.errors import ContactError, FitError, InvalidInput
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.models import Noise, StructuredGP
+from forcegp.robots import Robot
+
+QUICK = OptimizerOptions(iterations=40)
+
+
+@pytest.fixture(scope="module")
+def train():
+    return arm_data(60, seed=1)
+
+
+@pytest.fixture(scope="module")
+def test():
+    return arm_data(200, seed=2)
+
+
+@pytest.fixture(scope="module")
+def posterior(train):
+    return StructuredGP(train.system).fit(train, options=QUICK)
+
+
+def test_learns_the_friction_and_is_calibrated(posterior, test):
+    prediction = posterior.predict(test.q, test.v, test.u)
+    nominal = test.system.dynamics(*map(torch.tensor, (test.q, test.v, test.u))).acceleration_map().offset.numpy()
+    error = np.abs(prediction.mean.numpy() - test.truth["a"]).mean()
+    assert error < 0.1 * np.abs(nominal - test.truth["a"]).mean()
+    inside = np.abs(prediction.mean.numpy() - test.a) < 1.96 * prediction.measurement.std.numpy()
+    assert 0.90 < inside.mean() < 0.99
+
+
+def test_every_prediction_obeys_the_constraint(posterior, test):
+    prediction = posterior.predict(test.q, test.v, test.u)
+    dynamics = test.system.dynamics(*map(torch.tensor, (test.q, test.v, test.u)))
+    violation = (dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b
+    assert float(violation.abs().max()) < 1e-10
+    along_normal = dynamics.A @ prediction.covariance @ dynamics.A.mT
+    assert float(along_normal.abs().max()) < 1e-12
+    assert float(torch.linalg.eigvalsh(prediction.covariance).min()) > -1e-12
+
+
+def test_forces_and_acceleration_belong_together(posterior, test):
+    prediction = posterior.predict(test.q, test.v, test.u)
+    dynamics = test.system.dynamics(*map(torch.tensor, (test.q, test.v, test.u)))
+    Q_U = prediction.unknown_force
+    assert torch.allclose(dynamics.acceleration(Q_U.mean), prediction.mean, atol=1e-10)
+    assert torch.allclose(dynamics.H @ Q_U.covariance @ dynamics.H.mT, prediction.covariance, atol=1e-10)
+    assert torch.allclose(dynamics.multiplier(Q_U.mean), prediction.multiplier.mean, atol=1e-10)
+    normals = dynamics.normals[:, 0]
+    assert torch.allclose(prediction.contact_force.mean, normals * prediction.multiplier.mean, atol=1e-10)
+    # M a = Q_K + Q_U + A^T lambda
+    balance = (
+        (dynamics.M @ prediction.mean[..., None])[..., 0]
+        - dynamics.Q_K
+        - Q_U.mean
+        - (dynamics.A.mT @ prediction.multiplier.mean[..., None])[..., 0]
+    )
+    assert float(balance.abs().max()) < 1e-9
+
+
+def test_equals_dense_gaussian_conditioning(posterior, train, test):
+    """p(a*) from one joint covariance of all training accelerations, written plainly."""
+    model = posterior.likelihood
+    kernels = list(posterior.latent.kernels)
+
+    def parts(data):
+        dynamics = train.system.dynamics(*map(torch.tensor, (data.q, data.v, data.u)))
+        z = torch.cat([torch.tensor(x) for x in (data.q, data.v, data.u)], -1)
+        (scaled, *_) = model.standardization([z] * 3)
+        return dynamics.H, dynamics.acceleration_map().offset, scaled
+
+    H, m, z = parts(train)
+    H_new, m_new, z_new = parts(test.rows(slice(0, 5)))
+    S = torch.zeros(60, 3, 60, 3).double()
+    cross = torch.zeros(5, 3, 60, 3).double()
+    prior = torch.zeros(5, 3, 3).double()
+    for joint, kernel in enumerate(kernels):
+        w, w_new = H[..., joint], H_new[..., joint]
+        S += torch.einsum("id,ij,je->idje", w, kernel(z, z).to_dense(), w)
+        cross += torch.einsum("id,ij,je->idje", w_new, kernel(z_new, z).to_dense(), w)
+        prior += torch.einsum("id,ie->ide", w_new, w_new) * kernel.outputscale
+    S = S.reshape(180, 180) + NOISE**2 * torch.eye(180).double()
+    cross = cross.reshape(5, 3, 180)
+    solved = torch.linalg.solve(S, (torch.tensor(train.a) - m).reshape(-1))
+    mean = m_new + cross @ solved
+    covariance = prior - cross @ torch.linalg.solve(S, cross.mT)
+
+    prediction = posterior.predict(*(x[:5] for x in (test.q, test.v, test.u)))
+    assert torch.allclose(prediction.mean, mean, atol=1e-8)
+    assert torch.allclose(prediction.covariance, covariance, atol=1e-8)
+
+
+def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
+    states = [torch.tensor(x[:6]) for x in (test.q, test.v, test.u)]
+    flat = posterior.predict(*states)
+    batched = posterior.predict(*(x.reshape(2, 3, 3) for x in states))
+    assert torch.equal(batched.mean.reshape(6, 3), flat.mean)
+    assert batched.covariance.shape == (2, 3, 3, 3)
+    assert batched.multiplier.mean.shape == (2, 3, 1)
+    single = posterior.predict(*(x[0] for x in states))
+    assert single.mean.shape == (3,)
+    assert torch.allclose(single.mean, flat.mean[0], atol=1e-12)
+    assert posterior.predict(*(x[:0] for x in states)).mean.shape == (0, 3)
+    monkeypatch.setattr("forcegp.models.structured_posterior.ROWS_PER_BLOCK", 4)
+    assert torch.allclose(posterior.predict(*states).covariance, flat.covariance, atol=1e-12)
+    assert posterior.predict(*states, covariance=False).covariance is None
+
+    def mean_of(q, v, u):
+        return posterior.predict(q, v, u, covariance=False).mean
+
+    point = tuple(x[0].requires_grad_() for x in states)
+    assert torch.autograd.gradcheck(mean_of, point, atol=1e-6)
+
+
+def test_zero_mean_carries_the_known_forces_in_the_processes(train, test):
+    zero = StructuredGP(train.system, mean="zero").fit(train, options=QUICK)
+    states = tuple(map(torch.tensor, (test.q, test.v, test.u)))
+    dynamics = test.system.dynamics(*states)
+    prediction = zero.predict(*states)
+    total = prediction.unknown_force.mean
+    assert torch.allclose(dynamics.acceleration_map(known=False)(total), prediction.mean, atol=1e-9)
+    assert float(((dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b).abs().max()) < 1e-9
+
+
+def test_the_noise_is_learned(train):
+    fitted = StructuredGP(train.system, noise=Noise(0.2, learn=True)).fit(
+        train, options=OptimizerOptions(iterations=80)
+    )
+    assert np.allclose(fitted.noise_std.numpy(), NOISE, rtol=0.5)
+
+
+def test_force_level_noise_widens_along_H(train, test):
+    fitted = StructuredGP(train.system, noise=Noise(NOISE, 0.3)).fit(train, options=OptimizerOptions(iterations=3))
+    prediction = fitted.predict(test.q[:4], test.v[:4], test.u[:4])
+    H = test.system.dynamics(*(torch.tensor(x[:4]) for x in (test.q, test.v, test.u))).H
+    expected = NOISE**2 * torch.eye(3).double() + 0.09 * H @ H.mT
+    assert torch.allclose(prediction.noise_covariance, expected, atol=1e-12)
+
+
+def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
+    options = OptimizerOptions(iterations=5)
+    model = StructuredGP(train.system)
+    three = model.fit(train, points=15, restarts=3, seed=7, options=options)
+    again = model.fit(train, points=15, restarts=3, seed=7, jobs=2, options=options)
+    more = model.fit(train, points=15, restarts=4, seed=7, options=options)
+    values = three.settings["restart_objective"]
+    assert len(set(values)) == 3
+    assert three.result.value == min(values)
+    assert np.allclose(again.settings["restart_objective"], values, rtol=1e-9)
+    assert np.allclose(more.settings["restart_objective"][:3], values, rtol=1e-12)
+    other = model.fit(train, points=15, restarts=2, seed=8, options=options)
+    assert other.settings["restart_objective"][0] == pytest.approx(values[0])
+    assert other.settings["restart_objective"][1] != pytest.approx(values[1])
+
+
+def test_the_hyperprior_can_be_left_out(train):
+    model = StructuredGP(train.system)
+    options = OptimizerOptions(iterations=100)
+    plain = model.fit(train, points=20, hyperprior=False, options=options)
+    held = model.fit(train, points=20, options=options)
+    assert plain.result.value == pytest.approx(plain.negative_log_likelihood, abs=1e-6)
+    assert plain.negative_log_likelihood < held.negative_log_likelihood < held.result.value
+    assert plain.result.history[-1] <= plain.result.history[0]
+
+
+def test_nothing_of_the_caller_changes(train):
+    before = {name: getattr(train, name).copy() for name in ("q", "v", "u", "a")}
+    state = torch.get_default_dtype(), torch.get_num_threads()
+    StructuredGP(train.system).fit(train, points=10, options=OptimizerOptions(iterations=2))
+    assert all(np.array_equal(getattr(train, name), value) for name, value in before.items())
+    assert state == (torch.get_default_dtype(), torch.get_num_threads())
+
+
+def test_works_without_contacts():
+    system = arm_system(contacts=0)
+    train, test = arm_data(50, 3, system), arm_data(50, 4, system)
+    prediction = StructuredGP(system).fit(train, options=QUICK).predict(test.q, test.v, test.u)
+    assert prediction.multiplier.mean.shape == (50, 0)
+    assert np.abs(prediction.mean.numpy() - test.truth["a"]).mean() < 0.2
+
+
+def test_redundant_contacts_change_nothing(train, test):
+    doubled = train.system.with_contacts(train.system.contacts * 2)
+    options = OptimizerOptions(iterations=5)
+    one = StructuredGP(train.system).fit(train, points=20, options=options).predict(test.q, test.v, test.u)
+    two = StructuredGP(doubled).fit(train, points=20, options=options).predict(test.q, test.v, test.u)
+    assert torch.allclose(one.mean, two.mean, atol=1e-6)
+    assert torch.allclose(two.multiplier.mean.sum(-1), one.multiplier.mean[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": 61}, "points=61 is not between 2 and the 60 rows"),
+        ({"points": 1}, "points=1"),
+        ({"restarts": 0}, "restarts=0"),
+    ],
+)
+def test_bad_numbers_are_refused(train, change, message):
+    with pytest.raises(InvalidInput, match=message):
+        StructuredGP(train.system).fit(train, **change)
+
+
+def test_a_dataset_of_another_robot_is_refused(train):
+    renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
+    with pytest.raises(InvalidInput, match="joints pan, lift, bend; the robot has yaw, lift, bend"):
+        StructuredGP(train.system.with_robot(renamed)).fit(train)
+
+
+def test_an_unknown_noise_level_asks_for_one(train):
+    fields = {name: getattr(train, name) for name in ("q", "v", "u", "a", "time", "joint_names", "units", "system")}
+    with pytest.raises(InvalidInput, match=r"Noise\(0.1, learn=True\)"):
+        StructuredGP(train.system).fit(Dataset(**fields))
+
+
+def test_wrong_mean_and_contradictory_contacts_are_refused(train):
+    with pytest.raises(InvalidInput, match="'analytical', 'zero'"):
+        StructuredGP(train.system, mean="none")
+    contradiction = Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9))
+    system = MechanicalSystem(
+        train.system.robot, (*train.system.contacts, contradiction), baumgarte=train.system.baumgarte
+    )
+    with pytest.raises(ContactError, match="contradict"):
+        StructuredGP(system).fit(train)
+
+
+def test_a_fit_that_cannot_start_names_the_cause(train):
+    broken = train.rows(slice(0, 10))
+    huge = Dataset(
+        **{
+            name: getattr(broken, name)
+            for name in ("q", "v", "u", "time", "joint_names", "units", "system", "noise_std")
+        },
+        a=np.full((10, 3), 1e200),
+    )
+    with pytest.raises(FitError, match="none of 2 restarts"):
+        StructuredGP(train.system).fit(huge, restarts=2)
+
+
+def test_states_that_make_no_sense_are_refused(posterior, test):
+    with pytest.raises(InvalidInput, match="last dimension must be 3"):
+        posterior.predict(test.q[:, :2], test.v, test.u)
+    with pytest.raises(InvalidInput, match="not finite"):
+        posterior.predict(np.full(3, np.nan), np.zeros(3), np.zeros(3))
+    with pytest.raises(InvalidInput, match="do not broadcast"):
+        posterior.predict(test.q[:2], test.v[:3], test.u[:3])
+    with pytest.raises(InvalidInput, match="cannot be read as numbers"):
+        posterior.predict(["a", "b", "c"], test.v, test.u)
