@@ -28,7 +28,7 @@ def test_mixing_is_the_identity_and_features_are_the_chosen_states(dynamics):
 def test_kernels_start_at_the_given_variance_and_the_typical_distance():
     kernels = JointForces().kernels((9, 9, 9), torch.tensor([1.0, 4.0, 0.25]).double())
     z = torch.zeros(1, 9).double()
-    assert [float(kernel(z, z).to_dense()) for kernel in kernels] == pytest.approx([1.0, 4.0, 0.25])
+    assert [kernel(z, z).to_dense().item() for kernel in kernels] == pytest.approx([1.0, 4.0, 0.25])
     assert torch.allclose(kernels[0].base_kernel.lengthscale, torch.tensor(3.0).double())
 
 

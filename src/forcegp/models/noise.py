@@ -59,8 +59,8 @@ class Noise:
     def log_prior(self, parameters: Mapping[str, Tensor], nv: int) -> Float[Tensor, ""]:
         """Log density (up to a constant) of the noise among `parameters` under its hyperprior.
 
-        Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint arm with
-        60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
+        Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint
+        arm with 60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
         """
         total = torch.zeros((), dtype=torch.float64)
         for name, start in self.parameters(nv).items():

@@ -85,8 +85,8 @@ class StructuredGP:
         factors.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
-        hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II maximum a
-            posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
+        hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
+            maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
         options: the search itself.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
 

@@ -32,6 +32,6 @@ def prior_from_dict(stored: Mapping[str, Any]) -> ForcePrior:
     if name not in PRIORS:
         raise FileFormatError(f"unknown prior {name!r}; registered: {', '.join(PRIORS)}")
     try:
-        return PRIORS[name](**{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()})
+        return PRIORS[name](**{key: tuple(x) if isinstance(x, list) else x for key, x in fields.items()})
     except TypeError as error:
         raise FileFormatError(f"prior {name!r} has wrong fields {sorted(fields)}: {error}") from None
