@@ -26,6 +26,7 @@ from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 from forcegp.robots import Robot
 
 FORMAT_VERSION = 1
+STORED_PARTS = {"urdf": str, "gravity": list, "armature": list, "locked": dict, "contacts": list, "known_forces": list}
 CONSISTENCY_TOLERANCE = 1e-6
 """|A a - b| above this fraction of 1 + |b| means that redundant contacts contradict each other."""
 
@@ -111,13 +112,14 @@ class MechanicalSystem:
             )
         dynamics = self.dynamics(q, v, u)
         a = dynamics.acceleration_map().offset
-        violation = ((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs() / (1.0 + dynamics.b.abs())
-        if not bool((violation <= CONSISTENCY_TOLERANCE).all()):
-            row, index = divmod(int(violation.argmax()), violation.shape[-1])
+        violation = ((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs()
+        relative = violation / (1.0 + dynamics.b.abs())
+        if not bool((relative <= CONSISTENCY_TOLERANCE).all()):
+            row, index = divmod(int(relative.argmax()), relative.shape[-1])
             raise ContactError(
-                f"the contacts contradict each other at row {row}: |A a - b| = {float(violation.max()):.2e} for "
-                f"contact {index} although redundant "
-                "contacts are solved in the least-squares sense; remove one of them or check their surfaces."
+                f"the contacts contradict each other, most at row {row}: |A a - b| = "
+                f"{float(violation[row, index]):.2e} for contact {index}, although redundant contacts are solved in "
+                "the least-squares sense; remove one of them or check their surfaces."
             )
 
     def with_robot(self, robot: Robot) -> MechanicalSystem:
@@ -162,12 +164,15 @@ class MechanicalSystem:
                 f"stored system has format {stored.get('format')!r}; this forcegp reads {FORMAT_VERSION}"
             )
         try:
+            for key, kind in STORED_PARTS.items():
+                if not isinstance(stored[key], kind):
+                    raise FileFormatError(f"stored system is damaged: {key} is {stored[key]!r}")
             robot = Robot.from_urdf_text(
                 stored["urdf"],
                 source="stored URDF",
                 gravity=stored["gravity"],
-                armature=stored["armature"] if any(stored["armature"]) else None,
-                locked=stored["locked"] or None,
+                armature=stored["armature"],
+                locked=stored["locked"],
             )
             if contacts is None:
                 contacts = [
