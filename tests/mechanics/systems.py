@@ -61,7 +61,7 @@ def states(nv: int, *batch: int, seed: int = 0) -> tuple[torch.Tensor, torch.Ten
 
 
 def regular_states(built: MechanicalSystem, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of many random states those farthest from postures in which the contacts lose rank, where no method keeps its digits."""
+    """Of many random states those farthest from postures where the contacts lose rank, and any method its digits."""
     candidates = states(built.robot.nv, 20 * count)
     A = built.dynamics(*candidates).A
     if not built.contacts:
@@ -73,7 +73,7 @@ def regular_states(built: MechanicalSystem, count: int) -> tuple[torch.Tensor, t
 
 
 def solve_kkt(M, Q, A, b):
-    """a and lambda from [[M, -A^T], [A, 0]] [a; lambda] = [Q; b]: one dense system, in the minimum-norm sense where A is redundant."""
+    """a and lambda from [[M, -A^T], [A, 0]] [a; lambda] = [Q; b], dense; of minimum norm where A is redundant."""
     m, nv = A.shape[-2:]
     batch = M.shape[:-2]
     matrix = torch.cat([torch.cat([M, -A.mT], -1), torch.cat([A, A.new_zeros(*batch, m, m)], -1)], -2)
@@ -97,7 +97,7 @@ def assert_close(given, expected, tolerance: float) -> None:
 def assert_derivatives(function, *arguments: torch.Tensor, step: float = 1e-5, tolerance: float = 1e-6) -> None:
     """Jacobians of `function` (to one vector) by autograd against central differences, relative to their largest entry.
 
-    `torch.autograd.gradcheck` wants every entry to be right to an absolute tolerance, which rounding of large outputs hides.
+    `torch.autograd.gradcheck` wants every entry right to an absolute tolerance, which rounding of large outputs hides.
     """
     jacobians = torch.autograd.functional.jacobian(function, arguments)
     for k, (argument, jacobian) in enumerate(zip(arguments, jacobians, strict=True)):

@@ -1,0 +1,184 @@
+"""A and b of one contact against Pinocchio and against the distance along a trajectory."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tests.mechanics.systems import POINT, assert_close, assert_derivatives, robot, states, surfaces
+from tests.robots.pinocchio_oracle import Oracle
+from tests.robots.robot_models import FRAMES, MODELS
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import Baumgarte, Contact, MechanicalSystem, Plane, State
+
+SURFACES = list(surfaces())
+FLOOR = Plane((0.0, 0.0, 1.0), 0.0)
+
+
+def contact(model: str, surface: str) -> Contact:
+    return Contact(FRAMES[model], POINT, surfaces()[surface])
+
+
+def constraint(model: str, surface: str, baumgarte, q, v, u):
+    return contact(model, surface).constraint(State.of(robot(model), q, v, u), baumgarte)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("model", MODELS)
+def test_against_pinocchio(model, surface):
+    """A = s_p J and b = -(s_p a_classical + v^T s_pp v), J and a_classical from Pinocchio."""
+    touching, built = contact(model, surface), robot(model)
+    q, v, u = states(built.nv, 10)
+    A, b, gradient = constraint(model, surface, None, q, v, u)
+    assert_close(
+        touching.position(built.kinematics(q)), built.frame_pose(q, FRAMES[model])[:, :3] @ homogeneous(), 1e-12
+    )
+    oracle = Oracle(MODELS[model](), built)
+    index = oracle.with_point(FRAMES[model], np.array(POINT))
+    for row in range(len(q)):
+        pose, jacobian, acceleration = (
+            torch.as_tensor(x.copy()) for x in oracle.frame(q[row].numpy(), v[row].numpy(), index)
+        )
+        p, J = pose[:3, 3], jacobian[:3]
+        assert_close(touching.position(built.kinematics(q[row])), p, 1e-12)
+        assert_close(gradient[row], touching.surface.gradient(p), 1e-11)
+        assert_close(A[row], touching.surface.gradient(p) @ J, 1e-10)
+        velocity = J @ v[row]
+        curvature = velocity @ touching.surface.hessian(p) @ velocity
+        assert_close(b[row], -(touching.surface.gradient(p) @ acceleration[:3] + curvature), 1e-10)
+        assert_close(touching.distance(built.kinematics(q[row])), touching.surface.value(p), 1e-12)
+
+
+def homogeneous() -> torch.Tensor:
+    return torch.tensor([*POINT, 1.0], dtype=torch.float64)
+
+
+def along(motion, step: float):
+    """First and second derivative at 0 by central differences of fourth order."""
+    values = [motion(k * step) for k in (-2, -1, 0, 1, 2)]
+    first = (values[0] - 8.0 * values[1] + 8.0 * values[3] - values[4]) / (12.0 * step)
+    second = (-values[0] + 16.0 * values[1] - 30.0 * values[2] + 16.0 * values[3] - values[4]) / (12.0 * step**2)
+    return first, second
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("model", MODELS)
+def test_they_are_the_derivatives_of_the_distance(model, surface):
+    """On q(t) = q + v t + a t^2 / 2: c' = A v and c'' = A a - b, for any acceleration."""
+    touching, built = contact(model, surface), robot(model)
+    q, v, a = states(built.nv, 10, seed=1)
+    A, b, _ = constraint(model, surface, None, q, v, torch.zeros_like(q))
+    rate, second = along(lambda t: touching.distance(built.kinematics(q + v * t + 0.5 * a * t**2)), 1e-3)
+    assert_close(rate, (A * v).sum(-1), 1e-8)
+    assert_close(second, (A * a).sum(-1) - b, 1e-6)
+
+
+@pytest.mark.parametrize(("omega", "zeta"), [(10.0, 1.0), (3.0, 0.2), (0.0, 1.0), (4.0, 0.0)])
+@pytest.mark.parametrize("surface", SURFACES)
+def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, zeta):
+    """c'' + 2 zeta omega c' + omega^2 c = 0, with c and its derivatives from finite differences."""
+    touching, built = contact("chain", surface), robot("chain")
+    baumgarte = Baumgarte(omega, zeta)
+    system = MechanicalSystem(built, (touching,), baumgarte=baumgarte)
+    q, v, u = states(built.nv, 5, seed=2)
+    u = 0.01 * u
+    a = system.dynamics(q, v, u).acceleration(torch.zeros_like(u))
+    step = 1e-3 / max(1.0, float(a.abs().max()) ** 0.5)
+    rate, second = along(lambda t: touching.distance(built.kinematics(q + v * t + 0.5 * a * t**2)), step)
+    distance = touching.distance(built.kinematics(q))
+    assert_close(second, -2.0 * zeta * omega * rate - omega**2 * distance, 1e-5)
+    without = constraint("chain", surface, None, q, v, u)
+    assert_close(
+        constraint("chain", surface, baumgarte, q, v, u)[1] - without[1],
+        -2.0 * zeta * omega * (without[0] * v).sum(-1) - omega**2 * distance,
+        1e-12,
+    )
+
+
+def test_baumgarte_brings_a_drifted_tool_back_to_the_surface():
+    """From 2 cm off, released at rest with critical damping: no overshoot, e-folds away."""
+    built = robot("chain")
+    q, _, _ = states(built.nv)
+    frame = FRAMES["chain"]
+    height = float(built.frame_pose(q, frame)[2, 3]) - 0.02
+    touching = Contact(frame, (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), height))
+    system = MechanicalSystem(built, (touching,), baumgarte=Baumgarte(20.0, 1.0))
+    v, u = torch.zeros_like(q), torch.zeros_like(q)
+    dt, distances = 2e-3, []
+    for _ in range(100):
+        v = v + dt * system.dynamics(q, v, -0.5 * v).acceleration(u)
+        q = q + dt * v
+        distances.append(float(touching.distance(built.kinematics(q))))
+    exact = [0.02 * (1.0 + 20.0 * t) * math.exp(-20.0 * t) for t in dt * np.arange(1, 101)]
+    assert np.abs(np.array(distances) - exact).max() < 5e-4  # symplectic Euler is of first order
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+def test_derivatives(surface):
+    def function(q, v):
+        A, b, gradient = constraint("tree", surface, Baumgarte(3.0, 0.5), q, v, torch.zeros_like(q))
+        return torch.cat([A, b[None], gradient])
+
+    q, v, _ = states(robot("tree").nv)
+    assert_derivatives(function, q, v)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3)], ids=str)
+@pytest.mark.parametrize("surface", SURFACES)
+def test_batch_dimensions_are_arbitrary(surface, batch):
+    nv = robot("tree").nv
+    A, b, gradient = constraint("tree", surface, Baumgarte(1.0), *states(nv, *batch))
+    assert A.shape == (*batch, nv)
+    assert b.shape == batch
+    assert gradient.shape == (*batch, 3)
+    touching, kinematics = contact("tree", surface), robot("tree").kinematics(states(nv, *batch)[0])
+    assert touching.position(kinematics).shape == (*batch, 3)
+    assert touching.distance(kinematics).shape == batch
+
+
+# ---------------------------------------------------------------- values
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_points_may_come_in_any_form():
+    for point in ([0, 0, 1], np.array([0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, 1.0])):
+        assert Contact("tool", point, FLOOR) == Contact("tool", (0.0, 0.0, 1.0), FLOOR)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("tool", (0, 0), FLOOR), r"Contact point is \(0, 0\); give three finite numbers"),
+        (("tool", (0, 0, math.nan), FLOOR), "Contact point"),
+        (("tool", (0, 0, "a"), FLOOR), "Contact point"),
+        (("tool", "123", FLOOR), "Contact point is '123'"),
+        (("tool", None, FLOOR), "Contact point is None"),
+        ((7, (0, 0, 0), FLOOR), "Contact frame is 7; give the name of a link"),
+        (("tool", (0, 0, 0), lambda p: p[2]), "Contact surface is a function; give a Plane"),
+        (("tool", (0, 0, 0), Plane), "Contact surface is a ABCMeta"),
+    ],
+    ids=str,
+)
+def test_wrong_contacts_are_named(arguments, message):
+    with pytest.raises(InvalidInput, match=message):
+        Contact(*arguments)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((-1.0,), "Baumgarte omega is -1.0; it must be a finite number >= 0"),
+        ((math.inf,), "Baumgarte omega"),
+        (("10",), "Baumgarte omega is '10'"),
+        ((10.0, -0.1), "Baumgarte zeta is -0.1"),
+        ((10.0, math.nan), "Baumgarte zeta"),
+        ((10.0, None), "Baumgarte zeta is None"),
+    ],
+    ids=str,
+)
+def test_wrong_stabilisation_is_named(arguments, message):
+    with pytest.raises(InvalidInput, match=message):
+        Baumgarte(*arguments)

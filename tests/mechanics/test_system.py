@@ -1,0 +1,346 @@
+import contextlib
+import copy
+import json
+import math
+from dataclasses import FrozenInstanceError
+
+import jaxtyping
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.mechanics.systems import assert_close, normal, robot, states, surfaces, system
+from tests.robots.robot_models import CHAIN, FRAMES, TREE
+
+from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, NumericalError, UnknownFrame
+from forcegp.mechanics import (
+    Actuation,
+    Armature,
+    Baumgarte,
+    Contact,
+    CoulombJointFriction,
+    Cylinder,
+    ImplicitSurface,
+    MechanicalSystem,
+    Plane,
+    RigidBodyBias,
+    Sphere,
+    ViscousJointFriction,
+)
+from forcegp.robots import Robot
+
+FLOOR = Plane((0.0, 0.0, 1.0), 0.055)
+
+
+def complete() -> MechanicalSystem:
+    """Every kind of part, a robot that is not as its file says."""
+    built = Robot.from_urdf_text(TREE, gravity=(0.1, -0.2, -9.7), locked={"left_gripper": 0.013})
+    built = built.with_armature({"torso": 0.25})
+    parameters = built.inertial_parameters("right_hand")["right_hand"]
+    built = built.with_inertials({"right_hand": parameters + 0.1 * normal(10)})
+    return MechanicalSystem(
+        built,
+        (
+            Contact("right_hand", (0.1, -0.2, 0.3), Plane((0.3, 0.1, 1.0), 0.123)),
+            Contact("camera", (0.0, 0.0, 0.1), Sphere((0.1, 0.2, 0.3), 0.7)),
+            Contact("left_arm", (0.3, 0.0, 0.0), Cylinder((0.0, 0.1, 0.0), (1.0, 1.0, 0.1), 0.4)),
+        ),
+        (
+            Actuation(),
+            RigidBodyBias(),
+            ViscousJointFriction.from_robot(built),
+            CoulombJointFriction({"torso": 0.3}, 0.02),
+            Armature(0.05),
+        ),
+        Baumgarte(7.0, 0.8),
+    )
+
+
+def assert_same_dynamics(one: MechanicalSystem, other: MechanicalSystem) -> None:
+    arguments, Q_U = states(one.robot.nv, 4), normal(4, one.robot.nv)
+    for name in ("M", "A", "b", "H", "Q_b", "Q_K"):
+        assert torch.equal(getattr(one.dynamics(*arguments), name), getattr(other.dynamics(*arguments), name)), name
+    assert torch.equal(one.dynamics(*arguments).acceleration(Q_U), other.dynamics(*arguments).acceleration(Q_U))
+
+
+# ---------------------------------------------------------------- what it holds
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_it_cannot_be_changed():
+    built = system()
+    with pytest.raises(FrozenInstanceError):
+        built.contacts = ()  # type: ignore[misc]
+    assert isinstance(built.contacts, tuple)
+    assert isinstance(MechanicalSystem(robot("iiwa"), list(built.contacts)).contacts, tuple)
+
+
+def test_arguments_are_left_alone():
+    built = system("iiwa", "three", baumgarte=Baumgarte(10.0))
+    arguments = states(7, 3)
+    kept = [x.clone() for x in arguments]
+    built.dynamics(*arguments).acceleration(normal(3, 7))
+    built.check_states(*arguments)
+    assert all(torch.equal(x, y) for x, y in zip(arguments, kept, strict=True))
+
+
+def test_other_contacts_and_other_robots():
+    built = complete()
+    free = built.with_contacts([])
+    assert free.contacts == ()
+    assert free.baumgarte == built.baumgarte
+    assert len(built.contacts) == 3
+    heavier = built.with_robot(built.robot.with_armature([1.0] * built.robot.nv))
+    arguments = states(built.robot.nv, 3)
+    expected = built.dynamics(*arguments).M - torch.diag(built.robot.armature) + torch.eye(built.robot.nv).double()
+    assert_close(heavier.dynamics(*arguments).M, expected, 1e-12)
+    with pytest.raises(InvalidInput, match="chain has 4 joints"):
+        built.with_robot(robot("chain"))
+
+
+# ---------------------------------------------------------------- parts that do not fit
+
+
+@pytest.mark.parametrize(
+    ("contact", "error", "message"),
+    [
+        (Contact("toool", (0.0, 0.0, 0.0), FLOOR), UnknownFrame, "no frame 'toool' in chain; did you mean 'tool'?"),
+        (Contact("rail", (0.0, 0.0, 0.0), FLOOR), ContactError, "frame 'rail' of chain is fixed in the world"),
+    ],
+)
+def test_contacts_that_do_not_fit_the_robot(contact, error, message):
+    with pytest.raises(error, match=message):
+        MechanicalSystem(robot("chain"), (contact,))
+
+
+def test_a_frame_below_a_locked_joint_may_be_fixed_in_the_world():
+    locked = Robot.from_urdf_text(CHAIN, locked={"slide": 0.0, "spin": 0.3})
+    with pytest.raises(ContactError, match="'bracket' of chain is fixed in the world"):
+        MechanicalSystem(locked, (Contact("bracket", (0.0, 0.0, 0.0), FLOOR),))
+    MechanicalSystem(locked, (Contact("forearm", (0.0, 0.0, 0.0), FLOOR),))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"contacts": (FLOOR,)}, "contacts is .*; give a sequence of Contact objects"),
+        ({"contacts": Contact("tool", (0.0, 0.0, 0.0), FLOOR)}, "give a sequence of Contact objects"),
+        ({"contacts": None}, "contacts is None"),
+        ({"known_forces": (Actuation,)}, "known_forces is .*; give a sequence of KnownForce objects"),
+        ({"known_forces": Actuation()}, "give a sequence of KnownForce objects"),
+        ({"known_forces": ("actuation",)}, "give a sequence of KnownForce objects"),
+    ],
+    ids=str,
+)
+def test_parts_of_the_wrong_kind(parts, message):
+    with pytest.raises(InvalidInput, match=message):
+        MechanicalSystem(robot("chain"), **parts)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (((5, 1), (5, 4), (5, 4)), r"q has shape \(5, 1\); its last dimension must be 4"),
+        (((5, 4), (5, 1), (5, 4)), r"v has shape \(5, 1\)"),
+        (((5, 4), (5, 4), (5, 1)), r"u has shape \(5, 1\)"),
+        (((5, 4), (4, 4), (5, 4)), "batch shapes do not broadcast"),
+        (((5, 4), (5, 4), (4, 4)), "batch shapes do not broadcast"),
+        (((), (4,), (4,)), "q has shape"),
+    ],
+    ids=str,
+)
+def test_states_of_wrong_shape_are_never_stretched(shapes, message):
+    with pytest.raises(InvalidInput, match=message):
+        MechanicalSystem(robot("chain")).dynamics(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_states_of_wrong_type():
+    good = torch.zeros(4, dtype=torch.float64)
+    for bad in (good.float(), good.numpy(), [0.0] * 4):
+        for position in range(3):
+            arguments = [good] * 3
+            arguments[position] = bad
+            with pytest.raises(InvalidInput, match=f"^{'qvu'[position]} is"):
+                MechanicalSystem(robot("chain")).dynamics(*arguments)
+
+
+# ---------------------------------------------------------------- states that contacts cannot hold
+
+
+def test_states_that_fit_pass():
+    for kind in ("none", "one", "three", "same twice", "four corners"):
+        system("iiwa", kind, baumgarte=Baumgarte(10.0)).check_states(*states(7, 20))
+    system("iiwa", "one").check_states(*states(7, 0))
+
+
+def test_a_gradient_that_vanishes_is_named_by_row_and_contact():
+    """p^T p = 0.1 has no direction at the origin."""
+    built = robot("chain")
+    q, v, u = states(4, 5)
+    corner = built.frame_pose(q[3], FRAMES["chain"])[:3, 3]
+    bowl = ImplicitSurface(lambda p: (p - corner).square().sum() - 0.1)
+    origin = (0.0, 0.0, 0.0)
+    held = MechanicalSystem(built, (Contact("forearm", origin, FLOOR), Contact(FRAMES["chain"], origin, bowl)))
+    with pytest.raises(ContactError, match=r"contact 1 \(frame 'tool'\) has no direction at row 3"):
+        held.check_states(q, v, u)
+    held.check_states(q[:3], v[:3], u[:3])
+
+
+def test_the_centre_of_a_sphere_and_the_axis_of_a_cylinder():
+    built = robot("chain")
+    q, v, u = states(4, 2)
+    center = tuple(built.frame_pose(q[1], FRAMES["chain"])[:3, 3].tolist())
+    for surface in (Sphere(center, 0.1), Cylinder(center, (0.0, 0.0, 1.0), 0.1)):
+        held = MechanicalSystem(built, (Contact(FRAMES["chain"], (0.0, 0.0, 0.0), surface),))
+        with pytest.raises(ContactError, match=r"contact 0 .* row 1"):
+            held.check_states(q, v, u)
+
+
+def test_a_point_that_cannot_move_along_the_normal():
+    """A hub on a vertical axis cannot be lifted."""
+    lift = """<robot name="turntable"><link name="base"/><link name="table">
+      <inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+      <joint name="turn" type="continuous">
+      <parent link="base"/><child link="table"/><axis xyz="0 0 1"/></joint></robot>"""
+    built = Robot.from_urdf_text(lift)
+    held = MechanicalSystem(built, (Contact("table", (0.5, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.0)),))
+    with pytest.raises(ContactError, match="cannot move along it"):
+        held.check_states(*states(1, 2))
+
+
+def test_contradictory_contacts_are_named():
+    """The same point on two parallel planes: whichever Baumgarte pulls it to, the other is violated."""
+    tool = FRAMES["iiwa"]
+    contacts = tuple(Contact(tool, (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), height)) for height in (0.055, 0.065))
+    held = MechanicalSystem(robot("iiwa"), contacts, baumgarte=Baumgarte(10.0))
+    with pytest.raises(ContactError, match=r"contradict each other, most at row \d: .* = 5.00e-01 for contact [01]"):
+        held.check_states(*states(7, 3))
+
+
+def test_states_that_are_not_finite_are_refused():
+    for position in range(2):
+        arguments = states(7, 4)
+        arguments[position][2, 1] = math.nan
+        with pytest.raises((ContactError, NumericalError), match=r"row 2|not positive definite"):
+            system("iiwa", "one").check_states(*arguments)
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_a_file_changes_nothing():
+    built = complete()
+    again = MechanicalSystem.from_json(built.to_json())
+    assert again.to_json() == built.to_json()
+    assert again.contacts == built.contacts
+    assert again.baumgarte == built.baumgarte
+    assert again.robot.joint_names == built.robot.joint_names
+    assert dict(again.robot.locked) == {"left_gripper": 0.013}
+    assert torch.equal(again.robot.gravity, built.robot.gravity)
+    assert torch.equal(again.robot.armature, built.robot.armature)
+    assert [type(force) for force in again.known_forces] == [type(force) for force in built.known_forces]
+    assert_same_dynamics(again, built)
+
+
+def test_a_bare_system_too():
+    built = MechanicalSystem(robot("chain"), known_forces=())
+    again = MechanicalSystem.from_json(built.to_json())
+    assert again.contacts == again.known_forces == ()
+    assert again.baumgarte is None
+    assert_same_dynamics(again, built)
+
+
+def test_a_surface_that_holds_code_cannot_be_stored_but_given_again():
+    waves = (Contact(FRAMES["chain"], (0.0, 0.0, 0.0), surfaces()["waves"]),)
+    built = MechanicalSystem(robot("chain"), waves)
+    with pytest.raises(ContactError, match="pass them again when loading"):
+        built.to_json()
+    stored = built.with_contacts(()).to_dict()
+    assert_same_dynamics(MechanicalSystem.from_dict(stored, contacts=waves), built)
+
+
+def test_stored_text_is_plain_json():
+    def plain(value):
+        if isinstance(value, dict):
+            return all(type(key) is str and plain(entry) for key, entry in value.items())
+        if isinstance(value, list):
+            return all(map(plain, value))
+        return value is None or type(value) in (str, int, float, bool)
+
+    stored = json.loads(complete().to_json(), parse_constant=pytest.fail)
+    assert plain(stored)
+    assert set(stored) == {"format", "urdf", "gravity", "armature", "locked", "contacts", "known_forces", "baumgarte"}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "text", ["", "{", "nothing", "[]", "3", "null", '"text"', "[" * 100_000, "{}", '{"format": 2}']
+)
+def test_text_that_is_no_system(text):
+    with pytest.raises(FileFormatError, match="stored system"):
+        MechanicalSystem.from_json(text)
+
+
+@pytest.mark.parametrize(
+    "key", ["format", "urdf", "gravity", "armature", "locked", "contacts", "known_forces", "baumgarte"]
+)
+def test_every_part_must_be_there(key):
+    stored = complete().to_dict()
+    del stored[key]
+    with pytest.raises(FileFormatError, match=key if key != "format" else "format None"):
+        MechanicalSystem.from_dict(stored)
+
+
+def places(value, path=()):
+    """Every place in a tree of dictionaries and lists."""
+    yield path
+    if isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from places(value[key], (*path, key))
+
+
+STORED = complete().to_dict()
+PLACES = [place for place in places(STORED) if place]
+RUBBISH = [None, 5, -1.5, "rubbish", "", [], ["a"], [[]], {}, {"a": 1}, math.nan, math.inf, True, "DELETE"]
+
+
+def damaged(place, rubbish) -> dict:
+    stored = copy.deepcopy(STORED)
+    *above, last = place
+    parent = stored
+    for key in above:
+        parent = parent[key]
+    if rubbish == "DELETE":
+        del parent[last]
+    else:
+        parent[last] = rubbish
+    return stored
+
+
+@settings(max_examples=150)
+@given(place=st.sampled_from(PLACES), rubbish=st.sampled_from(RUBBISH))
+def test_damage_anywhere_gives_an_error_of_forcegp_or_finite_numbers(place, rubbish):
+    """Never an error of Python or torch, and never a system with numbers that are not finite."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        with contextlib.suppress(ForceGPError):
+            json.loads(MechanicalSystem.from_dict(damaged(place, rubbish)).to_json(), parse_constant=pytest.fail)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("part", ["urdf", "gravity", "armature", "locked", "contacts", "known_forces"])
+@pytest.mark.parametrize("empty", ["", None, 0, False], ids=repr)
+def test_an_emptied_part_is_not_taken_for_none(part, empty):
+    with pytest.raises(FileFormatError, match="damaged"):
+        MechanicalSystem.from_dict(damaged((part,), empty))
+
+
+def test_armature_must_be_complete():
+    for rubbish in ("DELETE", None):
+        with pytest.raises(FileFormatError, match="armature"):
+            MechanicalSystem.from_dict(damaged(("armature", 0), rubbish))
