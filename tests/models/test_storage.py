@@ -25,7 +25,7 @@ def data():
 @pytest.fixture(scope="module")
 def posterior(data):
     model = StructuredGP(data.system, mean="zero", noise=Noise((0.05, 0.06, 0.07), 0.02, learn=True))
-    return model.fit(data, points=15, options=OPTIONS)
+    return model.fit(data, points=15, restarts=1, options=OPTIONS)
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_a_surface_that_is_code_cannot_be_stored(tmp_path):
     surface = ImplicitSurface(lambda p: p[2] + 0.2 * p[0] - 0.4)
     system = arm_system().with_contacts((Contact("hand", (0.0, 0.0, 0.2), surface),))
     data = arm_data(12, 6, system)
-    fitted = StructuredGP(system).fit(data, options=OPTIONS)
+    fitted = StructuredGP(system).fit(data, restarts=1, options=OPTIONS)
     with pytest.raises(ContactError, match="never code"):
         save_posterior(fitted, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []

@@ -27,7 +27,7 @@ def test():
 
 @pytest.fixture(scope="module")
 def posterior(train):
-    return StructuredGP(train.system).fit(train, options=QUICK)
+    return StructuredGP(train.system).fit(train, restarts=1, options=QUICK)
 
 
 def test_learns_the_friction_and_is_calibrated(posterior, test):
@@ -123,7 +123,7 @@ def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
 
 
 def test_zero_mean_carries_the_known_forces_in_the_processes(train, test):
-    zero = StructuredGP(train.system, mean="zero").fit(train, options=QUICK)
+    zero = StructuredGP(train.system, mean="zero").fit(train, restarts=1, options=QUICK)
     states = tuple(map(torch.tensor, (test.q, test.v, test.u)))
     dynamics = test.system.dynamics(*states)
     prediction = zero.predict(*states)
@@ -140,7 +140,9 @@ def test_the_noise_is_learned(train):
 
 
 def test_force_level_noise_widens_along_H(train, test):
-    fitted = StructuredGP(train.system, noise=Noise(NOISE, 0.3)).fit(train, options=OptimizerOptions(iterations=3))
+    fitted = StructuredGP(train.system, noise=Noise(NOISE, 0.3)).fit(
+        train, restarts=1, options=OptimizerOptions(iterations=3)
+    )
     prediction = fitted.predict(test.q[:4], test.v[:4], test.u[:4])
     H = test.system.dynamics(*(torch.tensor(x[:4]) for x in (test.q, test.v, test.u))).H
     expected = NOISE**2 * torch.eye(3).double() + 0.09 * H @ H.mT
@@ -166,8 +168,8 @@ def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
 def test_the_hyperprior_can_be_left_out(train):
     model = StructuredGP(train.system)
     options = OptimizerOptions(iterations=100)
-    plain = model.fit(train, points=20, hyperprior=False, options=options)
-    held = model.fit(train, points=20, options=options)
+    plain = model.fit(train, points=20, restarts=1, hyperprior=False, options=options)
+    held = model.fit(train, points=20, restarts=1, options=options)
     assert plain.result.value == pytest.approx(plain.negative_log_likelihood, abs=1e-6)
     assert plain.negative_log_likelihood < held.negative_log_likelihood < held.result.value
     assert plain.result.history[-1] <= plain.result.history[0]
@@ -184,7 +186,7 @@ def test_nothing_of_the_caller_changes(train):
 def test_works_without_contacts():
     system = arm_system(contacts=0)
     train, test = arm_data(50, 3, system), arm_data(50, 4, system)
-    prediction = StructuredGP(system).fit(train, options=QUICK).predict(test.q, test.v, test.u)
+    prediction = StructuredGP(system).fit(train, restarts=1, options=QUICK).predict(test.q, test.v, test.u)
     assert prediction.multiplier.mean.shape == (50, 0)
     assert np.abs(prediction.mean.numpy() - test.truth["a"]).mean() < 0.2
 
@@ -192,8 +194,8 @@ def test_works_without_contacts():
 def test_redundant_contacts_change_nothing(train, test):
     doubled = train.system.with_contacts(train.system.contacts * 2)
     options = OptimizerOptions(iterations=5)
-    one = StructuredGP(train.system).fit(train, points=20, options=options).predict(test.q, test.v, test.u)
-    two = StructuredGP(doubled).fit(train, points=20, options=options).predict(test.q, test.v, test.u)
+    one = StructuredGP(train.system).fit(train, points=20, restarts=1, options=options).predict(test.q, test.v, test.u)
+    two = StructuredGP(doubled).fit(train, points=20, restarts=1, options=options).predict(test.q, test.v, test.u)
     assert torch.allclose(one.mean, two.mean, atol=1e-6)
     assert torch.allclose(two.multiplier.mean.sum(-1), one.multiplier.mean[:, 0], atol=1e-6)
 

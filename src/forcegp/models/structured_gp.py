@@ -32,6 +32,9 @@ RESTART_SPREAD = 0.7
 none.
 """
 
+MOST_POINTS_FOR_RESTARTS = 400
+"""Training points up to which several starts are the default."""
+
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
 
@@ -68,7 +71,7 @@ class StructuredGP:
         dataset: Dataset,
         *,
         points: int | None = None,
-        restarts: int = 1,
+        restarts: int | None = None,
         seed: int = 0,
         jobs: int = 1,
         hyperprior: bool = True,
@@ -82,7 +85,8 @@ class StructuredGP:
         dataset: rows with the joints of the robot in its order; nothing in it is changed.
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
         restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
-        factors.
+            factors, and the best final value wins. None means 4 up to 400 points, where local optima cost most and
+            searches cost little, and 1 beyond.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
@@ -96,10 +100,12 @@ class StructuredGP:
         ContactError: a contact cannot hold at some row.
         FitError: no restart could be evaluated; the message names the cause.
         """
-        if restarts < 1 or jobs < 1:
-            raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
         noise = self._resolved_noise(dataset)
         rows = self._training_rows(dataset, points)
+        if restarts is None:
+            restarts = 4 if len(rows) <= MOST_POINTS_FOR_RESTARTS else 1
+        if restarts < 1 or jobs < 1:
+            raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
         training = TrainingData(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u, rows.a)))
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
