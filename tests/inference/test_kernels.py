@@ -2,6 +2,7 @@ import gpytorch.kernels as gk
 import pytest
 import torch
 from gpytorch.constraints import Positive
+from gpytorch.priors import GammaPrior, LogNormalPrior
 from tests.inference.dense import squared_exponential
 from tests.inference.problems import normal
 
@@ -171,6 +172,40 @@ def test_matrices_at_other_parameters_and_their_gradients():
         torch.testing.assert_close(K, reference)
     for gradient, reference in zip(gradients, expected, strict=True):
         torch.testing.assert_close(gradient, reference)
+
+
+def with_priors() -> gk.ScaleKernel:
+    base = gk.RBFKernel(ard_num_dims=3, lengthscale_prior=LogNormalPrior(0.3, 0.8))
+    return gk.ScaleKernel(base, outputscale_prior=GammaPrior(2.0, 0.5)).double()
+
+
+def test_log_prior_and_its_gradient():
+    kernels = LatentKernels([with_priors(), gk.LinearKernel().double(), with_priors()])
+    parameters = {name: (value + 0.2).requires_grad_() for name, value in kernels.initial_parameters().items()}
+    value = kernels.log_prior(parameters)
+    expected = 0.0
+    for c in (0, 2):
+        lengthscale = torch.nn.functional.softplus(parameters[f"kernels.{c}.base_kernel.raw_lengthscale"])
+        outputscale = torch.nn.functional.softplus(parameters[f"kernels.{c}.raw_outputscale"])
+        expected = expected + torch.distributions.LogNormal(0.3, 0.8).log_prob(lengthscale).sum()
+        expected = expected + torch.distributions.Gamma(2.0, 0.5).log_prob(outputscale)
+    torch.testing.assert_close(value, expected, rtol=1e-6, atol=0.0)
+    leaves = [tensor for name, tensor in parameters.items() if "kernels.1" not in name]
+    for gradient, reference in zip(
+        torch.autograd.grad(value, leaves), torch.autograd.grad(expected, leaves), strict=True
+    ):
+        torch.testing.assert_close(gradient, reference, rtol=1e-6, atol=1e-8)
+
+
+def test_without_priors_there_is_nothing_to_add():
+    kernels = three_kernels()
+    assert float(kernels.log_prior(kernels.initial_parameters())) == 0.0
+
+
+def test_a_kernel_that_latents_share_has_one_prior():
+    kernel = with_priors()
+    alone, shared = LatentKernels([kernel]), LatentKernels([kernel] * 3)
+    assert torch.equal(alone.log_prior(alone.initial_parameters()), shared.log_prior(shared.initial_parameters()))
 
 
 def test_a_copy_at_other_parameters_leaves_the_original_alone():

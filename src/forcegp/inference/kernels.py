@@ -102,16 +102,17 @@ class LatentKernels(torch.nn.Module):
 
 
 class _LogPrior(torch.nn.Module):
-    """Sum of the log densities of all priors that are registered on some kernels."""
+    """Sum of the log densities of all priors that are registered on some kernels, once where latents share a kernel."""
 
     def __init__(self, latent: LatentKernels) -> None:
         super().__init__()
         self.kernels = latent.kernels
-        self.named = [entry for kernel in latent for entry in kernel.named_priors()]
+        named = [entry for kernel in latent for entry in kernel.named_priors()]
+        self.priors = {(id(module), id(prior)): (module, prior, closure) for _, module, prior, closure, _ in named}
 
     def forward(self) -> Tensor:
         total = torch.zeros((), dtype=torch.float64)
-        for _, module, prior, closure, _ in self.named:
+        for module, prior, closure in self.priors.values():
             value = prior.log_prob(closure(module)).sum()
             total = total.to(value.device) + value
         return total
