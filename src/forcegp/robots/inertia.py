@@ -18,9 +18,9 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
-# relative to the trace of Sigma: what printing an ideal rod or plate with six digits costs
+# relative to the largest principal moment: what printing an ideal rod or plate with six digits costs
 ROUNDING = 1e-6
-# below this, log-Cholesky parameters (whose diagonal is a logarithm) say nothing any more
+# relative thickness squared below which log-Cholesky parameters (logarithms) say nothing any more
 SINGULAR = 1e-12
 
 # e^(d1, d2, d3), s12, s23, s13, t1, t2, t3, 1 -> row-major 4x4 upper triangle

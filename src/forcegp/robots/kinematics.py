@@ -104,8 +104,8 @@ class Kinematics:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
         body, offset = self.robot.frame(frame)
         if body == WORLD:
-            return offset.expand(*self.batch_shape, 4, 4)
-        return self._rows((algorithms.product(self.poses[body], offset[..., None])).movedim(-1, 0))
+            return offset.repeat(*self.batch_shape, 1, 1)
+        return self._rows(algorithms.product(self.poses[body], offset[..., None]).movedim(-1, 0))
 
     def frame_jacobian(self, frame: str, point: Point | None = None) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""

@@ -71,7 +71,7 @@ class Robot:
     layout: Layout
     tree: Tree
     urdf_text: str
-    locked: Mapping[str, float]
+    _locked: tuple[tuple[str, float], ...]
     _frames: dict[str, tuple[int, Tensor]]
     _merge_plans: dict[tuple[str, ...], tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict)
 
@@ -120,7 +120,7 @@ class Robot:
             device=torch.device("cpu"),
         )
         frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
-        return cls(description, layout, tree, text, locked, frames)
+        return cls(description, layout, tree, text, tuple(locked.items()), frames)
 
     def with_inertials(self, inertials: Inertials) -> Robot:
         """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
@@ -199,12 +199,17 @@ class Robot:
     @property
     def gravity(self) -> Float[Tensor, "3"]:
         """Gravitational acceleration in m/s^2."""
-        return self.tree.gravity
+        return self.tree.gravity.clone()
 
     @property
     def armature(self) -> Float[Tensor, "nv"]:
         """Rotor inertia per joint in kg m^2 or kg."""
-        return self.tree.armature
+        return self.tree.armature.clone()
+
+    @property
+    def locked(self) -> dict[str, float]:
+        """Movable joints of the URDF that are fixed here, and their positions in rad or m."""
+        return dict(self._locked)
 
     @property
     def device(self) -> torch.device:

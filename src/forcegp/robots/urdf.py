@@ -131,7 +131,7 @@ def parse_urdf(text: str, *, source: str) -> RobotDescription:
         if name in joints:
             raise DuplicateName(f"{source}: two joints are called {name!r}; joint names must be unique, rename one.")
         joints[name] = _joint(element, name, links, _Place(f"joint {name!r}", source))
-    return RobotDescription(root.get("name", "").strip() or "robot", source, links, tuple(joints.values()))
+    return RobotDescription(_name(root, "robot", source), source, links, tuple(joints.values()))
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _parse_xml(text: str, source: str) -> Element:
             f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
             "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
         ) from None
-    except ParseError as error:
+    except (ParseError, UnicodeError) as error:
         hint = ""
         if "unbound prefix" in str(error):
             hint = " If this is a xacro file, expand it first: xacro robot.urdf.xacro > robot.urdf."

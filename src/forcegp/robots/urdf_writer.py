@@ -24,7 +24,7 @@ def replace_inertial(
     spans = _find_link(data, link)
     if spans is None:
         raise UnknownLink(f"{source}: no link {link!r} in the URDF text.")
-    (start, head_end, end), inertial = spans
+    (start, head_end), inertial = spans
     if inertial is not None:
         first, last = inertial
         element = _inertial(mass, center_of_mass, inertia, newline + _indent_of(data, first))
@@ -32,8 +32,8 @@ def replace_inertial(
     indent = _indent_of(data, start)
     element = newline + indent + b"  " + _inertial(mass, center_of_mass, inertia, newline + indent + b"  ")
     if data[head_end - 2 : head_end] == b"/>":  # <link name="tool"/> has no inside yet
-        opened = data[start : head_end - 2].rstrip() + b">"
-        return (data[:start] + opened + element + newline + indent + b"</link>" + data[end:]).decode("utf-8")
+        opened = data[: head_end - 2].rstrip() + b">"
+        return (opened + element + newline + indent + b"</link>" + data[head_end:]).decode("utf-8")
     return (data[:head_end] + element + data[head_end:]).decode("utf-8")
 
 
@@ -50,10 +50,10 @@ def write_text(text: str, path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _find_link(data: bytes, link: str) -> tuple[tuple[int, int, int], tuple[int, int] | None] | None:
-    """Byte offsets of a link's element (start, end of its start tag, end) and of the ``<inertial>`` directly in it."""
+def _find_link(data: bytes, link: str) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
+    """Byte offsets (first, one past last) of a link's start tag and of the ``<inertial>`` element directly in it."""
     parser = expat.ParserCreate("utf-8")
-    path: list[tuple[str, int]] = []
+    depth = 0
     inside = False
     found: list[int] = []
     inertial: list[int] = []
@@ -71,30 +71,28 @@ def _find_link(data: bytes, link: str) -> tuple[tuple[int, int, int], tuple[int,
             position += 1
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal inside
+        nonlocal depth, inside
         position = parser.CurrentByteIndex
-        path.append((tag, position))
-        if len(path) == 2 and tag == "link" and attributes.get("name") == link:
+        depth += 1
+        if depth == 2 and tag == "link" and attributes.get("name") == link:
             inside = True
             found.extend((position, after_tag(position)))
-        elif inside and len(path) == 3 and tag == "inertial":
+        elif inside and depth == 3 and tag == "inertial":
             inertial.append(position)
 
     def end(tag: str) -> None:
-        nonlocal inside
-        if inside and len(path) == 3 and tag == "inertial":
+        nonlocal depth, inside
+        if inside and depth == 3 and tag == "inertial":
             inertial.append(after_tag(parser.CurrentByteIndex))
-        elif inside and len(path) == 2:
-            found.append(after_tag(parser.CurrentByteIndex))
-            inside = False
-        path.pop()
+        inside = inside and depth > 2
+        depth -= 1
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.Parse(data, True)
     if not found:
         return None
-    return (found[0], found[1], found[2]), ((inertial[0], inertial[1]) if inertial else None)
+    return (found[0], found[1]), ((inertial[0], inertial[1]) if inertial else None)
 
 
 def _indent_of(data: bytes, position: int) -> bytes:

@@ -1,0 +1,362 @@
+"""What a Robot shows of its URDF, how its links merge, and what it says about wrong names and inputs."""
+
+import pickle
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+from tests.robots.robot_models import CHAIN, TREE
+
+from forcegp.errors import (
+    InvalidInput,
+    NonPhysicalInertia,
+    NumericalError,
+    UnknownFrame,
+    UnknownJoint,
+    UnknownLink,
+)
+from forcegp.robots import Robot, physical_from_parameters
+
+
+@pytest.fixture(scope="module")
+def tree() -> Robot:
+    return Robot.from_urdf_text(TREE)
+
+
+@pytest.fixture(scope="module")
+def chain() -> Robot:
+    return Robot.from_urdf_text(CHAIN)
+
+
+@pytest.fixture
+def unchecked():
+    """Without the run-time check of shapes in signatures, as users have it."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_joints_come_depth_first_and_branches_in_file_order(tree):
+    assert tree.joint_names == (
+        "torso",
+        "right_shoulder",
+        "right_wrist",
+        "left_shoulder",
+        "left_gripper",
+        "second_finger",
+    )
+    assert tree.nv == 6
+    assert tree.name == "tree"
+
+
+def test_joint_order_does_not_change_the_physics(tree):
+    # the same joints, with the branches in the other order
+    wrist = TREE.index('<joint name="right_shoulder"'), TREE.index('<joint name="left_shoulder"')
+    end = TREE.index('<joint name="left_gripper"')
+    swapped = Robot.from_urdf_text(TREE[: wrist[0]] + TREE[wrist[1] : end] + TREE[wrist[0] : wrist[1]] + TREE[end:])
+    assert swapped.joint_names[1] == "left_shoulder"
+    columns = [tree.joint_names.index(name) for name in swapped.joint_names]
+    q = torch.linspace(-1, 1, 6, dtype=torch.float64)
+    expected = tree.mass_matrix(q)[columns][:, columns]
+    torch.testing.assert_close(swapped.mass_matrix(q[columns]), expected, rtol=1e-13, atol=1e-13)
+
+
+def test_limits_damping_and_friction_are_visible(tree):
+    torso = tree.joint("torso")
+    assert (torso.type, torso.parent, torso.child) == ("revolute", "base", "body")
+    assert (torso.lower, torso.upper) == (-np.inf, np.inf)
+    assert (torso.velocity_limit, torso.effort_limit, torso.damping, torso.friction) == (2.0, 100.0, 0.7, 0.2)
+    wrist = tree.joint("right_wrist")
+    assert (wrist.lower, wrist.upper, wrist.axis) == (-1.0, 2.0, (0.0, 0.0, -1.0))
+    shoulder = tree.joint("right_shoulder")
+    assert shoulder.type == "continuous"
+    assert (shoulder.effort_limit, shoulder.damping) == (np.inf, 0.0)
+    np.testing.assert_allclose(shoulder.axis, np.array([1, 2, -0.5]) / np.sqrt(5.25))
+    assert tree.joint("left_shoulder").axis == (1.0, 0.0, 0.0)  # the format's default
+    assert tree.joint("second_finger").upper == 0.0  # the format's default where only one is given
+
+
+def test_links_show_who_moves_them_and_their_inertia(tree):
+    camera = tree.link("camera")
+    assert camera.joint == "torso"
+    assert camera.mass == 0.4
+    assert camera.center_of_mass == (0.01, 0.0, 0.0)
+    c, s = np.cos(0.5), np.sin(0.5)
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    inertia = np.array([[0.0004, 0, 0], [0, 0.0003, 0.00005], [0, 0.00005, 0.0002]])
+    np.testing.assert_allclose(camera.inertia, turn @ inertia @ turn.T, atol=1e-18)
+    assert tree.link("base").joint is None
+    assert tree.link("lens").mass == 0.0
+    assert set(tree.link_names) == set(tree.frame_names)
+
+
+def test_repr_names_robot_and_joints(chain):
+    assert repr(chain).startswith("Robot('chain', nv=4, links=7, joints=[slide (prismatic), spin (continuous)")
+
+
+def test_merged_link_stays_a_parameter(chain):
+    # a bracket twice as heavy, by its name, although it is fixed to the hub
+    parameters = chain.inertial_parameters("bracket")["bracket"]
+    heavier = parameters + torch.tensor([0.5 * np.log(2.0), *np.zeros(9)])
+    text = CHAIN.replace('<mass value="0.7"/>', '<mass value="1.4"/>')
+    for old, new in [("0.002", "0.004"), ("0.0002", "0.0004"), ("0.003", "0.006"), ("0.0001", "0.0002")]:
+        head, tail = text.split('<link name="bracket">')
+        text = head + '<link name="bracket">' + tail.replace(f'="{old}"', f'="{new}"', 1)
+    text = text.replace('izz="0.0025"', 'izz="0.005"')
+    q = torch.linspace(-1, 1, 4, dtype=torch.float64)
+    expected = Robot.from_urdf_text(text).mass_matrix(q)
+    torch.testing.assert_close(chain.mass_matrix(q, {"bracket": heavier}), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_massless_frame_can_be_given_inertia(chain):
+    payload = torch.tensor([0.1, -2.0, -2.1, -2.2, 0.01, 0.0, 0.02, 0.05, 0.0, 0.1], dtype=torch.float64)
+    q, v = torch.ones(2, 4, dtype=torch.float64)
+    loaded = chain.with_inertials({"tool": payload})
+    mass, center, _ = physical_from_parameters(payload)
+    assert loaded.link("tool").mass == pytest.approx(mass.item(), rel=1e-15)
+    np.testing.assert_array_equal(loaded.link("tool").center_of_mass, center)
+    expected = chain.mass_matrix_and_bias(q, v, {"tool": payload})
+    torch.testing.assert_close(loaded.mass_matrix_and_bias(q, v), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_moving_a_center_of_mass_never_moves_a_frame(chain):
+    q = torch.linspace(-1, 1, 4, dtype=torch.float64)
+    wrist = chain.inertial_parameters("wrist")["wrist"]
+    other = chain.with_inertials({"wrist": wrist + torch.tensor([0.0] * 7 + [0.3, 0.2, 0.1], dtype=torch.float64)})
+    for frame in chain.frame_names:
+        assert torch.equal(other.frame_pose(q, frame), chain.frame_pose(q, frame))
+
+
+def test_locked_joint_is_fixed_where_it_is_locked(tree):
+    locked = Robot.from_urdf_text(TREE, locked={"torso": 0.4, "right_wrist": -0.3})
+    assert locked.joint_names == ("right_shoulder", "left_shoulder", "left_gripper", "second_finger")
+    assert locked.locked == {"torso": 0.4, "right_wrist": -0.3}
+    full = dict.fromkeys(tree.joint_names, 0.2) | locked.locked
+    q = torch.tensor([full[name] for name in tree.joint_names], dtype=torch.float64)
+    free = [tree.joint_names.index(name) for name in locked.joint_names]
+    for frame in tree.frame_names:
+        torch.testing.assert_close(locked.frame_pose(q[free], frame), tree.frame_pose(q, frame), rtol=0, atol=1e-15)
+    torch.testing.assert_close(locked.mass_matrix(q[free]), tree.mass_matrix(q)[free][:, free], rtol=1e-13, atol=1e-15)
+    kept = locked.with_armature({"left_shoulder": 0.5}).with_inertials(locked.inertial_parameters("left_arm"))
+    assert kept.locked == locked.locked
+    assert kept.armature.tolist() == [0.0, 0.5, 0.0, 0.0]
+
+
+def test_armature_by_name_and_in_order(chain):
+    named = chain.with_armature({"spin": 0.2})
+    ordered = Robot.from_urdf_text(CHAIN, armature=(0, 0.2, 0, 0))
+    assert named.armature.tolist() == ordered.armature.tolist() == [0.0, 0.2, 0.0, 0.0]
+    assert named.with_armature({"skew": 0.3}).armature.tolist() == [0.0, 0.2, 0.3, 0.0]
+    q = torch.zeros(4, dtype=torch.float64)
+    added = named.mass_matrix(q) - chain.mass_matrix(q)
+    torch.testing.assert_close(added, torch.diag(named.armature))
+
+
+def test_robot_is_immutable_and_survives_pickling(chain):
+    with pytest.raises(AttributeError):
+        chain.urdf_text = ""  # type: ignore[misc]
+    chain.gravity.zero_()
+    assert chain.gravity.tolist() == [0.0, 0.0, -9.81]
+    q = torch.ones(4, dtype=torch.float64)
+    assert torch.equal(pickle.loads(pickle.dumps(chain)).mass_matrix(q), chain.mass_matrix(q))
+
+
+# ---------------------------------------------------------------------- batches
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (1, 1, 2), (0,), (3, 0)])
+def test_any_batch_shape(tree, batch):
+    q, v, a = torch.randn(3, *batch, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    n = tree.nv
+    inertials = {name: p.expand(*batch, 10) for name, p in tree.inertial_parameters("camera", "left_arm").items()}
+    for given in (None, inertials):
+        shapes = {
+            (*batch, n, n): [tree.mass_matrix(q, given)],
+            (*batch, n): [
+                tree.bias_forces(q, v, given),
+                tree.gravity_forces(q, given),
+                tree.inverse_dynamics(q, v, a, given),
+                tree.forward_dynamics(q, v, a, given),
+            ],
+            (*batch, 4, 4): [tree.frame_pose(q, "lens"), tree.frame_pose(q, "base")],
+            (*batch, 6, n): [tree.frame_jacobian(q, "lens", (1.0, 0.0, 0.0)), tree.frame_jacobian(q, "base")],
+            (*batch, 6): [tree.frame_bias_acceleration(q, v, "lens"), tree.frame_bias_acceleration(q, v, "base")],
+        }
+        for shape, values in shapes.items():
+            for value in values:
+                assert value.shape == shape
+    # each state on its own gives the same
+    flat = tree.forward_dynamics(q, v, a).reshape(-1, n)
+    for i, state in enumerate(zip(*(x.reshape(-1, n) for x in (q, v, a)), strict=True)):
+        torch.testing.assert_close(flat[i], tree.forward_dynamics(*state), rtol=1e-11, atol=1e-11)
+
+
+def test_batches_broadcast(chain):
+    generator = torch.Generator().manual_seed(1)
+    q = torch.randn(3, 1, 4, generator=generator, dtype=torch.float64)
+    v = torch.randn(5, 4, generator=generator, dtype=torch.float64)
+    a = torch.randn(4, generator=generator, dtype=torch.float64)
+    wrist = chain.inertial_parameters("wrist")["wrist"] + 0.1 * torch.randn(2, 1, 1, 10, dtype=torch.float64)
+    full = (2, 3, 5)
+    expanded = [x.expand(*full, 4) for x in (q, v, a)]
+    given, all_given = {"wrist": wrist}, {"wrist": wrist.expand(*full, 10)}
+    for name in ("inverse_dynamics", "forward_dynamics"):
+        function = getattr(chain, name)
+        torch.testing.assert_close(function(q, v, a, given), function(*expanded, all_given))
+    torch.testing.assert_close(chain.mass_matrix(q, given), chain.mass_matrix(expanded[0], all_given)[:, :, :1])
+    torch.testing.assert_close(chain.bias_forces(q, v, given), chain.bias_forces(*expanded[:2], all_given))
+    points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    ours = chain.frame_jacobian(q, "tool", points)
+    assert ours.shape == (3, 5, 6, 4)
+    torch.testing.assert_close(ours[1, 2], chain.frame_jacobian(q[1, 0], "tool", points[2]))
+    ours = chain.frame_bias_acceleration(q, v, "tool", points)
+    torch.testing.assert_close(ours[1, 2], chain.frame_bias_acceleration(q[1, 0], v[2], "tool", points[2]))
+
+
+def test_inertials_of_a_batch_at_one_state(chain):
+    q = torch.ones(4, dtype=torch.float64)
+    wrist = chain.inertial_parameters("wrist")["wrist"] + torch.linspace(0, 1, 7, dtype=torch.float64)[:, None]
+    masses = chain.mass_matrix(q, {"wrist": wrist})
+    assert masses.shape == (7, 4, 4)
+    torch.testing.assert_close(masses[4], chain.mass_matrix(q, {"wrist": wrist[4]}))
+
+
+def test_one_kinematics_serves_everything(chain):
+    q, v, a = torch.linspace(-1, 1, 24, dtype=torch.float64).reshape(3, 2, 4)
+    kinematics = chain.kinematics(q, v)
+    assert kinematics.batch_shape == (2,)
+    pairs = [
+        (kinematics.mass_matrix(), chain.mass_matrix(q)),
+        (kinematics.bias_forces(), chain.bias_forces(q, v)),
+        (kinematics.gravity_forces(), chain.gravity_forces(q)),
+        (kinematics.inverse_dynamics(a), chain.inverse_dynamics(q, v, a)),
+        (kinematics.forward_dynamics(a), chain.forward_dynamics(q, v, a)),
+        (kinematics.frame_pose("tool"), chain.frame_pose(q, "tool")),
+        (kinematics.frame_jacobian("tool"), chain.frame_jacobian(q, "tool")),
+        (kinematics.frame_bias_acceleration("tool"), chain.frame_bias_acceleration(q, v, "tool")),
+    ]
+    for ours, expected in pairs:
+        assert torch.equal(ours, expected)
+    with pytest.raises(InvalidInput, match=r"bias_forces needs velocities; .* robot\.kinematics\(q, v\)"):
+        chain.kinematics(q).bias_forces()
+
+
+# ---------------------------------------------------------------------- wrong names and inputs
+
+
+def test_unknown_names_list_the_valid_ones(tree):
+    q = torch.zeros(6, dtype=torch.float64)
+    with pytest.raises(UnknownFrame, match="no frame 'left_fingr' in tree; did you mean 'left_finger'"):
+        tree.frame_pose(q, "left_fingr")
+    with pytest.raises(UnknownLink, match="no link 'boddy' in tree; did you mean 'body'"):
+        tree.link("boddy")
+    with pytest.raises(UnknownLink, match="did you mean 'camera'"):
+        tree.mass_matrix(q, {"camra": torch.zeros(10, dtype=torch.float64)})
+    with pytest.raises(UnknownJoint, match="did you mean 'torso'"):
+        tree.joint("torsoo")
+    with pytest.raises(UnknownJoint, match="did you mean 'torso'"):
+        Robot.from_urdf_text(TREE, armature={"torsoo": 1.0})
+    with pytest.raises(UnknownJoint, match="did you mean 'torso'"):
+        Robot.from_urdf_text(TREE, locked={"torsoo": 1.0})
+
+
+def test_links_without_inertial_parameters_say_why(tree):
+    with pytest.raises(InvalidInput, match="'base' of tree is fixed in the world, so its inertia never enters"):
+        tree.inertial_parameters("base")
+    with pytest.raises(InvalidInput, match="'base' of tree is fixed in the world"):
+        tree.mass_matrix(torch.zeros(6, dtype=torch.float64), {"base": torch.zeros(10, dtype=torch.float64)})
+    with pytest.raises(InvalidInput, match=r"'lens' of tree is a massless frame.*<inertial>"):
+        tree.inertial_parameters("lens")
+
+
+def test_ideal_rod_moves_but_is_no_parameter():
+    rod = CHAIN.replace('ixx="0.002" ixy="0" ixz="0.0005" iyy="0.02" iyz="0" izz="0.021"', 'ixx="0" ixy="0" ixz="0" '
+                        'iyy="0.02" iyz="0" izz="0.02"')  # fmt: skip
+    robot = Robot.from_urdf_text(rod)
+    assert torch.linalg.eigvalsh(robot.mass_matrix(torch.ones(4, dtype=torch.float64))).min() > 0
+    with pytest.raises(NonPhysicalInertia, match=r"link 'forearm' .*line-like.*thickness"):
+        robot.inertial_parameters("forearm")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.zeros(4), "q is a ndarray; give a tensor"),
+        (torch.zeros(3, dtype=torch.float64), r"q has shape \(3,\); its last dimension must be 4"),
+        (torch.zeros((), dtype=torch.float64), r"q has shape \(\); its last dimension must be 4"),
+        (torch.zeros(4), r"q is torch.float32; .*float64, pass .*.double\(\)"),
+        (torch.zeros(4, dtype=torch.int64), "q is torch.int64"),
+        (torch.zeros(4, dtype=torch.float64, device="meta"), r"q is on meta but the robot on cpu; use .*to\('meta'\)"),
+    ],
+)
+def test_wrong_inputs(chain, value, message):
+    with pytest.raises(InvalidInput, match=message):
+        chain.mass_matrix(value)
+    good = torch.zeros(4, dtype=torch.float64)
+    for name, function in [("v", chain.bias_forces), ("a", chain.inverse_dynamics), ("tau", chain.forward_dynamics)]:
+        arguments = (good, value) if name == "v" else (good, good, value)
+        with pytest.raises(InvalidInput, match=message.replace("q", name, 1)):
+            function(*arguments)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_batches_points_and_parameters(chain):
+    two, three = torch.zeros(2, 4, dtype=torch.float64), torch.zeros(3, 4, dtype=torch.float64)
+    with pytest.raises(InvalidInput, match=r"do not broadcast: q \(2,\), v \(3,\)"):
+        chain.bias_forces(two, three)
+    with pytest.raises(InvalidInput, match=r"do not broadcast: the states \(2,\), tau \(3,\)"):
+        chain.forward_dynamics(two, two, three)
+    with pytest.raises(InvalidInput, match=r"do not broadcast: the states \(2,\), inertials \(3,\)"):
+        chain.mass_matrix(two, {"wrist": torch.zeros(3, 10, dtype=torch.float64)})
+    zeros = torch.zeros(3, 10, dtype=torch.float64)
+    with pytest.raises(InvalidInput, match=r"inertials\['hub'\] \(2,\), inertials\['wrist'\] \(3,\)"):
+        chain.mass_matrix(two, {"hub": zeros[:2], "wrist": zeros})
+    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] has shape \(9,\); its last dimension must be 10"):
+        chain.mass_matrix(two, {"wrist": torch.zeros(9, dtype=torch.float64)})
+    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] has shape \(2, 10\); a robot holds one set"):
+        chain.with_inertials({"wrist": torch.zeros(2, 10, dtype=torch.float64)})
+    with pytest.raises(InvalidInput, match=r"point is .* give 3 finite numbers"):
+        chain.frame_jacobian(two, "tool", (1.0, 2.0))
+    with pytest.raises(InvalidInput, match=r"point has shape \(2,\)"):
+        chain.frame_jacobian(two, "tool", torch.zeros(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gravity": (0, 0)}, "gravity is .*; give 3 finite numbers"),
+        ({"gravity": (0, 0, np.nan)}, "give 3 finite numbers"),
+        ({"armature": (1, 2, 3)}, "armature is .*; give 4 finite numbers"),
+        ({"armature": {"spin": -1.0}}, "armature of joint 'spin' is -1; a rotor inertia cannot be negative"),
+        ({"locked": {"flange": 0.0}}, "joint 'flange' is fixed already"),
+        ({"locked": {"spin": np.inf}}, "locked joint 'spin' at inf: give a finite position"),
+    ],
+)
+def test_wrong_options(options, message):
+    with pytest.raises(InvalidInput, match=message):
+        Robot.from_urdf_text(CHAIN, **options)
+
+
+def test_singular_mass_matrix_is_an_error():
+    point_on_axis = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial></link>
+      <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+    one = torch.ones(1, dtype=torch.float64)
+    with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
+        Robot.from_urdf_text(point_on_axis).forward_dynamics(one, one, one)
+    acceleration = Robot.from_urdf_text(point_on_axis, armature=(0.5,)).forward_dynamics(one, one, one)
+    torch.testing.assert_close(acceleration, 2.0 * one)
+
+
+def test_constants_move_to_another_device(chain):
+    # the meta device computes shapes only; it is there on every machine
+    moved = chain.to("meta")
+    q = torch.zeros(5, 4, dtype=torch.float64, device="meta")
+    assert moved.device.type == "meta"
+    assert moved.mass_matrix(q).device.type == "meta"
+    assert moved.frame_jacobian(q, "tool", (0.0, 0.0, 0.1)).shape == (5, 6, 4)
+    assert chain.device.type == "cpu"
+    with pytest.raises(InvalidInput, match="q is on cpu but the robot on meta"):
+        moved.mass_matrix(torch.zeros(4, dtype=torch.float64))

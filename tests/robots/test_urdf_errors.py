@@ -1,0 +1,257 @@
+"""Each way in which a URDF can be wrong has its own error, which names the file, the culprit and the remedy."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.robots.robot_models import CHAIN, TREE
+
+from forcegp import errors
+from forcegp.robots import Robot
+
+SMALL = """<robot name="small">
+  <link name="base"/>
+  <joint name="hinge" type="revolute">
+    <parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="5" velocity="3"/>
+  </joint>
+  <link name="arm">
+    <inertial>
+      <origin xyz="0.1 0 0"/><mass value="2"/>
+      <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>
+    </inertial>
+  </link>
+</robot>"""
+JOINT = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint></robot>'
+
+
+def changed(old: str, new: str) -> str:
+    assert old in SMALL
+    return SMALL.replace(old, new)
+
+
+def with_joint(name: str, parent: str, child: str, links: str = "") -> str:
+    return SMALL.replace("</robot>", links + JOINT.format(name, parent, child))
+
+
+def without_inertial(text: str) -> str:
+    return re.sub("<inertial>.*</inertial>", "", text, flags=re.DOTALL)
+
+
+ENTITIES = '<!DOCTYPE robot [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>' + SMALL.replace("small", "&b;")
+IXX = 'ixx="0.1"'
+
+WRONG = {
+    "empty": ("", errors.MalformedUrdf, ["is empty", "<robot name"]),
+    "blank": (" \n\t", errors.MalformedUrdf, ["is empty"]),
+    "not xml": ("robot: small", errors.MalformedUrdf, ["not well-formed XML", "line 1"]),
+    "cut off": (SMALL[:200], errors.MalformedUrdf, ["not well-formed XML"]),
+    "not a robot": ("<sdf/>", errors.MalformedUrdf, ["<sdf>, not <robot>"]),
+    "no robot name": (changed(' name="small"', ""), errors.MissingElement, ['<robot name="...">']),
+    "no links": ('<robot name="r"/>', errors.MalformedUrdf, ["no <link>"]),
+    "nothing moves": ('<robot name="r"><link name="a"/></robot>', errors.RobotModelError, ["no movable joint"]),
+    "entities": (ENTITIES, errors.UnsafeXml, ["entity", "remove the <!DOCTYPE"]),
+    "external dtd": ('<!DOCTYPE robot SYSTEM "file:///etc/passwd">' + SMALL, errors.UnsafeXml, ["external reference"]),
+    "bare doctype": ("<!DOCTYPE robot>" + SMALL, errors.UnsafeXml, ["DTD"]),
+    "xacro macro": (
+        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm side="left"/></robot>',
+        errors.UnexpandedXacro,
+        ["<arm>", "run xacro first"],
+    ),
+    "xacro expression": (changed("0.1 0 0", "${length} 0 0"), errors.UnexpandedXacro, ["<origin>", "run xacro first"]),
+    "xacro without its namespace": (
+        '<robot name="r"><xacro:arm/></robot>',
+        errors.MalformedUrdf,
+        ["unbound prefix", "xacro robot.urdf.xacro"],
+    ),
+    "link without name": (changed('<link name="base"/>', "<link/>"), errors.MissingElement, ['<link name="...">']),
+    "joint without name": (changed(' name="hinge"', ""), errors.MissingElement, ['<joint name="...">']),
+    "two links of a name": (changed('"base"/>', '"arm"/>'), errors.DuplicateName, ["two links", "'arm'", "rename"]),
+    "two joints of a name": (with_joint("hinge", "base", "arm"), errors.DuplicateName, ["two joints", "'hinge'"]),
+    "two inertials": (
+        changed('<link name="arm">', '<link name="arm"><inertial/>'),
+        errors.DuplicateName,
+        ["link 'arm'", "2 <inertial>", "keep one"],
+    ),
+    "no type": (changed(' type="revolute"', ""), errors.MissingElement, ["joint 'hinge'", "'type'", "add it"]),
+    "misspelt type": (
+        changed('"revolute"', '"revolut"'),
+        errors.UnsupportedJoint,
+        ["joint 'hinge'", "'revolut'", "Did you mean 'revolute'"],
+    ),
+    "floating": (changed('"revolute"', '"floating"'), errors.UnsupportedJoint, ["joint 'hinge'", "type 'fixed'"]),
+    "planar": (changed('"revolute"', '"planar"'), errors.UnsupportedJoint, ["joint 'hinge'", "two prismatic"]),
+    "mimic": (
+        changed("<axis", '<mimic joint="other" multiplier="2"/><axis'),
+        errors.UnsupportedJoint,
+        ["joint 'hinge' mimics 'other'", "locked={'hinge': position}"],
+    ),
+    "no parent": (changed('<parent link="base"/>', ""), errors.MissingElement, ["joint 'hinge'", "<parent>"]),
+    "no child": (changed('<child link="arm"/>', ""), errors.MissingElement, ["joint 'hinge'", "<child>"]),
+    "parent without link": (
+        changed('<parent link="base"/>', "<parent/>"),
+        errors.MissingElement,
+        ["joint 'hinge'", "<parent> has no attribute 'link'"],
+    ),
+    "unknown child": (
+        changed('<child link="arm"/>', '<child link="amr"/>'),
+        errors.DanglingJoint,
+        ["joint 'hinge'", "child link 'amr'", "did you mean 'arm'", "arm, base"],
+    ),
+    "zero axis": (changed("0 0 1", "0 0 0"), errors.InvalidNumber, ["joint 'hinge'", "<axis>", "non-zero"]),
+    "NaN axis": (changed("0 0 1", "0 nan 1"), errors.InvalidNumber, ["joint 'hinge'", "<axis>", "finite"]),
+    "short axis": (changed("0 0 1", "0 1"), errors.InvalidNumber, ["joint 'hinge'", "2 numbers", "not 3"]),
+    "axis in words": (changed("0 0 1", "0 0 up"), errors.InvalidNumber, ["joint 'hinge'", "'up', not a number"]),
+    "number with underscore": (changed("-1", "-1_0"), errors.InvalidNumber, ["<limit> lower", "'-1_0'"]),
+    "limit in words": (changed('upper="1"', 'upper="one"'), errors.InvalidNumber, ["<limit> upper", "'one'"]),
+    "NaN limit": (changed('upper="1"', 'upper="nan"'), errors.InvalidNumber, ["<limit> upper", "NaN"]),
+    "crossed limits": (changed('upper="1"', 'upper="-2"'), errors.InvalidNumber, ["lower limit -1", "swap"]),
+    "infinite origin": (
+        changed("<axis", '<origin xyz="0 inf 0"/><axis'),
+        errors.InvalidNumber,
+        ["joint 'hinge'", "<origin> xyz", "finite"],
+    ),
+    "infinite angle": (
+        changed("<axis", '<origin rpy="0 inf 0"/><axis'),
+        errors.InvalidNumber,
+        ["joint 'hinge'", "<origin> rpy", "rad"],
+    ),
+    "no mass element": (changed('<mass value="2"/>', ""), errors.MissingElement, ["link 'arm'", "<mass>"]),
+    "no inertia element": (re.sub("<inertia .*/>", "", SMALL), errors.MissingElement, ["link 'arm'", "<inertia>"]),
+    "no ixx": (changed(IXX, ""), errors.MissingElement, ["link 'arm'", "'ixx'"]),
+    "mass in words": (changed('"2"', '"two"'), errors.InvalidNumber, ["link 'arm'", "'two', not a number"]),
+    "moving link without inertia": (
+        without_inertial(SMALL),
+        errors.MissingInertia,
+        ["link 'arm'", "joint 'hinge'", "add an <inertial>", "locked={'hinge': 0.0}"],
+    ),
+    "moving links that are all massless": (
+        without_inertial(with_joint("mount", "arm", "tool", '<link name="tool"/>')),
+        errors.MissingInertia,
+        ["link 'arm' and the links fixed to it ('tool')"],
+    ),
+    "massless but inert": (changed('"2"', '"0"'), errors.NonPhysicalInertia, ["link 'arm'", "mass is zero"]),
+    "negative mass": (changed('"2"', '"-2"'), errors.NonPhysicalInertia, ["link 'arm'", "-2 kg is negative"]),
+    "NaN mass": (changed('"2"', '"nan"'), errors.NonPhysicalInertia, ["link 'arm'", "not finite"]),
+    "NaN inertia": (changed(IXX, 'ixx="nan"'), errors.NonPhysicalInertia, ["link 'arm'", "not finite"]),
+    "negative inertia": (changed(IXX, 'ixx="-1"'), errors.NonPhysicalInertia, ["link 'arm'", "not positive definite"]),
+    "indefinite inertia": (
+        changed('ixy="0"', 'ixy="0.2"'),
+        errors.NonPhysicalInertia,
+        ["link 'arm'", "not positive definite", "-0.1"],
+    ),
+    "triangle inequality": (
+        changed(IXX, 'ixx="0.21"'),
+        errors.NonPhysicalInertia,
+        ["link 'arm'", "0.1, 0.1, 0.21", "triangle inequality", "Correct its <inertial>"],
+    ),
+    "two parents": (
+        with_joint("second", "base", "arm"),
+        errors.KinematicLoop,
+        ["link 'arm' has two parents", "'hinge'", "'second'", "remove one"],
+    ),
+    "loop beside the tree": (
+        with_joint("1", "a", "b", '<link name="a"/><link name="b"/>').replace("</robot>", JOINT.format("2", "b", "a")),
+        errors.KinematicLoop,
+        ["'a' <- 'b' <- 'a'", "remove one of its joints"],
+    ),
+    "nothing but a loop": (with_joint("back", "arm", "base"), errors.KinematicLoop, ["'base' <- 'arm' <- 'base'"]),
+    "joint onto itself": (changed('parent link="base"', 'parent link="arm"'), errors.KinematicLoop, ["'arm' <- 'arm'"]),
+    "two parts": (
+        changed('<link name="base"/>', '<link name="base"/><link name="stray"/>'),
+        errors.KinematicLoop,
+        ["2 separate parts", "'base', 'stray'", "connect them"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_each_error_names_file_culprit_and_remedy(case, tmp_path):
+    text, error, fragments = WRONG[case]
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    with pytest.raises(errors.RobotModelError) as caught:
+        Robot.from_urdf(path)
+    assert type(caught.value) is error
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    for fragment in fragments:
+        assert fragment in message
+    assert "\n" not in message
+
+
+def test_the_small_robot_itself_is_right():
+    assert Robot.from_urdf_text(SMALL).joint_names == ("hinge",)
+
+
+def test_expanding_entities_costs_nothing():
+    laughs = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 12))
+    with pytest.raises(errors.UnsafeXml):
+        Robot.from_urdf_text(f'<!DOCTYPE r [<!ENTITY l0 "ha">{laughs}]><robot name="&l11;"/>')
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(errors.UnreadableRobotFile, match=r"missing\.urdf: no such file; give the path"):
+        Robot.from_urdf(tmp_path / "missing.urdf")
+    (tmp_path / "arm.urdf").write_text(SMALL)
+    with pytest.raises(errors.UnreadableRobotFile, match=r"is a directory; .* It holds arm\.urdf"):
+        Robot.from_urdf(str(tmp_path))
+    (tmp_path / "arm.urdf").write_bytes(SMALL.replace("small", "größe").encode("latin-1"))
+    with pytest.raises(errors.UnreadableRobotFile, match=r"arm\.urdf: is not utf-8 text; save the URDF as UTF-8"):
+        Robot.from_urdf(tmp_path / "arm.urdf")
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
+def test_declared_encodings_are_read_and_written(encoding, tmp_path):
+    path, copy = tmp_path / "arm.urdf", tmp_path / "copy.urdf"
+    declared = f'<?xml version="1.0" encoding="{encoding.removesuffix("-sig")}"?>\n'
+    path.write_bytes((declared + SMALL.replace("small", "größe")).encode(encoding))
+    robot = Robot.from_urdf(path)
+    assert robot.name == "größe"
+    robot.to_urdf(copy)
+    assert copy.read_bytes() == path.read_bytes()
+
+
+def test_links_fixed_in_the_world_may_have_any_inertia():
+    inert = '<inertial><mass value="nan"/><inertia ixx="-1" ixy="0" ixz="0" iyy="0" iyz="0" izz="9"/></inertial>'
+    text = SMALL.replace('<link name="base"/>', f'<link name="base">{inert}</link>')
+    q = torch.ones(1, dtype=torch.float64)
+    assert torch.equal(Robot.from_urdf_text(text).mass_matrix(q), Robot.from_urdf_text(SMALL).mass_matrix(q))
+
+
+def test_locking_excuses_what_no_longer_moves():
+    text = TREE.replace('<axis xyz="0 0 -2"/>', '<axis xyz="0 0 -2"/><mimic joint="left_gripper"/>')
+    with pytest.raises(errors.UnsupportedJoint, match="second_finger"):
+        Robot.from_urdf_text(text)
+    assert "second_finger" not in Robot.from_urdf_text(text, locked={"second_finger": 0.0}).joint_names
+
+
+def test_rounding_of_an_ideal_plate_is_forgiven():
+    plate = SMALL.replace('ixx="0.1"', 'ixx="0.0333333"').replace('iyy="0.1"', 'iyy="0.0666667"')
+    assert Robot.from_urdf_text(plate).nv == 1
+    with pytest.raises(errors.NonPhysicalInertia):
+        Robot.from_urdf_text(plate.replace('"0.0666667"', '"0.0666600"'))
+
+
+def test_joints_may_stand_in_any_order_before_their_links():
+    head, *parts = re.split(r"(?=<joint|<link)", CHAIN.replace("</robot>", ""))
+    reordered = Robot.from_urdf_text(head + "".join(reversed(parts)) + "</robot>")
+    assert reordered.joint_names == Robot.from_urdf_text(CHAIN).joint_names
+    q = torch.tensor(np.random.default_rng(0).normal(size=4))
+    assert torch.equal(reordered.mass_matrix(q), Robot.from_urdf_text(CHAIN).mass_matrix(q))
+
+
+def test_parts_that_are_not_mechanics_are_ignored():
+    extra = """<gazebo><plugin name="p" filename="$(find x)"/></gazebo>
+      <transmission name="t"><joint name="hinge"><mechanicalReduction>1</mechanicalReduction></joint></transmission>
+      <material name="m"><color rgba="1 1 1 1"/></material></robot>"""
+    assert Robot.from_urdf_text(SMALL.replace("</robot>", extra)).nv == 1
+
+
+def test_relative_paths_and_strings_are_paths(tmp_path, monkeypatch):
+    (tmp_path / "arm.urdf").write_text(SMALL)
+    monkeypatch.chdir(tmp_path)
+    assert Robot.from_urdf("arm.urdf").source == "arm.urdf"
+    assert Robot.from_urdf(Path("arm.urdf")).nv == 1
