@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
+    from forcegp.evaluation import Evaluation, evaluate
     from forcegp.mechanics import (
         Actuation,
         Armature,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
     from forcegp.priors import JointForces
     from forcegp.robots import Robot
+    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
     __version__: str
 
@@ -46,12 +48,17 @@ __all__ = [
     "Armature",
     # what was measured
     "Dataset",
+    "KukaSurfaceConfig",
+    "simulate_kuka_surface",
     # what is unknown, and the model that learns it
     "JointForces",
     "Noise",
     "StructuredGP",
     "save_posterior",
     "load_posterior",
+    # how good it is
+    "evaluate",
+    "Evaluation",
 ]
 
 _ROOMS = {
@@ -61,6 +68,8 @@ _ROOMS = {
     "data": {"Dataset"},
     "priors": {"JointForces"},
     "models": {"StructuredGP", "Noise", "save_posterior", "load_posterior"},
+    "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
+    "evaluation": {"Evaluation", "evaluate"},
 }
 
 

@@ -38,6 +38,12 @@ MOST_POINTS_FOR_RESTARTS = 400
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
 
+
+def default_restarts(points: int) -> int:
+    """Starts of the search where none are asked for."""
+    return 4 if points <= MOST_POINTS_FOR_RESTARTS else 1
+
+
 FitProgress = Callable[[int, int, float], None]
 
 
@@ -102,8 +108,7 @@ class StructuredGP:
         """
         noise = self._resolved_noise(dataset)
         rows = self._training_rows(dataset, points)
-        if restarts is None:
-            restarts = 4 if len(rows) <= MOST_POINTS_FOR_RESTARTS else 1
+        restarts = default_restarts(len(rows)) if restarts is None else restarts
         if restarts < 1 or jobs < 1:
             raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
         training = TrainingData(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u, rows.a)))

@@ -1,0 +1,180 @@
+"""`forcegp demo`: simulate, learn, evaluate and draw, in one go."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
+
+from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.evaluate import draw, score
+from forcegp.cli.fit import fit, fit_summary
+from forcegp.cli.simulate import simulate
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import (
+    folder_written_whole,
+    holds_only_own_files,
+    require_free_folder,
+    write_config,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.evaluation import Evaluation
+    from forcegp.models import StructuredPosterior
+
+KIND = "forcegp demo"
+NOISE = 0.1  # rad/s^2, as in the paper
+
+MODELS = {"S-GP": ("s-gp", "zero"), "S-GP + analytical mean": ("s-gp-analytical-mean", "analytical")}
+"""Name in the paper -> (folder, mean)."""
+
+PUBLISHED_MAE = {
+    "S-GP": {100: 0.5856, 200: 0.2092, 400: 0.1193, 600: 0.1049, 800: 0.1006, 1000: 0.0977},
+    "S-GP + analytical mean": {100: 0.1051, 200: 0.0936, 400: 0.0868, 600: 0.0855, 800: 0.0847, 1000: 0.0844},
+}
+"""Mean absolute error against noisy accelerations by number of points (Rath, Geist, Trimpe 2021, figure 2b)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Command):
+    """A robot arm slides its tool on a surface, and a model learns the friction that nobody modelled.
+
+    Simulates a training and a test trajectory, fits the model of the paper (Rath, Geist, Trimpe 2021) without and with
+    its analytical mean, scores both on the other trajectory, draws pictures, and keeps everything in one folder.
+
+    For instance:
+      forcegp demo --out demo --points 100
+    """
+
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("demo")
+    """The folder to write. That of an earlier demo is replaced."""
+    seed: Annotated[int, arg(metavar="K")] = 1
+    """The training trajectory has seed K, the test trajectory K + 1."""
+    points: Annotated[int, arg(metavar="N")] = 100
+    """Training points."""
+    seconds: Annotated[float, arg(metavar="S")] = 60.0
+    """Length of each trajectory in s."""
+    iterations: Annotated[int, arg(metavar="N")] = 200
+    """Most iterations of each fit."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """Processes for the starts of each fit."""
+    overwrite: bool = False
+    """Replace an earlier demo's folder even if it holds other files, too."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """All four steps."""
+        replaceable = self.overwrite or holds_only_own_files(self.out, KIND)
+        require_free_folder(self.out, kind=KIND, overwrite=replaceable)
+        start = time.monotonic()
+        with folder_written_whole(self.out) as folder:
+            folder.mkdir()
+            train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
+            models, evaluations = {}, {}
+            for name, (place, mean) in MODELS.items():
+                models[name] = self._fitted(terminal, folder / place, train, name, mean)
+                evaluations[name] = score(terminal, models[name], test, f"predicting with {name}")
+            pictures = _draw_all(terminal, folder, models, test)
+            terminal.note(f"drew {', '.join(pictures)}")
+            results = self._results(models, evaluations, time.monotonic() - start)
+            write_json(folder / "results.json", results)
+            options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations")}
+            write_config(folder, KIND, {"options": options, "machine": results["machine"]})
+        self._show(terminal, evaluations, results["wall_seconds"])
+        return results
+
+    def _seeds(self) -> dict[str, int]:
+        return {"train": self.seed, "test": self.seed + 1}
+
+    def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> Dataset:
+        start = time.monotonic()
+        dataset = simulate(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
+        dataset.save(folder / f"{name}.h5")
+        terminal.note(f"simulated {name}: {len(dataset)} rows, seed {seed} ({time.monotonic() - start:.1f} s)")
+        return dataset
+
+    def _fitted(self, terminal: Terminal, run: Path, train: Dataset, name: str, mean: Any) -> StructuredPosterior:
+        from forcegp.inference import OptimizerOptions
+        from forcegp.models import StructuredGP, save_posterior
+
+        start = time.monotonic()
+        assert train.system is not None
+        posterior = fit(
+            terminal,
+            StructuredGP(train.system, mean=mean),
+            train,
+            name=f"fitting {name}",
+            points=min(self.points, len(train)),
+            restarts=None,
+            seed=0,
+            jobs=self.jobs,
+            options=OptimizerOptions(iterations=self.iterations),
+        )
+        save_posterior(posterior, run)
+        iterations = len(posterior.result.history) - 1
+        terminal.note(f"fitted {name}: {iterations} iterations ({time.monotonic() - start:.1f} s)")
+        return posterior
+
+    def _results(
+        self,
+        models: Mapping[str, StructuredPosterior],
+        evaluations: Mapping[str, Evaluation],
+        wall_seconds: float,
+    ) -> dict[str, Any]:
+        return {
+            "out": str(self.out),
+            "seeds": self._seeds(),
+            "seconds": self.seconds,
+            "points": self.points,
+            "models": {
+                name: {
+                    "run": str(self.out / MODELS[name][0]),
+                    "fit": fit_summary(models[name], models[name].result.cpu_seconds),
+                    "evaluation": evaluations[name].to_dict(),
+                    "published_mae": PUBLISHED_MAE[name].get(self.points),
+                }
+                for name in models
+            },
+            "machine": {"system": platform.platform(), "cores": os.cpu_count(), "python": platform.python_version()},
+            "wall_seconds": wall_seconds,
+        }
+
+    def _show(self, terminal: Terminal, evaluations: Mapping[str, Evaluation], wall_seconds: float) -> None:
+        from forcegp.cli.tables import NONE, columns, nats, number, percent
+
+        header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
+        rows = []
+        for name, evaluation in evaluations.items():
+            published = number(PUBLISHED_MAE[name].get(self.points))
+            errors = [number(evaluation.mae), published, number(evaluation.mae_noise_free), number(evaluation.rmse)]
+            calibration = [nats(evaluation.nlpd), percent(evaluation.coverage_95)]
+            rows.append([name, *errors, *calibration, number(evaluation.constraint_error)])
+        first = next(iter(evaluations.values()))
+        known = [number(first.known_physics_mae), NONE, number(first.known_physics_mae_noise_free)]
+        rows.insert(0, ["known physics alone", *known, *[NONE] * 4])
+        rows.append(["noise floor", number(first.noise_floor), NONE, number(0.0), *[NONE] * 4])
+        title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
+        terminal.say(
+            columns(title, header, rows),
+            f"{self.out}/summary.png shows it; results.json, models and data lie beside it ({wall_seconds:.0f} s).",
+        )
+
+
+def _draw_all(terminal: Terminal, folder: Path, models: Mapping[str, StructuredPosterior], test: Dataset) -> list[str]:
+    from forcegp.evaluation import likelihood_figure, save_figure
+
+    pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
+    save_figure(
+        likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
+        folder / "likelihood.png",
+    )
+    return pictures

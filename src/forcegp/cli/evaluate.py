@@ -1,0 +1,127 @@
+"""`forcegp evaluate`: score a fitted model on a dataset that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.evaluation import Evaluation
+    from forcegp.models import StructuredPosterior
+
+KIND = "forcegp evaluate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Command):
+    """Score a fitted model on a dataset that it has not seen: errors, likelihood, coverage, constraint error.
+
+    For instance:
+      forcegp evaluate run test.h5 --plots figures
+      forcegp evaluate run test.h5 --json | jq .mae
+    """
+
+    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder that `forcegp fit --out` wrote."""
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """The dataset to predict (HDF5)."""
+    every: Annotated[int, arg(metavar="K")] = 1
+    """Take every K-th row only."""
+    plots: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: no plots)")] = None
+    """Also draw predictions, tool path and training into this folder, with the scores as evaluation.json."""
+    overwrite: bool = False
+    """Replace the folder of plots if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Evaluate, draw if asked to, and show."""
+        if self.every < 1:
+            raise InvalidInput(f"--every is {self.every}; it must be at least 1.")
+        if self.plots is not None:
+            require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
+        from forcegp.data import Dataset
+        from forcegp.models import load_posterior
+
+        posterior = load_posterior(self.run_folder)
+        dataset = Dataset.load(self.data).rows(slice(None, None, self.every))
+        evaluation = score(terminal, posterior, dataset)
+        scores = {
+            "run": str(self.run_folder),
+            "data": str(self.data),
+            "every": self.every,
+            "points": len(posterior.likelihood.training.q),
+            "mean": posterior.model.mean,
+            **evaluation.to_dict(),
+        }
+        if self.plots is not None:
+            with folder_written_whole(self.plots) as folder:
+                folder.mkdir()
+                draw(terminal, folder, posterior, dataset)
+                write_json(folder / "evaluation.json", scores)
+                write_config(folder, KIND, {"options": {name: scores[name] for name in ("run", "data", "every")}})
+            terminal.note(f"plots: {self.plots}")
+        terminal.say(*_report(posterior, evaluation, self.data))
+        return scores
+
+
+def score(terminal: Terminal, posterior: StructuredPosterior, dataset: Dataset, name: str = "predicting") -> Evaluation:
+    """`forcegp.evaluation.evaluate` with a progress bar; warnings go to stderr."""
+    from forcegp.evaluation import evaluate
+
+    with terminal.progress(f"{name}: {len(dataset)} rows") as report:
+        evaluation = evaluate(posterior, dataset, progress=report)
+    for warning in evaluation.warnings:
+        terminal.warn(warning)
+    return evaluation
+
+
+def draw(terminal: Terminal, folder: Path, posterior: StructuredPosterior, dataset: Dataset) -> list[str]:
+    """Write every plot that these data allow to `folder`; returns the names of the files."""
+    from forcegp.evaluation import (
+        likelihood_figure,
+        prediction_figure,
+        save_figure,
+        summary_figure,
+        tool_path_figure,
+    )
+
+    figures = {
+        "prediction.png": lambda: prediction_figure(posterior, dataset),
+        "likelihood.png": lambda: likelihood_figure({f"{posterior.model.mean} mean": posterior.result.history}),
+    }
+    if posterior.system.contacts:
+        figures["tool_path.png"] = lambda: tool_path_figure(posterior, dataset)
+        figures["summary.png"] = lambda: summary_figure(posterior, dataset)
+    with terminal.progress("drawing") as report:
+        for done, (name, figure) in enumerate(figures.items()):
+            report(done, len(figures), name)
+            save_figure(figure(), folder / name)
+    return list(figures)
+
+
+def _report(posterior: StructuredPosterior, evaluation: Evaluation, data: Path) -> list[Any]:
+    from forcegp.cli.tables import evaluation_table, facts, number
+
+    points = len(posterior.likelihood.training.q)
+    title = f"{points} training points, {posterior.model.mean} mean; {evaluation.rows} rows of {data}"
+    floor = "" if evaluation.noise_floor is None else f" (a perfect model has {number(evaluation.noise_floor)})"
+    values = {
+        "MAE": f"{number(evaluation.mae)}{floor}",
+        "known physics alone": f"{number(evaluation.known_physics_mae)}",
+        "constraint error |A a - b|": f"mean {number(evaluation.constraint_error)}, "
+        f"largest {number(evaluation.constraint_error_max)}",
+    }
+    if evaluation.force_mae is not None:
+        values["force that moves the robot"] = f"MAE {number(evaluation.force_mae)} against the truth"
+    return [evaluation_table(title, evaluation), facts("", values)]

@@ -1,0 +1,244 @@
+"""`forcegp fit`: learn the unknown forces from a dataset and write the model to a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.inference import OptimizerOptions
+    from forcegp.mechanics import MechanicalSystem
+    from forcegp.models import Noise, StructuredPosterior
+
+KIND = "forcegp fit"
+START_NOISE = 0.1
+"""Where learning the noise starts if the dataset does not state it, in rad/s^2 or m/s^2."""
+
+KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Command):
+    """Learn the unknown forces from a dataset, and write the model to a folder.
+
+    The dataset carries its robot and contacts, so nothing else is needed; --robot, --contact and --known-force
+    override it.
+
+    For instance:
+      forcegp fit train.h5 --points 100 --out run
+      forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
+    """
+
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """The dataset to learn from (HDF5)."""
+    out: Annotated[Path, arg(metavar="RUN")]
+    """The folder to write."""
+    points: Annotated[int, arg(metavar="N")] = 200
+    """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
+    mean: Literal["analytical", "zero"] = "analytical"
+    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
+    prior: Literal["joint"] = "joint"
+    """joint: one Gaussian process per joint force, on (q, v, u)."""
+    noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
+    """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
+    restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
+    """Starts of the search; the best is kept."""
+    seed: Annotated[int, arg(metavar="K")] = 0
+    """Draws the starts of the search after the first."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """Processes for the restarts."""
+    iterations: Annotated[int, arg(metavar="N")] = 200
+    """Most L-BFGS iterations of each start."""
+    adam_steps: Annotated[int, arg(metavar="N")] = 0
+    """Adam steps before them."""
+    hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
+    robot: Annotated[Path | None, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
+    """Use this robot instead of the dataset's."""
+    contact: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: the dataset's)"),
+    ] = ()
+    """A point that stays on a surface, instead of the dataset's contacts; m, in the axes of the link FRAME.
+    SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
+    none is no contact at all."""
+    known_force: Annotated[
+        UseAppendAction[tuple[KnownForceName, ...]],
+        arg(metavar="NAME", help_behavior_hint="(repeatable; default: the dataset's)"),
+    ] = ()
+    """The complete list of known forces, instead of the dataset's: actuation, rigid-body-bias,
+    viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Fit and save."""
+        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        from forcegp.data import Dataset
+        from forcegp.inference import OptimizerOptions
+        from forcegp.models import StructuredGP
+
+        start = time.monotonic()
+        dataset = Dataset.load(self.data)
+        system = self._system(dataset)
+        model = StructuredGP(system, mean=self.mean, noise=resolved_noise(self.noise, dataset))
+        options = OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps)
+        points = min(self.points, len(dataset))
+        posterior = fit(
+            terminal,
+            model,
+            dataset,
+            points=points,
+            restarts=self.restarts,
+            seed=self.seed,
+            jobs=self.jobs,
+            hyperprior=self.hyperprior,
+            options=options,
+        )
+        summary = fit_summary(posterior, time.monotonic() - start)
+        with folder_written_whole(self.out) as folder:
+            self._write(folder, posterior)
+        terminal.say(*_report(self.out, summary))
+        return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
+
+    def _system(self, dataset: Dataset) -> MechanicalSystem:
+        """What is known: the dataset's own system, with what the options replace."""
+        from forcegp.mechanics import MechanicalSystem
+        from forcegp.robots import Robot
+
+        contacts = parse_contacts(self.contact)
+        system = dataset.system
+        if self.robot is not None:
+            gravity = (0.0, 0.0, -9.81) if system is None else system.robot.gravity.tolist()
+            robot = Robot.from_urdf(self.robot, gravity=gravity)
+            if robot.joint_names != tuple(dataset.joint_names):
+                raise InvalidInput(
+                    f"{self.robot} has joints {', '.join(robot.joint_names)}; {self.data} has "
+                    f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
+                )
+            system = MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        if system is None:
+            raise InvalidInput(
+                f"{self.data} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
+            )
+        if self.contact:
+            system = system.with_contacts(contacts)
+        if self.known_force:
+            system = _with_known_forces(system, self.known_force)
+        return system
+
+    def _write(self, folder: Path, posterior: StructuredPosterior) -> None:
+        from forcegp.models import save_posterior
+
+        save_posterior(posterior, folder)
+        options = {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+            if name not in ("json", "debug", "overwrite")
+        }
+        data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
+        write_config(folder, KIND, {"options": options, "data": data, "resolved": dict(posterior.settings)})
+
+
+def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> StructuredPosterior:
+    """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
+    from forcegp.models.structured_gp import default_restarts
+
+    options: OptimizerOptions = how["options"]
+    restarts = default_restarts(how["points"]) if how["restarts"] is None else how["restarts"]
+    steps = options.iterations + options.adam_steps
+    with terminal.progress(f"{name}: {how['points']} points") as report:
+
+        def progress(restart: int, iteration: int, value: float) -> None:
+            start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
+            note = f"{start}iteration {iteration}, objective {value:.1f}"
+            report(restart * steps + min(iteration, steps), restarts * steps, note)
+
+        return model.fit(dataset, **how, progress=progress if how["jobs"] == 1 else None)
+
+
+def resolved_noise(given: str, dataset: Dataset) -> Noise | None:
+    """The model's noise for `learned`, `dataset` or a number. Raises InvalidInput for anything else."""
+    from forcegp.models import Noise
+
+    stated = None if dataset.noise_std is None else tuple(float(std) for std in dataset.noise_std)
+    if given == "learned":
+        return Noise(stated or START_NOISE, learn=True)
+    if given == "dataset":
+        if stated is None:
+            raise InvalidInput(
+                "the dataset does not state its noise; add --noise learned, or --noise SIGMA if it is known."
+            )
+        return None
+    try:
+        sigma = float(given)
+    except ValueError:
+        raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
+    return Noise(sigma)
+
+
+def fit_summary(posterior: StructuredPosterior, wall_seconds: float) -> dict[str, Any]:
+    """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
+    result = posterior.result
+    return {
+        "points": len(posterior.likelihood.training.q),
+        "mean": posterior.model.mean,
+        "objective_start": result.history[0],
+        "objective": result.value,
+        "nll": posterior.negative_log_likelihood,
+        "iterations": len(result.history) - 1,
+        "evaluations": result.evaluations,
+        "converged": result.converged,
+        "status": result.status,
+        "noise_std": posterior.noise_std.tolist(),
+        "cpu_seconds": result.cpu_seconds,
+        "wall_seconds": wall_seconds,
+    }
+
+
+def _with_known_forces(system: MechanicalSystem, names: tuple[str, ...]) -> MechanicalSystem:
+    from dataclasses import replace
+
+    from forcegp.mechanics import Actuation, CoulombJointFriction, RigidBodyBias, ViscousJointFriction
+
+    made = {
+        "actuation": lambda: Actuation(),
+        "rigid-body-bias": lambda: RigidBodyBias(),
+        "viscous-joint-friction": lambda: ViscousJointFriction.from_robot(system.robot),
+        "coulomb-joint-friction": lambda: CoulombJointFriction.from_robot(system.robot),
+    }
+    return replace(system, known_forces=tuple(made[name]() for name in dict.fromkeys(names)))
+
+
+def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
+    from forcegp.cli.tables import facts
+
+    noise = summary["noise_std"]
+    shown = f"{noise[0]:.4g}" if len(set(noise)) == 1 else " ".join(f"{std:.3g}" for std in noise)
+    table = facts(
+        f"{run}: learned from {summary['points']} points",
+        {
+            "objective": f"{summary['objective_start']:.1f} → {summary['objective']:.1f} nats",
+            "negative log likelihood": f"{summary['nll']:.1f} nats",
+            "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
+            "search": "converged" if summary["converged"] else f"not converged: {summary['status']}",
+            "noise": f"{shown} (standard deviation)",
+            "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
+        },
+    )
+    return [table, f"Next: forcegp evaluate {run} TEST.h5"]

@@ -1,0 +1,83 @@
+"""Tables for people: aligned, with units, readable at 80 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from forcegp.evaluation import Evaluation
+
+
+NONE = "–"
+
+
+def facts(title: str, values: Mapping[str, str]) -> Table:
+    """Names and values, one per line."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, show_header=False, pad_edge=False)
+    table.add_column(style="dim")
+    table.add_column()
+    for name, value in values.items():
+        table.add_row(name, Text(value))
+    return table
+
+
+def columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, last: Sequence[str] = ()) -> Table:
+    """A table whose first column is text and whose others are numbers; `last` is set apart below."""
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    for place, name in enumerate(header):
+        table.add_column(name, justify="right" if place else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    if last:
+        table.add_section()
+        table.add_row(*last, style="bold")
+    return table
+
+
+def evaluation_table(title: str, evaluation: Evaluation) -> Table:
+    """One line per joint and their mean."""
+    header = ["joint", "MAE", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "MAE, known\nphysics"]
+    formats = {
+        "mae": number,
+        "mae_noise_free": number,
+        "rmse": number,
+        "nlpd": nats,
+        "coverage_95": percent,
+        "known_physics_mae": number,
+    }
+    rows = []
+    for joint, name in enumerate(evaluation.joint_names):
+        each = {score: getattr(evaluation, f"{score}_per_joint") for score in formats}
+        cells = [show(None if each[score] is None else each[score][joint]) for score, show in formats.items()]
+        rows.append([name, *cells])
+    means = [show(getattr(evaluation, score)) for score, show in formats.items()]
+    return columns(title, header, rows, last=["mean (NLPD: joint)", *means])
+
+
+def number(value: float | None) -> str:
+    """Four decimals for numbers of ordinary size, a power of ten for others, a dash for none."""
+    if value is None:
+        return NONE
+    return f"{value:.4f}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.0e}"
+
+
+def nats(value: float | None) -> str:
+    """Two decimals: differences below a hundredth of a nat tell nothing."""
+    return NONE if value is None else f"{value:.2f}"
+
+
+def percent(value: float | None) -> str:
+    """`94.6 %`."""
+    return NONE if value is None else f"{100.0 * value:.1f} %"

@@ -1,0 +1,143 @@
+"""Where a command speaks: results on stdout, everything else on stderr; with --json, only JSON on stdout."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+
+PLAIN_SECONDS = 10.0
+"""Between two lines about progress where there is no terminal to draw a bar on."""
+
+
+class Report(Protocol):
+    """Called as `report(done, total)`, if wished with a note for people."""
+
+    def __call__(self, done: int, total: int, note: str = "") -> None:  # noqa: D102
+        ...
+
+
+class Terminal:
+    """A context in which a command runs.
+
+    With `json`, the process's stdout is pointed at stderr until the result is printed, so that nothing a library prints
+    (not even from C) can stand before or after the one JSON object. It stays there: C prints when the process ends.
+    """
+
+    def __init__(self, *, json: bool) -> None:
+        self.json = json
+        self._stdout: int | None = None
+
+    # rich is imported when something is shown, so that --help and errors come at once
+
+    @cached_property
+    def out(self) -> Console:
+        """What the command found."""
+        from rich.console import Console
+
+        return Console(highlight=False, soft_wrap=False)
+
+    @cached_property
+    def err(self) -> Console:
+        """What happens meanwhile."""
+        from rich.console import Console
+
+        return Console(stderr=True, highlight=False, soft_wrap=True)
+
+    def __enter__(self) -> Terminal:
+        if self.json:
+            sys.stdout.flush()
+            self._stdout = os.dup(1)
+            os.dup2(2, 1)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._stdout is not None:
+            os.close(self._stdout)
+            self._stdout = None
+
+    def result(self, value: Mapping[str, Any]) -> None:
+        """Print the result of the command as one JSON object, if that was asked for."""
+        if self._stdout is not None:
+            sys.stdout.flush()
+            text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+            with os.fdopen(os.dup(self._stdout), "w", encoding="utf-8") as stdout:
+                stdout.write(text)
+
+    def say(self, *renderables: RenderableType) -> None:
+        """Show people the result; silent with --json."""
+        if not self.json:
+            for renderable in renderables:
+                self.out.print(renderable)
+
+    def note(self, text: str) -> None:
+        """Tell people on stderr what was done."""
+        self.err.print(text, style="dim", markup=False)
+
+    def warn(self, text: str) -> None:
+        """Warn people on stderr."""
+        self.err.print(f"warning: {' '.join(text.split())}", style="yellow", markup=False)
+
+    @contextmanager
+    def progress(self, what: str) -> Iterator[Report]:
+        """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
+        if self.err.is_terminal:
+            yield from self._bar(what)
+        else:
+            yield _PlainProgress(self, what).report
+
+    def _bar(self, what: str) -> Iterator[Report]:
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=30),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[remaining]}{task.fields[note]}"),
+        )
+        with Progress(*columns, console=self.err, transient=True) as bars:
+            task = bars.add_task(what, total=None, note="", remaining="")
+            start = time.monotonic()
+
+            def report(done: int, total: int, note: str = "") -> None:
+                remaining = _remaining(time.monotonic() - start, done, total)
+                bars.update(task, completed=done, total=total, note=note and f"  {note}", remaining=remaining)
+
+            yield report
+
+
+class _PlainProgress:
+    """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
+
+    def __init__(self, terminal: Terminal, what: str) -> None:
+        self.terminal = terminal
+        self.what = what
+        self.start = self.spoke = time.monotonic()
+
+    def report(self, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        if now - self.spoke < PLAIN_SECONDS or done >= total:
+            return
+        self.spoke = now
+        parts = [f"{done / total:.0%}", _remaining(now - self.start, done, total), note]
+        self.terminal.note(f"{self.what}: {', '.join(part for part in parts if part)}")
+
+
+def _remaining(elapsed: float, done: int, total: int) -> str:
+    """`12 s left`: at the speed so far, at most."""
+    if not 0 < done < total or elapsed < 1.0:
+        return ""
+    seconds = elapsed * (total - done) / done
+    return f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"

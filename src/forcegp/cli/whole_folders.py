@@ -1,0 +1,96 @@
+"""Folders that are written whole or not at all, and never over what forcegp did not write."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from forcegp.errors import InvalidInput
+
+CONFIG = "config.json"
+LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
+
+
+def require_free_file(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file that exists, or whose folder does not, before any work is done. Raises InvalidInput."""
+    if path.is_dir():
+        raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
+    if path.exists() and not overwrite:
+        raise InvalidInput(f"{path} exists already; choose another name for --out, or add --overwrite.")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
+
+
+def require_free_folder(path: Path, *, kind: str, overwrite: bool) -> None:
+    """Refuse a path that exists, unless it is an empty folder, or one that forcegp wrote and --overwrite is given.
+
+    Raises InvalidInput before any work is done.
+    """
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not path.is_dir() or not _written_by_forcegp(path, kind):
+        raise InvalidInput(
+            f"{path} exists and was not written by `{kind}`, so it is not overwritten; choose another name."
+        )
+    if not overwrite:
+        raise InvalidInput(f"{path} exists already; choose another name for --out, or add --overwrite.")
+
+
+def holds_only_own_files(path: Path, kind: str) -> bool:
+    """Is this a folder that `kind` wrote and nobody added anything to?"""
+    if not _written_by_forcegp(path, kind):
+        return False
+    listed = set(_config(path).get("files", ()))
+    return {str(file.relative_to(path)) for file in path.rglob("*") if file.is_file()} <= listed
+
+
+@contextmanager
+def folder_written_whole(path: Path) -> Iterator[Path]:
+    """A path beside `path` to write a folder at: it takes the place of `path` at the end, and vanishes on failure."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield temporary
+        if path.exists():
+            old = temporary.with_suffix(".old")
+            os.replace(path, old)
+            os.replace(temporary, path)
+            shutil.rmtree(old)
+        else:
+            os.replace(temporary, path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def write_config(folder: Path, kind: str, content: Mapping[str, Any]) -> None:
+    """`config.json`: what is needed to do it again, with versions and the list of files, which must be there by now."""
+    files = sorted([CONFIG, *(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())])
+    from importlib.metadata import version
+
+    versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+    write_json(folder / CONFIG, {"kind": kind, **content, "versions": versions, "files": files})
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Readable JSON; the file lies in a folder that is being written whole."""
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _written_by_forcegp(path: Path, kind: str) -> bool:
+    return _config(path).get("kind") == kind
+
+
+def _config(path: Path) -> dict[str, Any]:
+    try:
+        config = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return config if isinstance(config, dict) else {}

@@ -1,0 +1,91 @@
+"""Scores of predictions, as plain functions of arrays: rows first, one column per joint (or contact)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import solve_triangular
+from scipy.special import ndtri
+
+from forcegp.errors import InvalidInput, NumericalError
+
+LOG_2_PI = float(np.log(2.0 * np.pi))
+
+
+def mean_absolute_error(
+    predicted: Float[np.ndarray, "rows k"], target: Float[np.ndarray, "rows k"]
+) -> Float[np.ndarray, " k"]:
+    """Mean of |predicted - target| over the rows, in the units of the columns."""
+    return np.abs(predicted - target).mean(axis=0)
+
+
+def root_mean_square_error(
+    predicted: Float[np.ndarray, "rows k"], target: Float[np.ndarray, "rows k"]
+) -> Float[np.ndarray, " k"]:
+    """Root of the mean of (predicted - target)^2 over the rows, in the units of the columns."""
+    return np.sqrt(np.square(predicted - target).mean(axis=0))
+
+
+def negative_log_density(
+    mean: Float[np.ndarray, "rows k"], covariance: Float[np.ndarray, "rows k k"], target: Float[np.ndarray, "rows k"]
+) -> Float[np.ndarray, " rows"]:
+    """-log N(target; mean, covariance) of every row, all columns jointly, in nats.
+
+    1/2 r^T S^-1 r + 1/2 log|S| + k/2 log 2 pi (Rasmussen & Williams 2006, eq. A.23). Its mean over test rows is the
+    negative log predictive density. Raises NumericalError, naming the row, for a covariance that is not positive
+    definite: that of a measurement always is, that of a constrained acceleration without noise never.
+    """
+    try:
+        lower = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        row = int(np.argmin(np.linalg.eigvalsh(covariance)[:, 0]))
+        raise NumericalError(
+            f"the predicted covariance of row {row} is not positive definite, so it has no density; "
+            "add the covariance of the measurement noise."
+        ) from None
+    white = solve_triangular(lower, (target - mean)[..., None], lower=True)[..., 0]
+    log_determinant = 2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
+    return 0.5 * (np.square(white).sum(axis=-1) + log_determinant + mean.shape[-1] * LOG_2_PI)
+
+
+def marginal_negative_log_density(
+    mean: Float[np.ndarray, "rows k"], variance: Float[np.ndarray, "rows k"], target: Float[np.ndarray, "rows k"]
+) -> Float[np.ndarray, " k"]:
+    """Mean over the rows of -log N(target; mean, variance) of each column alone, in nats."""
+    if not (variance > 0).all():
+        raise NumericalError("a predicted variance is not positive, so it has no density; add that of the noise.")
+    return (0.5 * (np.square(target - mean) / variance + np.log(variance) + LOG_2_PI)).mean(axis=0)
+
+
+def interval_coverage(
+    mean: Float[np.ndarray, "rows k"],
+    variance: Float[np.ndarray, "rows k"],
+    target: Float[np.ndarray, "rows k"],
+    level: float = 0.95,
+) -> Float[np.ndarray, " k"]:
+    """Share of targets inside the central `level` interval of each column: about `level` if the variance is right.
+
+    `variance` must be that of `target`: with measurement noise for measured values, without for noise-free ones.
+    """
+    if not 0.0 < level < 1.0:
+        raise InvalidInput(f"level is {level}; it must be between 0 and 1, for example 0.95.")
+    return (np.abs(target - mean) <= ndtri(0.5 + 0.5 * level) * np.sqrt(variance)).mean(axis=0)
+
+
+def constraint_residual(
+    A: Float[np.ndarray, "rows m nv"], b: Float[np.ndarray, "rows m"], a: Float[np.ndarray, "rows nv"]
+) -> Float[np.ndarray, "rows m"]:
+    """A a - b of every row and contact [m/s^2 for surfaces that are signed distances]."""
+    return (A @ a[..., None])[..., 0] - b
+
+
+def joint_space_residual(
+    A: Float[np.ndarray, "rows m nv"], residual: Float[np.ndarray, "rows m"]
+) -> Float[np.ndarray, "rows nv"]:
+    """A^+ (A a - b): the smallest change of the acceleration that would meet the constraint, per joint."""
+    return (np.linalg.pinv(A) @ residual[..., None])[..., 0] if A.shape[-2] else np.zeros((len(A), A.shape[-1]))
+
+
+def noise_floor(noise_std: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """Mean absolute error of a perfect prediction against targets with Gaussian noise: std sqrt(2 / pi)."""
+    return noise_std * np.sqrt(2.0 / np.pi)

@@ -1,0 +1,52 @@
+"""Is a model tested on what it was trained on? Sentences that say so."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Int
+
+from forcegp.data import Dataset
+from forcegp.models import StructuredPosterior
+
+
+def overlap_warnings(posterior: StructuredPosterior, dataset: Dataset) -> tuple[str, ...]:
+    """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
+    return tuple(_warnings(posterior, dataset))
+
+
+def shared_rows(posterior: StructuredPosterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
+    """Numbers of the rows of `dataset` whose (q, v, u) is exactly that of a training point."""
+    training = posterior.likelihood.training
+    trained = {row.tobytes() for row in _inputs(*(getattr(training, name).cpu().numpy() for name in ("q", "v", "u")))}
+    rows = _inputs(dataset.q, dataset.v, dataset.u)
+    return np.array([number for number, row in enumerate(rows) if row.tobytes() in trained], dtype=np.int64)
+
+
+def _warnings(posterior: StructuredPosterior, dataset: Dataset) -> Iterator[str]:
+    repeated = shared_rows(posterior, dataset)
+    if repeated.size:
+        yield (
+            f"{repeated.size} of {len(dataset)} test rows are also training rows (the first: row {repeated[0]}), "
+            "so these scores flatter the model; test on another trajectory."
+        )
+    else:
+        source = posterior.settings.get("data") or {}
+        metadata = json.loads(json.dumps(dataset.metadata))
+        shared = sorted(set(source.get("episodes", ())) & set(dataset.episodes))
+        if metadata and shared and json.loads(json.dumps(source.get("metadata"))) == metadata:
+            yield (
+                f"training and test rows come from the same recording (equal metadata, episodes {shared} in both), "
+                "so these scores flatter the model; test on another trajectory."
+            )
+    own, model = dataset.system, posterior.system
+    if own is not None and (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte):
+        yield (
+            "the contacts of the model are not those of the data; the constraint error is measured on those of the data"
+        )
+
+
+def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return np.hstack([q, v, u]) + 0.0  # + 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes

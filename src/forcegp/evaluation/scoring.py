@@ -1,0 +1,100 @@
+"""`evaluate`: predict every row of a Dataset with a fitted model and score it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.evaluation import metrics
+from forcegp.evaluation.evaluation import Evaluation, Numbers
+from forcegp.evaluation.overlap import overlap_warnings
+from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
+from forcegp.models import StructuredPosterior
+
+
+def evaluate(
+    posterior: StructuredPosterior, dataset: Dataset, *, progress: Callable[[int, int], None] | None = None
+) -> Evaluation:
+    """Predict every row of `dataset` and compare; `progress(rows done, rows in total)` is called now and then.
+
+    Raises InvalidInput if the joints of model and Dataset differ.
+    """
+    if tuple(dataset.joint_names) != posterior.joint_names:
+        raise InvalidInput(
+            f"the dataset has joints {', '.join(dataset.joint_names)}; the model was trained on "
+            f"{', '.join(posterior.joint_names)}. Evaluate on data of the same robot."
+        )
+    predicted = predict_rows(posterior, dataset, progress)
+    return Evaluation(
+        rows=len(dataset),
+        joint_names=posterior.joint_names,
+        noise_std_per_joint=_numbers(posterior.noise_std.detach().cpu().numpy()),
+        noise_floor_per_joint=None
+        if dataset.noise_std is None
+        else _numbers(metrics.noise_floor(np.asarray(dataset.noise_std))),
+        known_physics_mae_per_joint=_numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
+        warnings=overlap_warnings(posterior, dataset),
+        **_against_measurements(predicted, dataset),
+        **_against_truth(predicted, dataset),
+        **_constraint(predicted),
+    )
+
+
+def _against_measurements(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]:
+    measurement = predicted.measurement_variance
+    return {
+        "mae_per_joint": _numbers(metrics.mean_absolute_error(predicted.mean, dataset.a)),
+        "rmse_per_joint": _numbers(metrics.root_mean_square_error(predicted.mean, dataset.a)),
+        "nlpd": float(predicted.negative_log_density.mean()),
+        "nlpd_per_joint": _numbers(metrics.marginal_negative_log_density(predicted.mean, measurement, dataset.a)),
+        "coverage_95_per_joint": _numbers(metrics.interval_coverage(predicted.mean, measurement, dataset.a)),
+    }
+
+
+def _against_truth(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    if "a" in dataset.truth:
+        a = dataset.truth["a"]
+        force_error = (predicted.mass @ (predicted.mean - a)[..., None])[..., 0]
+        out["mae_noise_free_per_joint"] = _numbers(metrics.mean_absolute_error(predicted.mean, a))
+        out["rmse_noise_free_per_joint"] = _numbers(metrics.root_mean_square_error(predicted.mean, a))
+        out["coverage_95_noise_free_per_joint"] = _numbers(
+            metrics.interval_coverage(predicted.mean, predicted.variance, a)
+        )
+        out["known_physics_mae_noise_free_per_joint"] = _numbers(
+            metrics.mean_absolute_error(predicted.known_physics, a)
+        )
+        out["force_mae_per_joint"] = _numbers(np.abs(force_error).mean(axis=0))
+    if "Q_U" in dataset.truth:
+        truth = dataset.truth["Q_U"] + predicted.carried_known_force
+        out |= _forces("unknown_force", "_per_joint", predicted.unknown_force, predicted.unknown_force_variance, truth)
+    if "lambda" in dataset.truth and dataset.truth["lambda"].shape == predicted.multiplier.shape:
+        truth = dataset.truth["lambda"]
+        out |= _forces("multiplier", "_per_contact", predicted.multiplier, predicted.multiplier_variance, truth)
+    return out
+
+
+def _forces(name: str, per: str, mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -> dict[str, Numbers]:
+    return {
+        f"{name}_mae{per}": _numbers(metrics.mean_absolute_error(mean, truth)),
+        f"{name}_rmse{per}": _numbers(metrics.root_mean_square_error(mean, truth)),
+        f"{name}_coverage_95{per}": _numbers(metrics.interval_coverage(mean, variance, truth)),
+    }
+
+
+def _constraint(predicted: PredictedRows) -> dict[str, Any]:
+    residual = metrics.constraint_residual(predicted.A, predicted.b, predicted.mean)
+    per_joint = metrics.joint_space_residual(predicted.A, residual)
+    return {
+        "constraint_error_per_contact": _numbers(np.abs(residual).mean(axis=0)),
+        "constraint_error_per_joint": _numbers(np.abs(per_joint).mean(axis=0)),
+        "constraint_error_max": float(np.abs(residual).max(initial=0.0)),
+    }
+
+
+def _numbers(values: np.ndarray) -> Numbers:
+    return tuple(float(value) for value in values)
