@@ -9,7 +9,7 @@ from tests.inference.problems import normal
 
 from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import cholesky
-from forcegp.inference.cholesky import JITTER_LADDER, factorize
+from forcegp.inference.cholesky import factorize
 
 
 @pytest.fixture(params=["LAPACK", "torch"])
@@ -70,7 +70,7 @@ def test_factor_and_inverse_live_in_the_memory_of_the_matrix():
 
 
 @pytest.mark.usefixtures("route")
-@pytest.mark.parametrize("relative", JITTER_LADDER[1:])
+@pytest.mark.parametrize("relative", [1e-12, 1e-10, 1e-8])
 def test_the_smallest_sufficient_jitter_is_added_and_reported(relative):
     """A matrix whose smallest eigenvalue is -relative / 3 of its mean diagonal."""
     basis = torch.linalg.qr(normal(5, 5)).Q

@@ -111,6 +111,13 @@ def test_duplicate_points_are_perfectly_correlated():
     assert torch.linalg.eigvalsh(K)[0] > -1e-13
 
 
+def test_the_variance_of_a_point_is_the_output_scale_to_the_last_bit():
+    """Rounding of |z_i - z_i|^2 would make it smaller."""
+    kernel = scaled_rbf(3)
+    K = kernel_matrix(kernel, 1e3 * normal(30, 3))
+    assert torch.equal(K.diagonal(), kernel.outputscale.expand(30))
+
+
 @pytest.mark.parametrize("shift", [1e3, 1e6])
 def test_features_far_from_zero_lose_nothing(shift):
     """Differences alone count, so neither values nor gradients may cancel; the rounding of the shift itself remains."""
