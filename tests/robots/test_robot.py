@@ -159,6 +159,9 @@ def test_robot_is_immutable_and_survives_pickling(chain):
     chain.gravity.zero_()
     assert chain.gravity.tolist() == [0.0, 0.0, -9.81]
     q = torch.ones(4, dtype=torch.float64)
+    # nothing of a transform that ran before stays in the robot
+    wrist = chain.inertial_parameters("wrist")["wrist"]
+    torch.func.hessian(lambda p: chain.mass_matrix(q, {"wrist": p}).sum())(wrist)
     assert torch.equal(pickle.loads(pickle.dumps(chain)).mass_matrix(q), chain.mass_matrix(q))
 
 
@@ -317,6 +320,8 @@ def test_wrong_batches_points_and_parameters(chain):
         chain.mass_matrix(two, {"wrist": torch.zeros(9, dtype=torch.float64)})
     with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] has shape \(2, 10\); a robot holds one set"):
         chain.with_inertials({"wrist": torch.zeros(2, 10, dtype=torch.float64)})
+    with pytest.raises(InvalidInput, match="inertials is a list; give a mapping from link names"):
+        chain.mass_matrix(two, [zeros[0]])
     with pytest.raises(InvalidInput, match=r"point is .* give 3 finite numbers"):
         chain.frame_jacobian(two, "tool", (1.0, 2.0))
     with pytest.raises(InvalidInput, match=r"point has shape \(2,\)"):

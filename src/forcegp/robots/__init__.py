@@ -6,7 +6,8 @@ from forcegp.robots.inertia import (
     pseudo_inertia_from_parameters,
 )
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.robot import Joint, Link, Robot
+from forcegp.robots.parts import Joint, Link
+from forcegp.robots.robot import Robot
 
 __all__ = [
     "Joint",

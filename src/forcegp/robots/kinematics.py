@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.robots import algorithms
+from forcegp.robots.arguments import Inertials, Vector, broadcast_batch
 from forcegp.robots.tree import WORLD
 
 if TYPE_CHECKING:
     from forcegp.robots.robot import Robot
-
-Inertials = Mapping[str, Tensor]
-Vector = Sequence[float | int] | np.ndarray | Tensor
-Point = Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +102,7 @@ class Kinematics:
             return offset.repeat(*self.batch_shape, 1, 1)
         return self._rows(algorithms.product(self.poses[body], offset[..., None]).movedim(-1, 0))
 
-    def frame_jacobian(self, frame: str, point: Point | None = None) -> Float[Tensor, "... 6 nv"]:
+    def frame_jacobian(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         at, body, position = self._world_point(frame, point)
         if body == WORLD:
@@ -117,7 +112,7 @@ class Kinematics:
         reached = self.robot.tree.descendants[:, body, None, None]
         return at._rows((jacobian * reached).permute(2, 1, 0).contiguous())
 
-    def frame_bias_acceleration(self, frame: str, point: Point | None = None) -> Float[Tensor, "... 6"]:
+    def frame_bias_acceleration(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6"]:
         """Classical acceleration (..., 6) of a ``point`` fixed in ``frame`` at zero joint acceleration.
 
         This is ``Jdot v`` for :meth:`frame_jacobian`: [linear; angular], in m/s^2 and rad/s^2, without gravity.
@@ -161,7 +156,7 @@ class Kinematics:
         at = self._expand(self._broadcast("inertials", batch))
         return at, algorithms.world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
 
-    def _world_point(self, frame: str, point: Point | None) -> tuple[Kinematics, int, Tensor]:
+    def _world_point(self, frame: str, point: Vector | None) -> tuple[Kinematics, int, Tensor]:
         """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
         body, offset = self.robot.frame(frame)
         at = self
@@ -197,17 +192,6 @@ class Kinematics:
             v=None if self.v is None else wider(self.v),
             accelerations=None if self.accelerations is None else wider(self.accelerations),
         )
-
-
-def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
-    """Common batch shape; :class:`~forcegp.errors.InvalidInput` where there is none."""
-    try:
-        return torch.broadcast_shapes(*shapes.values())
-    except RuntimeError:
-        listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
-        raise InvalidInput(
-            f"batch shapes do not broadcast: {listed}; make them equal, or 1 where one value serves all."
-        ) from None
 
 
 def _columns(values: Tensor, batch: torch.Size) -> Tensor:

@@ -3,54 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
 from forcegp.robots import urdf_writer
-from forcegp.robots.inertia import (
-    log_cholesky_of_body,
-    physical_from_parameters,
-    pseudo_inertia_factor,
-)
-from forcegp.robots.kinematics import Inertials, Kinematics, Point, Vector, broadcast_batch
-from forcegp.robots.tree import WORLD, Layout, Tree, body_inertias, check_inertias, compile_tree, lay_out
+from forcegp.robots.arguments import Inertials, Vector, armature_values, broadcast_batch, check_tensor, finite_vector
+from forcegp.robots.inertia import log_cholesky_of_body, physical_from_parameters, pseudo_inertia_factor
+from forcegp.robots.kinematics import Kinematics
+from forcegp.robots.parts import Joint, Link
+from forcegp.robots.tree import WORLD, Layout, Tree, check_inertias, compile_tree, lay_out
 from forcegp.robots.urdf import RobotDescription, parse_urdf, read_text
 
 GRAVITY = (0.0, 0.0, -9.81)
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
-
-    name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic'
-    parent: str
-    child: str
-    axis: tuple[float, float, float]  # unit vector in the joint frame
-    lower: float
-    upper: float
-    velocity_limit: float
-    effort_limit: float
-    damping: float  # Nms/rad or Ns/m
-    friction: float  # Nm or N
-
-
-@dataclass(frozen=True)
-class Link:
-    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world)."""
-
-    name: str
-    joint: str | None
-    mass: float  # kg; 0 for a massless frame
-    center_of_mass: tuple[float, float, float]  # m, in the link frame
-    inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,7 +42,6 @@ class Robot:
     urdf_text: str
     _locked: tuple[tuple[str, float], ...]
     _frames: dict[str, tuple[int, Tensor]]
-    _merge_plans: dict[tuple[str, ...], tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict)
 
     # ------------------------------------------------------------------ making one
 
@@ -115,8 +83,8 @@ class Robot:
         tree = compile_tree(
             description,
             layout,
-            gravity=_finite_vector("gravity", gravity, 3),
-            armature=_armature(armature, names, description.name),
+            gravity=finite_vector("gravity", gravity, 3),
+            armature=armature_values(armature, names, description.name),
             device=torch.device("cpu"),
         )
         frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
@@ -146,7 +114,7 @@ class Robot:
         """The same robot with its constants on ``device``."""
         device = torch.device(device)
         frames = {name: (body, offset.to(device)) for name, (body, offset) in self._frames.items()}
-        return replace(self, tree=self.tree.to(device), _frames=frames, _merge_plans={})
+        return replace(self, tree=self.tree.to(device), _frames=frames)
 
     def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> Robot:
         robot = Robot.from_urdf_text(
@@ -331,7 +299,7 @@ class Robot:
         return self.kinematics(q).frame_pose(frame)
 
     def frame_jacobian(
-        self, q: Float[Tensor, "*#batch nv"], frame: str, point: Point | None = None
+        self, q: Float[Tensor, "*#batch nv"], frame: str, point: Vector | None = None
     ) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
@@ -341,7 +309,7 @@ class Robot:
         q: Float[Tensor, "*#batch nv"],
         v: Float[Tensor, "*#batch nv"],
         frame: str,
-        point: Point | None = None,
+        point: Vector | None = None,
     ) -> Float[Tensor, "... 6"]:
         """Acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``, classical, without gravity.
 
@@ -360,97 +328,48 @@ class Robot:
 
     def check_input(self, name: str, value: object) -> None:
         """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""
-        self._check_tensor(name, value, self.nv, f"one value per joint of {self.name}")
+        check_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
 
-    def check_point(self, point: Point) -> Float[Tensor, "*batch 3"]:
+    def check_point(self, point: Vector) -> Float[Tensor, "*batch 3"]:
         """A point in frame coordinates as a float64 tensor (..., 3)."""
         if not isinstance(point, Tensor):
-            point = torch.as_tensor(_finite_vector("point", point, 3), device=self.device)
-        self._check_tensor("point", point, 3, "x, y, z in m")
+            point = torch.as_tensor(finite_vector("point", point, 3), device=self.device)
+        check_tensor("point", point, 3, "x, y, z in m", self.device)
         return point
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
+        if not isinstance(inertials, Mapping):
+            raise InvalidInput(
+                f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
+            )
         names = tuple(inertials)
-        values = []
         for name in names:
             self._check_parameters(name, inertials[name])
-            values.append(inertials[name])
-        base, offsets, bodies = self._merge_plan(names)
+            self._require_moving(name)
         batch = broadcast_batch({f"inertials[{name!r}]": inertials[name].shape[:-1] for name in names})
-        parameters = torch.stack([value.expand(*batch, 10) for value in values])
+        parameters = torch.stack([inertials[name].expand(*batch, 10) for name in names])
+        offsets = torch.stack([self._frames[name][1] for name in names])
         factor = offsets.reshape(len(names), *(1 for _ in batch), 4, 4) @ pseudo_inertia_factor(parameters)
         given = (factor @ factor.mT).movedim((-2, -1), (1, 2))
-        added = (bodies @ given.flatten(1)).unflatten(1, given.shape[1:])
-        return base.reshape(self.nv, 4, 4, *(1 for _ in batch)) + added
+        # sum over the links that stay rather than subtract those that change: no cancellation
+        tree, moving = self.tree, self.layout.moving
+        stay = [i for i, name in enumerate(moving) if name not in inertials]
+        kept = (tree.carried[:, stay] @ tree.link_inertias[stay].flatten(1)).unflatten(1, (4, 4))
+        change = [moving.index(name) for name in names]
+        added = (tree.carried[:, change] @ given.flatten(1)).unflatten(1, given.shape[1:])
+        return kept.reshape(self.nv, 4, 4, *(1 for _ in batch)) + added
 
-    def _merge_plan(self, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
-        """Bodies' pseudo-inertias without the named links, these links' offsets, and which body each belongs to."""
-        if names not in self._merge_plans:
-            placements = [self._require_moving(name) for name in names]
-            others = {name: place for name, place in self.layout.links.items() if name not in names}
-            bodies = np.zeros((self.nv, len(names)))
-            bodies[[place.body for place in placements], np.arange(len(names))] = 1.0
-            plan = (
-                body_inertias(self.description, self.layout, others),
-                np.stack([place.offset for place in placements]),
-                bodies,
-            )
-            base, offsets, members = (torch.as_tensor(part, device=self.device) for part in plan)
-            self._merge_plans[names] = (base, offsets, members)
-        return self._merge_plans[names]
-
-    def _require_moving(self, link: str):
+    def _require_moving(self, link: str) -> None:
         placement = self.layout.links.get(link)
         if placement is None:
             raise UnknownLink(unknown_name_message("link", link, self.name, self.layout.links))
         if placement.body == WORLD:
-            moving = ", ".join(name for name, place in self.layout.links.items() if place.body != WORLD)
+            moving = ", ".join(self.layout.moving)
             raise InvalidInput(
                 f"link {link!r} of {self.name} is fixed in the world, so its inertia never enters the dynamics and "
                 f"cannot be a parameter; name a moving link: {moving}"
             )
-        return placement
 
     def _check_parameters(self, link: str, parameters: object) -> None:
-        self._check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters")
-
-    def _check_tensor(self, name: str, value: object, size: int, meaning: str) -> None:
-        if not isinstance(value, Tensor):
-            raise InvalidInput(
-                f"{name} is a {type(value).__name__}; give a tensor: torch.as_tensor({name}, dtype=torch.float64)."
-            )
-        if value.dim() == 0 or value.shape[-1] != size:
-            raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
-        if value.dtype != torch.float64:
-            raise InvalidInput(f"{name} is {value.dtype}; the dynamics needs float64, pass {name}.double().")
-        if value.device != self.device:
-            raise InvalidInput(
-                f"{name} is on {value.device} but the robot on {self.device}; use robot.to({str(value.device)!r}) "
-                f"or {name}.to({str(self.device)!r})."
-            )
-
-
-def _finite_vector(name: str, values: object, size: int) -> np.ndarray:
-    try:
-        array = np.array([float(value) for value in values])  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        raise InvalidInput(f"{name} is {values!r}; give {size} numbers.") from None
-    if array.shape != (size,) or not np.isfinite(array).all():
-        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
-    return array
-
-
-def _armature(given: Vector | Mapping[str, float | int] | None, joints: tuple[str, ...], robot: str) -> np.ndarray:
-    if given is None:
-        return np.zeros(len(joints))
-    if isinstance(given, Mapping):
-        unknown = next((name for name in given if name not in joints), None)
-        if unknown is not None:
-            raise UnknownJoint(unknown_name_message("joint", unknown, robot, joints))
-        given = [given.get(name, 0.0) for name in joints]
-    values = _finite_vector("armature", given, len(joints))
-    if (values < 0.0).any():
-        joint = joints[int(np.argmin(values))]
-        raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")
-    return values
+        check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

@@ -72,7 +72,9 @@ class Tree:
     related: Tensor  # (n, n, 1): 1 where one of the two joints moves the other
     velocity_sum: Tensor  # (n, n): 2 ancestors - 1, body velocity plus that of the parent body
     twist_basis: Tensor  # (12, 6): [w; v] -> [[w]x, v], row by row
-    inertias: Tensor  # (n, 4, 4, 1): pseudo-inertias of the bodies, merged
+    link_inertias: Tensor  # (links, 4, 4): pseudo-inertias of the moving links, in the frames of their bodies
+    carried: Tensor  # (n, links): 1 where the body carries the link
+    inertias: Tensor  # (n, 4, 4, 1): pseudo-inertias of the bodies, their links merged
     gravity: Tensor  # (3,)
     fall: Tensor  # (3, 4, 1): the acceleration T'' T^-1 of free fall
     armature: Tensor  # (n,)
@@ -92,6 +94,11 @@ class Layout:
     parents: tuple[int, ...]
     origins: tuple[np.ndarray, ...]  # body frame at q = 0 in the parent body's frame
     links: dict[str, Placement]
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of the links that some joint moves."""
+        return tuple(name for name, placement in self.links.items() if placement.body != WORLD)
 
 
 def lay_out(description: RobotDescription, locked: Mapping[str, float]) -> Layout:
@@ -187,17 +194,6 @@ def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
     return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
 
 
-def body_inertias(description: RobotDescription, layout: Layout, links: Mapping[str, Placement]) -> np.ndarray:
-    """Pseudo-inertias (n, 4, 4) of the bodies, summed over ``links``, each in its body's frame."""
-    out = np.zeros((len(layout.joints), 4, 4))
-    for name, placement in links.items():
-        inertial = description.links[name]
-        if placement.body != WORLD and inertial is not None:
-            local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
-            out[placement.body] += placement.offset @ local @ placement.offset.T
-    return out
-
-
 def check_inertias(description: RobotDescription, layout: Layout) -> None:
     """Every moving link must be physically possible and every body have mass; links fixed in the world need not be."""
     mass = np.zeros(len(layout.joints))
@@ -247,6 +243,14 @@ def compile_tree(
     for k, axis in enumerate(np.eye(3)):
         twist_basis[k, :, :3] = skew(axis)
         twist_basis[3 + k, :, 3] = axis
+    link_inertias = np.zeros((len(layout.moving), 4, 4))
+    carried = np.zeros((n, len(layout.moving)))
+    for k, name in enumerate(layout.moving):
+        placement, inertial = layout.links[name], description.links[name]
+        carried[placement.body, k] = 1.0
+        if inertial is not None:
+            local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
+            link_inertias[k] = placement.offset @ local @ placement.offset.T
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
     related = np.maximum(descendants, descendants.T)
@@ -271,7 +275,9 @@ def compile_tree(
         related=constant(related[..., None]),
         velocity_sum=constant(2.0 * descendants.T - np.eye(n)),
         twist_basis=constant(twist_basis.reshape(6, 12).T),
-        inertias=constant(body_inertias(description, layout, layout.links)[..., None]),
+        link_inertias=constant(link_inertias),
+        carried=constant(carried),
+        inertias=constant(np.tensordot(carried, link_inertias, 1)[..., None]),
         gravity=constant(gravity),
         fall=constant(fall[..., None]),
         armature=constant(armature),

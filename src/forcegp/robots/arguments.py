@@ -1,0 +1,71 @@
+"""Checks of what callers pass in: type, shape, dtype, device, and batches that broadcast."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
+
+Vector = Sequence[float | int] | np.ndarray | Tensor
+Inertials = Mapping[str, Tensor]
+
+
+def check_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> None:
+    """:class:`~forcegp.errors.InvalidInput` unless ``value`` is a float64 tensor (..., size) on ``device``."""
+    if not isinstance(value, Tensor):
+        raise InvalidInput(
+            f"{name} is a {type(value).__name__}; give a tensor: torch.as_tensor({name}, dtype=torch.float64)."
+        )
+    if value.dim() == 0 or value.shape[-1] != size:
+        raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
+    if value.dtype != torch.float64:
+        raise InvalidInput(f"{name} is {value.dtype}; the dynamics needs float64, pass {name}.double().")
+    if value.device != device:
+        raise InvalidInput(
+            f"{name} is on {value.device} but the robot on {device}; use robot.to({str(value.device)!r}) "
+            f"or {name}.to({str(device)!r})."
+        )
+
+
+def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
+    """Common batch shape; :class:`~forcegp.errors.InvalidInput` where there is none."""
+    try:
+        return torch.broadcast_shapes(*shapes.values())
+    except RuntimeError:
+        listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
+        raise InvalidInput(
+            f"batch shapes do not broadcast: {listed}; make them equal, or 1 where one value serves all."
+        ) from None
+
+
+def finite_vector(name: str, values: Vector, size: int) -> np.ndarray:
+    """``size`` finite numbers as an array."""
+    try:
+        array = np.array([float(value) for value in values])
+    except (TypeError, ValueError):
+        raise InvalidInput(f"{name} is {values!r}; give {size} numbers.") from None
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
+    return array
+
+
+def armature_values(
+    given: Vector | Mapping[str, float | int] | None, joints: tuple[str, ...], robot: str
+) -> np.ndarray:
+    """Rotor inertia per joint (kg m^2 or kg), given in joint order or by joint name; 0 where it is not given."""
+    if given is None:
+        return np.zeros(len(joints))
+    if isinstance(given, Mapping):
+        unknown = next((name for name in given if name not in joints), None)
+        if unknown is not None:
+            raise UnknownJoint(unknown_name_message("joint", unknown, robot, joints))
+        given = [given.get(name, 0.0) for name in joints]
+    values = finite_vector("armature", given, len(joints))
+    if (values < 0.0).any():
+        joint = joints[int(np.argmin(values))]
+        raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")
+    return values
