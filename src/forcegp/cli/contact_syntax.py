@@ -61,5 +61,7 @@ def _numbers(text: str, what: str, given: str, form: str, count: int) -> list[fl
     except ValueError:
         values = []
     if len(values) != count:
-        raise InvalidInput(f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; {EXAMPLE}")
+        raise InvalidInput(
+            f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
+        )
     return values

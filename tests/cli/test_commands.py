@@ -1,0 +1,153 @@
+"""The commands from end to end: the real executable on real files."""
+
+import contextlib
+import hashlib
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+
+import numpy as np
+import pytest
+
+from forcegp import Dataset, evaluate, load_posterior
+from forcegp.cli.main import main
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def test_simulate_writes_the_dataset_that_its_summary_describes(workshop):
+    summary = json.loads((workshop / "train.json").read_text())
+    data = Dataset.load(workshop / "train.h5")
+    assert summary["rows"] == len(data) == 480
+    assert summary["joint_names"] == list(data.joint_names)
+    assert summary["config"]["seed"] == data.metadata["config"]["seed"] == 1
+    np.testing.assert_array_equal(data.noise_std, summary["noise_std"])
+    np.testing.assert_array_equal(data.noise_std, np.full(7, 0.1))
+    assert sorted(summary["truth"]) == ["Q_U", "a", "lambda"]
+    assert Dataset.load(workshop / "test.h5").metadata["config"]["seed"] == 2
+
+
+def test_fit_writes_a_model_and_everything_needed_to_repeat_it(workshop):
+    run = workshop / "run"
+    config = json.loads((run / "config.json").read_text())
+    assert config["kind"] == "forcegp fit"
+    assert config["options"]["points"] == config["resolved"]["points"] == 15
+    assert config["options"]["mean"] == "analytical"
+    assert config["resolved"]["seed"] == 3
+    assert config["resolved"]["noise"]["acceleration"] == [0.1] * 7
+    assert config["data"]["sha256"] == hashlib.sha256((workshop / "train.h5").read_bytes()).hexdigest()
+    assert {"python", "torch", "forcegp"} <= config["versions"].keys()
+    assert sorted(config["files"]) == sorted(file.name for file in run.iterdir())
+    posterior = load_posterior(run)
+    assert len(posterior.result.history) - 1 <= 8
+    assert len(posterior.settings["restart_objective"]) == 2
+    told = (workshop / "fit.txt").read_text()
+    assert "learned from 15 points" in told
+    assert f"{posterior.negative_log_likelihood:.1f} nats" in told
+    assert "forcegp evaluate run TEST.h5" in told
+
+
+def test_evaluate_prints_exactly_one_json_object(workshop, forcegp):
+    done = forcegp("evaluate", "run", "test.h5", "--every", 4, "--json", folder=workshop)
+    assert done.returncode == 0, done.stderr
+    scores = json.loads(done.stdout)
+    for name in ("mae", "mae_noise_free", "rmse", "nlpd", "coverage_95", "constraint_error"):
+        assert isinstance(scores[name], float)
+        assert len(scores[f"{name}_per_joint"]) == 7
+    assert scores["constraint_error"] < 1e-10
+    expected = evaluate(load_posterior(workshop / "run"), Dataset.load(workshop / "test.h5").rows(slice(None, None, 4)))
+    assert scores["rows"] == expected.rows == 120
+    np.testing.assert_allclose(scores["mae_per_joint"], expected.mae_per_joint, rtol=1e-6)
+    assert scores["nlpd"] == pytest.approx(expected.nlpd, rel=1e-6)
+
+
+def test_evaluate_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
+    figures = tmp_path / "figures"
+    done = forcegp("evaluate", "run", "test.h5", "--plots", figures, folder=workshop)
+    assert done.returncode == 0, done.stderr
+    lines = re.findall(r"^\s*lbr_iiwa_joint_\d\s.*$", done.stdout, re.M)
+    assert len(lines) == 7
+    assert len({len(line.split()) for line in lines}) == 1
+    assert "mean" in done.stdout
+    names = {file.name for file in figures.iterdir()}
+    pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png"}
+    assert names == pictures | {"evaluation.json", "config.json"}
+    assert all((figures / name).read_bytes().startswith(PNG) for name in pictures)
+    assert json.loads((figures / "evaluation.json").read_text())["rows"] == 480
+    again = forcegp("evaluate", "run", "test.h5", "--plots", figures, folder=workshop)
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "--overwrite" in again.stderr
+
+
+def test_testing_on_the_training_data_is_said(workshop, forcegp):
+    done = forcegp("evaluate", "run", "train.h5", "--json", folder=workshop)
+    assert done.returncode == 0
+    (warning,) = json.loads(done.stdout)["warnings"]
+    assert "15 of 480 test rows are also training rows" in warning
+    assert f"warning: {warning}" in done.stderr
+
+
+def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path, monkeypatch, capfd):
+    pytest.importorskip("pybullet")
+    small = ("demo", "--seconds", "2", "--points", "12", "--iterations", "3")
+    done = forcegp(*small, "--json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    results = json.loads((tmp_path / "demo" / "results.json").read_text())
+    assert json.loads(done.stdout) == results
+    assert results["seeds"] == {"train": 1, "test": 2}
+    models = results["models"]
+    assert list(models) == ["S-GP", "S-GP + analytical mean"]
+    for model in models.values():
+        assert model["evaluation"]["constraint_error"] < 1e-10
+        assert model["evaluation"]["warnings"] == []
+        assert model["published_mae"] is None  # the paper has no value for 12 points
+        assert len(load_posterior(tmp_path / model["run"]).likelihood.training.q) == 12
+    assert (tmp_path / "demo" / "summary.png").read_bytes().startswith(PNG)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["demo"]
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo" / "notes.txt").write_text("mine")
+    assert main(small) == 2
+    assert "--overwrite" in capfd.readouterr().err
+    (tmp_path / "demo" / "notes.txt").unlink()
+    assert main([*small, "--seed", "5"]) == 0
+    told = capfd.readouterr().out
+    for row in ("known physics alone", "S-GP ", "S-GP + analytical mean", "noise floor"):
+        assert re.search(rf"^\s*{re.escape(row)}.*\d\.\d{{4}}", told, re.M), told
+    assert json.loads((tmp_path / "demo" / "results.json").read_text())["seeds"]["train"] == 5
+
+
+def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path):
+    pytest.importorskip("pybullet")
+    screen, terminal = pty.openpty()
+    command = [executable, "simulate", "kuka-surface", "--seconds", "5000", "--out", "long.h5"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=terminal) as process:
+        os.close(terminal)
+        seen = b""
+        while b" left" not in seen:  # the bar tells the remaining time, so the work is under way
+            seen += os.read(screen, 4096)
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(OSError):  # how Linux reports the end of a terminal; others with an empty read
+            while chunk := os.read(screen, 4096):
+                seen += chunk
+        assert process.wait(60) == 130
+    os.close(screen)
+    assert b"forcegp: interrupted" in seen.splitlines()[-1]
+    assert b"Traceback" not in seen
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["demo", "simulate", "fit", "evaluate"])
+def test_help_has_an_example(forcegp, command):
+    done = forcegp(command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(rf"For instance:\n\s+forcegp {command} \S", done.stdout)
+
+
+def test_version(forcegp):
+    done = forcegp("--version")
+    assert done.returncode == 0
+    assert re.fullmatch(r"forcegp \d+\.\d+\.\d+\n", done.stdout)

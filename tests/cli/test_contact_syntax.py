@@ -1,0 +1,42 @@
+"""`FRAME@x,y,z:SURFACE:numbers` reads as the contact that it looks like."""
+
+import pytest
+
+from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
+
+
+@pytest.mark.parametrize(
+    ("text", "contact"),
+    [
+        (EXAMPLE, Contact("lbr_iiwa_link_7", (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), 0.055))),
+        ("tool:plane:0,0,2,1", Contact("tool", (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.5))),
+        ("arm:tool@1,-2,3e-1:sphere:0,0,0,1", Contact("arm:tool", (1.0, -2.0, 0.3), Sphere((0.0, 0.0, 0.0), 1.0))),
+        (
+            "tool@0,0,0:cylinder:0,1,0,1,0,0,0.1",
+            Contact("tool", (0.0, 0.0, 0.0), Cylinder((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.1)),
+        ),
+        ("a@b@1,2,3:plane:1,0,0,0", Contact("a@b", (1.0, 2.0, 3.0), Plane((1.0, 0.0, 0.0), 0.0))),
+    ],
+)
+def test_reads_as_written(text, contact):
+    assert parse_contact(text) == contact
+    assert parse_contacts([text, text]) == (contact, contact)
+
+
+def test_none_is_no_contact():
+    assert parse_contacts(["none"]) == ()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "tool", "tool:plane", "plane:0,0,1,0", "tool:plan:0,0,1,0", "tool:plane:0,0,1", "tool:plane:0,0,1,x"),
+        *("tool@1,2:plane:0,0,1,0", "tool@:plane:0,0,1,0", "tool:plane:0,0,0,1", "tool:sphere:0,0,0,-1"),
+        *("tool:plane:0,0,nan,1", "tool:plane:"),
+    ],
+)
+def test_anything_else_is_refused(text):
+    with pytest.raises(InvalidInput):
+        parse_contact(text)

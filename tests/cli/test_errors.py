@@ -1,0 +1,167 @@
+"""Whatever goes wrong ends in one line that names it, exit code 2, and no output files."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.models.arm import URDF, arm_data, arm_system
+
+from forcegp.cli.arguments import one_line
+from forcegp.cli.main import main
+from forcegp.data import Dataset
+from forcegp.models import load_posterior
+
+CONTACT = "hand@0,0,0.2:plane:0.2,0,1,0.4"
+QUICK = ("--points", "8", "--iterations", "2", "--restarts", "1")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with good data, and with every kind of bad file; the current one."""
+    monkeypatch.chdir(tmp_path)
+    data = arm_data(20, seed=0)
+    data.save("arm.h5")
+    dataclasses.replace(data, system=None).save("no_robot.h5")
+    dataclasses.replace(data, noise_std=None).save("no_noise.h5")
+    content = (tmp_path / "arm.h5").read_bytes()
+    (tmp_path / "damaged.h5").write_bytes(content[: len(content) // 2])
+    (tmp_path / "text.h5").write_text("time,q,v\n")
+    (tmp_path / "arm.urdf").write_text(URDF)
+    (tmp_path / "other.urdf").write_text(URDF.replace('"bend"', '"wrist"'))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    return tmp_path
+
+
+WRONG = [
+    ("fit missing.h5 --out run", "missing.h5 is not a file"),
+    ("fit damaged.h5 --out run", "damaged.h5 is damaged"),
+    ("fit text.h5 --out run", "text.h5 is not an HDF5 file"),
+    ("fit no_robot.h5 --out run", "does not carry its robot; add --robot"),
+    ("fit no_noise.h5 --out run", "does not state its noise; add --noise"),
+    ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
+    ("fit arm.h5 --robot missing.urdf --out run", "missing.urdf: no such file"),
+    ("fit arm.h5 --points 1 --out run", "points=1 is not between 2 and the 20 rows"),
+    ("fit arm.h5 --restarts 0 --out run", "restarts=0"),
+    ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
+    ("fit arm.h5 --noise -0.1 --out run", "must be positive"),
+    ("fit arm.h5 --contact plane --out run", "is not FRAME@x,y,z:SURFACE"),
+    ("fit arm.h5 --contact hand:plane --out run", "plane needs 4 numbers nx,ny,nz,offset"),
+    ("fit arm.h5 --contact hand@0,0:plane:0,0,1,0 --out run", "the point needs 3 numbers"),
+    ("fit arm.h5 --contact hand:sphere:0,0,1 --out run", "sphere needs 4 numbers cx,cy,cz,radius"),
+    ("fit arm.h5 --contact hnd:plane:0,0,1,0 --out run", "no frame 'hnd' in arm; did you mean 'hand'?"),
+    (f"fit arm.h5 --contact none --contact {CONTACT} --out run", "none stands alone"),
+    ("fit arm.h5 --known-force wind --out run", "wind"),
+    ("fit arm.h5 --out mine", "mine exists"),
+    ("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"),
+    ("fit arm.h5 --out arm.h5 --overwrite", "was not written by `forcegp fit`"),
+    ("fit arm.h5", "--out"),
+    ("fit arm.h5 --pionts 5 --out run", "--pionts, 5. Perhaps you meant: --points N."),
+    ("fit arm.h5 --points five --out run", "--points: invalid literal for int() with base 10: 'five'"),
+    ("fit arm.h5 --mean big --out run", "'big' for argument '--mean'"),
+    ("evaluate missing arm.h5", "missing does not exist; give the folder that `forcegp fit --out` wrote"),
+    ("evaluate mine arm.h5", "mine holds no model.json"),
+    ("evaluate mine arm.h5 --every 0", "--every is 0"),
+    ("evaluate mine", "DATA"),
+    ("simulate kuka-surface --out arm.h5", "arm.h5 exists already"),
+    ("simulate kuka-surface --out mine", "mine is a folder"),
+    ("simulate kuka-surface --out nowhere/a.h5", "folder nowhere does not exist"),
+    ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
+    ("simulate mars --out a.h5", "'mars'"),
+    ("demo --out mine --overwrite", "was not written by `forcegp demo`"),
+    ("learn arm.h5", "Available subcommands: demo, simulate, fit, evaluate"),
+    ("", "demo, simulate, fit, evaluate"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG, ids=[words or "nothing" for words, _ in WRONG])
+def test_a_wrong_command_is_one_line_and_exit_code_2(folder, capfd, words, message):
+    before = sorted(folder.rglob("*"))
+    assert main(words.split()) == 2
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("forcegp: ")
+    assert told.err.count("\n") == 1, told.err
+    assert message in told.err
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("words", ["--debug fit missing.h5 --out run", "fit missing.h5 --out run --debug"])
+def test_debug_shows_the_traceback_before_the_line(folder, capfd, words):
+    assert main(words.split()) == 2
+    told = capfd.readouterr().err
+    assert "Traceback (most recent call last)" in told
+    assert told.splitlines()[-1].startswith("forcegp: missing.h5 is not a file")
+
+
+def test_overwriting_needs_a_word_and_replaces_the_whole_run(folder, capfd):
+    assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 0
+    assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 2
+    assert "run exists already; choose another name for --out, or add --overwrite" in capfd.readouterr().err
+    assert main(["fit", "arm.h5", *QUICK, "--mean", "zero", "--out", "run", "--overwrite"]) == 0
+    assert load_posterior("run").model.mean == "zero"
+    assert not list(folder.glob(".*"))
+
+
+def test_a_damaged_model_is_refused(folder, capfd):
+    assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 0
+    tensors = folder / "run" / "tensors.safetensors"
+    tensors.write_bytes(tensors.read_bytes()[:100])
+    capfd.readouterr()
+    assert main(["evaluate", "run", "arm.h5"]) == 2
+    assert "damaged" in capfd.readouterr().err
+
+
+def test_a_run_of_another_robot_is_refused(folder, capfd):
+    assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 0
+    names = ("pan", "lift", "wrist")
+    dataclasses.replace(Dataset.load("no_robot.h5"), joint_names=names).save("other.h5")
+    capfd.readouterr()
+    assert main(["evaluate", "run", "other.h5"]) == 2
+    assert "joints pan, lift, wrist; the model was trained on pan, lift, bend" in capfd.readouterr().err
+
+
+def test_robot_and_contact_replace_those_of_the_dataset(folder):
+    assert main(["fit", "no_robot.h5", "--robot", "arm.urdf", "--contact", CONTACT, *QUICK, "--out", "run"]) == 0
+    system, expected = load_posterior("run").system, arm_system()
+    assert system.contacts == expected.contacts
+    assert system.robot.joint_names == expected.robot.joint_names
+    np.testing.assert_allclose(system.robot.gravity, [0, 0, -9.81])
+    assert main(["fit", "arm.h5", "--contact", "none", *QUICK, "--out", "free"]) == 0
+    assert load_posterior("free").system.contacts == ()
+
+
+def test_known_forces_replace_those_of_the_dataset(folder):
+    forces = ("actuation", "rigid-body-bias", "viscous-joint-friction")
+    words = [word for force in forces for word in ("--known-force", force)]
+    assert main(["fit", "arm.h5", *words, *QUICK, "--out", "run"]) == 0
+    stored = load_posterior("run").system.to_dict()["known_forces"]
+    assert [force["type"] for force in stored] == list(forces)
+    assert stored[2]["coefficients"] == [0.3, 0.3, 0.3]  # <dynamics damping> of the URDF
+
+
+@pytest.mark.parametrize(
+    ("noise", "learned", "file"), [("learned", True, "no_noise.h5"), ("0.2", False, "no_noise.h5")]
+)
+def test_noise_is_learned_or_given(folder, noise, learned, file):
+    assert main(["fit", file, *QUICK, "--noise", noise, "--out", "run"]) == 0
+    posterior = load_posterior("run")
+    assert posterior.model.noise.learn is learned
+    if not learned:
+        np.testing.assert_allclose(posterior.noise_std, 0.2)
+
+
+def test_more_points_than_rows_means_all_rows(folder, capfd):
+    assert main(["fit", "arm.h5", "--points", "500", *QUICK[2:], "--out", "run"]) == 0
+    assert "learned from 20 points" in capfd.readouterr().out
+
+
+def test_a_box_becomes_a_sentence():
+    box = """╭─ Unrecognized options ─────────────────╮
+│ Unrecognized options: --pionts         │
+│ ────────────────────────────────────── │
+│ Perhaps you meant:                     │
+│     --points N                         │
+│         Train on so many rows.         │
+╰────────────────────────────────────────╯"""
+    assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."

@@ -1,0 +1,142 @@
+"""`evaluate` against the same scores computed row by row from `predict`, and its warnings."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal, norm
+from tests.data import samples
+from tests.models.arm import NOISE, arm_data, arm_system
+
+from forcegp.errors import InvalidInput
+from forcegp.evaluation import Evaluation, evaluate, predict_rows
+from forcegp.evaluation.predicted_rows import ROWS_PER_BLOCK
+from forcegp.models import load_posterior, save_posterior
+
+ASKED_FOR = ("mae", "mae_noise_free", "rmse", "nlpd", "coverage_95", "constraint_error")
+
+
+@pytest.fixture(scope="module")
+def evaluation(posterior, test_data) -> Evaluation:
+    return evaluate(posterior, test_data)
+
+
+def test_scores_are_those_of_single_predictions(posterior, test_data, evaluation):
+    errors, densities, inside, inside_noise_free = [], [], [], []
+    for row in range(len(test_data)):
+        prediction = posterior.predict(test_data.q[row], test_data.v[row], test_data.u[row])
+        mean, covariance = prediction.mean.numpy(), prediction.covariance.numpy()
+        noisy = covariance + NOISE**2 * np.eye(3)
+        errors.append(mean - test_data.a[row])
+        densities.append(-multivariate_normal(mean, noisy).logpdf(test_data.a[row]))
+        inside.append(np.abs(errors[-1]) <= norm.ppf(0.975) * np.sqrt(np.diag(noisy)))
+        gap = np.abs(mean - test_data.truth["a"][row])
+        inside_noise_free.append(gap <= norm.ppf(0.975) * np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(evaluation.mae_per_joint, np.abs(errors).mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(evaluation.rmse_per_joint, np.sqrt(np.square(errors).mean(axis=0)), rtol=1e-9)
+    assert evaluation.nlpd == pytest.approx(np.mean(densities), rel=1e-8)
+    np.testing.assert_allclose(evaluation.coverage_95_per_joint, np.mean(inside, axis=0))
+    np.testing.assert_allclose(evaluation.coverage_95_noise_free_per_joint, np.mean(inside_noise_free, axis=0))
+
+
+def test_the_dictionary_holds_every_mean_beside_what_it_is_the_mean_of(evaluation):
+    scores = evaluation.to_dict()
+    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
+    for name in ASKED_FOR:
+        assert isinstance(scores[name], float)
+        assert len(scores[f"{name}_per_joint"]) == 3
+    for name in ("mae", "rmse", "coverage_95", "mae_noise_free", "unknown_force_mae"):
+        assert scores[name] == pytest.approx(np.mean(scores[f"{name}_per_joint"]))
+    assert len(scores["constraint_error_per_contact"]) == 1
+    assert scores["constraint_error"] == pytest.approx(scores["constraint_error_per_contact"][0])
+    assert scores["rows"] == 60
+    assert scores["noise_floor"] == pytest.approx(NOISE * np.sqrt(2 / np.pi))
+    assert scores["warnings"] == []
+
+
+def test_learning_helps_and_the_constraint_holds(evaluation):
+    assert evaluation.mae_noise_free < 0.5 * evaluation.known_physics_mae_noise_free
+    assert evaluation.constraint_error <= evaluation.constraint_error_max < 1e-10
+    assert max(evaluation.constraint_error_per_joint) < 1e-10
+
+
+def test_without_truth_and_noise_level_only_measurements_are_scored(posterior, test_data, evaluation):
+    bare = dataclasses.replace(test_data, truth={}, noise_std=None, system=None)
+    scores = evaluate(posterior, bare).to_dict()
+    for name in ("mae_noise_free", "coverage_95_noise_free", "noise_floor", "force_mae", "unknown_force_mae"):
+        assert scores[name] is None
+        assert scores[f"{name}_per_joint"] is None
+    assert scores["multiplier_mae"] is scores["multiplier_mae_per_contact"] is None
+    assert scores["mae"] == evaluation.mae
+    assert scores["constraint_error"] == evaluation.constraint_error  # of the model's own contact
+
+
+def test_a_stored_model_scores_the_same(posterior, test_data, evaluation, tmp_path):
+    save_posterior(posterior, tmp_path / "run")
+    again = evaluate(load_posterior(tmp_path / "run"), test_data)
+    np.testing.assert_allclose(again.mae_per_joint, evaluation.mae_per_joint, rtol=1e-9)
+    assert again.nlpd == pytest.approx(evaluation.nlpd, rel=1e-9)
+
+
+def test_the_force_that_moves_the_robot_is_the_unknown_force_through_the_projector(posterior, test_data):
+    rows = test_data.rows(slice(0, 5))
+    predicted = predict_rows(posterior, rows)
+    states = [torch.tensor(values) for values in (rows.q, rows.v, rows.u)]
+    dynamics, prediction = arm_system().dynamics(*states), posterior.predict(*states)
+    projector = dynamics.M @ dynamics.H
+    expected = (projector @ prediction.unknown_force.mean[..., None])[..., 0]
+    np.testing.assert_allclose(predicted.moving_force, expected, atol=1e-9)
+    covariance = projector @ prediction.unknown_force.covariance @ projector.mT
+    np.testing.assert_allclose(predicted.moving_force_variance, covariance.diagonal(dim1=1, dim2=2), atol=1e-9)
+
+
+def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(without_mean, test_data):
+    evaluation = evaluate(without_mean, test_data)
+    predicted = predict_rows(without_mean, test_data)
+    known = arm_system().dynamics(*(torch.tensor(x) for x in (test_data.q, test_data.v, test_data.u))).Q_K.numpy()
+    carried = predicted.unknown_force - known
+    expected = np.abs(carried - test_data.truth["Q_U"]).mean(axis=0)
+    np.testing.assert_allclose(evaluation.unknown_force_mae_per_joint, expected, rtol=1e-9)
+    assert evaluation.constraint_error_max < 1e-10
+
+
+def test_blocks_of_rows_join_seamlessly(posterior):
+    data = arm_data(ROWS_PER_BLOCK + 3, seed=2)
+    calls = []
+    whole = predict_rows(posterior, data, lambda done, total: calls.append((done, total)))
+    assert calls == [(ROWS_PER_BLOCK, len(data)), (len(data), len(data))]
+    ends = predict_rows(posterior, data.rows([0, ROWS_PER_BLOCK - 1, ROWS_PER_BLOCK, len(data) - 1]))
+    rows = [0, ROWS_PER_BLOCK - 1, ROWS_PER_BLOCK, len(data) - 1]
+    for name in ("mean", "variance", "negative_log_density", "moving_force", "A", "b"):
+        np.testing.assert_allclose(getattr(whole, name)[rows], getattr(ends, name), rtol=1e-8, atol=1e-9)
+
+
+def test_the_constraint_is_that_of_the_data_and_a_model_without_it_is_named(without_contact, test_data):
+    evaluation = evaluate(without_contact, test_data)
+    assert evaluation.constraint_error > 1e-3
+    assert any("contacts of the model are not those of the data" in warning for warning in evaluation.warnings)
+    assert evaluation.multiplier_mae is None
+
+
+def test_training_rows_among_the_test_rows_are_counted(posterior, train, test_data):
+    mixed = dataclasses.replace(
+        test_data, **{name: np.vstack([getattr(test_data, name)[:-2], getattr(train, name)[:2]]) for name in "qvua"}
+    )
+    (warning,) = evaluate(posterior, mixed).warnings
+    assert "2 of 60 test rows are also training rows (the first: row 58)" in warning
+
+
+def test_other_rows_of_the_training_recording_are_noticed(posterior, train, test_data):
+    recorded = posterior.with_settings(data={"metadata": {"log": "monday"}, "episodes": [0]})
+    same = dataclasses.replace(test_data, metadata={"log": "monday"})
+    (warning,) = evaluate(recorded, same).warnings
+    assert "same recording" in warning
+    assert evaluate(recorded, dataclasses.replace(test_data, metadata={"log": "tuesday"})).warnings == ()
+    assert evaluate(recorded, dataclasses.replace(same, episode=np.ones(60, int))).warnings == ()
+
+
+def test_data_of_another_robot_are_refused(posterior):
+    with pytest.raises(InvalidInput, match=r"joints shoulder, elbow; the model was trained on pan, lift, bend"):
+        evaluate(posterior, samples.dataset())
