@@ -31,6 +31,14 @@ def check_tensor(name: str, value: object, size: int, meaning: str, device: torc
         )
 
 
+def check_mapping(inertials: object) -> None:
+    """:class:`~forcegp.errors.InvalidInput` unless inertials are given by link name."""
+    if not isinstance(inertials, Mapping):
+        raise InvalidInput(
+            f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
+        )
+
+
 def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
     """Common batch shape; :class:`~forcegp.errors.InvalidInput` where there is none."""
     try:
@@ -47,7 +55,7 @@ def finite_vector(name: str, values: Vector, size: int) -> np.ndarray:
     try:
         array = np.array([float(value) for value in values])
     except (TypeError, ValueError):
-        raise InvalidInput(f"{name} is {values!r}; give {size} numbers.") from None
+        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.") from None
     if array.shape != (size,) or not np.isfinite(array).all():
         raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
     return array
@@ -69,3 +77,16 @@ def armature_values(
         joint = joints[int(np.argmin(values))]
         raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")
     return values
+
+
+def locked_positions(locked: Mapping[str, float | int]) -> dict[str, float]:
+    """Positions (rad or m) of locked joints as floats."""
+    out = {}
+    for name, position in locked.items():
+        try:
+            out[name] = float(position)
+        except (TypeError, ValueError):
+            out[name] = np.nan
+        if not np.isfinite(out[name]):
+            raise InvalidInput(f"locked[{name!r}] is {position!r}; give a finite position in rad or m.")
+    return out

@@ -117,12 +117,21 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
     return None
 
 
-def log_cholesky_of_body(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, link: str) -> Tensor:
-    """Log-Cholesky parameters (10,) of a link; :class:`NonPhysicalInertia` where its mass is a line, plate or point."""
+def log_cholesky_of_link(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, link: str) -> Tensor:
+    """Log-Cholesky parameters (10,) of a link, called ``link`` in errors.
+
+    Raises :class:`~forcegp.errors.InvalidInput` for a massless frame and :class:`~forcegp.errors.NonPhysicalInertia`
+    where the mass is a line, plate or point.
+    """
+    if mass == 0.0:
+        raise InvalidInput(
+            f"link {link} is a massless frame, so it has no inertial parameters; name the link that carries the mass, "
+            "or give this one an <inertial> element."
+        )
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] + moments[1] - moments[2] <= SINGULAR * moments.sum():
         raise NonPhysicalInertia(
-            f"link {link!r} has a flat, line-like or point-like mass distribution (mass {mass:g} kg, principal moments "
+            f"link {link} has a flat, line-like or point-like mass distribution (mass {mass:g} kg, principal moments "
             f"{', '.join(f'{moment:.6g}' for moment in moments)} kg m^2), for which log-Cholesky parameters do not "
             "exist. Its dynamics is fine; to make its inertia a parameter, give it some thickness in every direction "
             "so that the two smaller principal moments add up to more than the largest."

@@ -12,7 +12,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.robots import algorithms
 from forcegp.robots.arguments import Inertials, Vector, broadcast_batch
-from forcegp.robots.tree import WORLD
+from forcegp.robots.layout import WORLD
 
 if TYPE_CHECKING:
     from forcegp.robots.robot import Robot

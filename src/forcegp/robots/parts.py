@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from forcegp.robots.urdf import InertialDescription, JointDescription
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,11 @@ class Joint:
     damping: float  # Nms/rad or Ns/m
     friction: float  # Nm or N
 
+    @classmethod
+    def of(cls, joint: JointDescription) -> Joint:
+        """What a description says about a movable joint, without its place in the tree."""
+        return cls(**{field.name: getattr(joint, field.name) for field in fields(cls)})
+
 
 @dataclass(frozen=True)
 class Link:
@@ -31,3 +38,11 @@ class Link:
     mass: float  # kg; 0 for a massless frame
     center_of_mass: tuple[float, float, float]  # m, in the link frame
     inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
+
+    @classmethod
+    def of(cls, name: str, joint: str | None, inertial: InertialDescription | None) -> Link:
+        """A link with its inertia; without one it is a massless frame."""
+        if inertial is None:
+            return cls(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
+        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
+        return cls(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)

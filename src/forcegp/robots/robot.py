@@ -6,18 +6,30 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
-from forcegp.robots import urdf_writer
-from forcegp.robots.arguments import Inertials, Vector, armature_values, broadcast_batch, check_tensor, finite_vector
-from forcegp.robots.inertia import log_cholesky_of_body, physical_from_parameters, pseudo_inertia_factor
+from forcegp.robots.arguments import (
+    Inertials,
+    Vector,
+    armature_values,
+    broadcast_batch,
+    check_mapping,
+    check_tensor,
+    finite_vector,
+    locked_positions,
+)
+from forcegp.robots.inertia import log_cholesky_of_link, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
+from forcegp.robots.layout import WORLD, Layout, check_inertias, lay_out
 from forcegp.robots.parts import Joint, Link
-from forcegp.robots.tree import WORLD, Layout, Tree, check_inertias, compile_tree, lay_out
-from forcegp.robots.urdf import RobotDescription, parse_urdf, read_text
+from forcegp.robots.tree import Tree, compile_tree, merged_inertias
+from forcegp.robots.urdf import RobotDescription, parse_urdf
+from forcegp.robots.urdf_file import read_text, write_text
+from forcegp.robots.urdf_writer import replace_inertial
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -76,7 +88,7 @@ class Robot:
     ) -> Robot:
         """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
         description = parse_urdf(text, source=source)
-        locked = {name: float(position) for name, position in (locked or {}).items()}
+        locked = locked_positions(locked or {})
         layout = lay_out(description, locked)
         check_inertias(description, layout)
         names = tuple(joint.name for joint in layout.joints)
@@ -94,14 +106,14 @@ class Robot:
         """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
         text = self.urdf_text
         for name, parameters in inertials.items():
-            self._require_moving(name)
+            self.layout.require_moving(name, self.name)
             self._check_parameters(name, parameters)
             if parameters.dim() != 1:
                 raise InvalidInput(
                     f"inertials[{name!r}] has shape {tuple(parameters.shape)}; a robot holds one set, give shape (10,)."
                 )
             mass, center, inertia = (value.detach().cpu().numpy() for value in physical_from_parameters(parameters))
-            text = urdf_writer.replace_inertial(text, name, float(mass), center, inertia, source=self.source)
+            text = replace_inertial(text, name, float(mass), center, inertia, source=self.source)
         return self._rebuilt(text, self.armature)
 
     def with_armature(self, armature: Vector | Mapping[str, float | int]) -> Robot:
@@ -118,11 +130,7 @@ class Robot:
 
     def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> Robot:
         robot = Robot.from_urdf_text(
-            text,
-            source=self.source,
-            gravity=self.gravity,
-            armature=armature,
-            locked=self.locked,
+            text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked
         )
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
@@ -146,8 +154,7 @@ class Robot:
     @property
     def joints(self) -> tuple[Joint, ...]:
         """Movable joints in the order of q."""
-        shown = Joint.__dataclass_fields__
-        return tuple(Joint(**{key: getattr(joint, key) for key in shown}) for joint in self.layout.joints)
+        return tuple(map(Joint.of, self.layout.joints))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -190,11 +197,7 @@ class Robot:
         if placement is None:
             raise UnknownLink(unknown_name_message("link", name, self.name, self.layout.links))
         joint = None if placement.body == WORLD else self.joint_names[placement.body]
-        inertial = self.description.links[name]
-        if inertial is None:
-            return Link(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
-        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
-        return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
+        return Link.of(name, joint, self.description.links[name])
 
     def joint(self, name: str) -> Joint:
         """One movable joint by name."""
@@ -211,21 +214,19 @@ class Robot:
         """
         out = {}
         for name in links:
-            self._require_moving(name)
-            inertial = self.description.links[name]
-            if inertial is None or inertial.mass == 0.0:
-                raise InvalidInput(
-                    f"link {name!r} of {self.name} is a massless frame, so it has no inertial parameters; name the "
-                    "link that carries the mass, or give this one an <inertial> element."
-                )
-            parameters = log_cholesky_of_body(inertial.mass, inertial.center_of_mass, inertial.inertia, link=name)
+            self.layout.require_moving(name, self.name)
+            link = self.link(name)
+            inertia = np.array(link.inertia)
+            parameters = log_cholesky_of_link(
+                link.mass, np.array(link.center_of_mass), inertia, f"{name!r} of {self.name}"
+            )
             out[name] = parameters.to(self.device)
         return out
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given."""
         if path is not None:
-            urdf_writer.write_text(self.urdf_text, Path(path))
+            write_text(self.urdf_text, Path(path))
         return self.urdf_text
 
     def __repr__(self) -> str:
@@ -339,37 +340,11 @@ class Robot:
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
-        if not isinstance(inertials, Mapping):
-            raise InvalidInput(
-                f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
-            )
-        names = tuple(inertials)
-        for name in names:
-            self._check_parameters(name, inertials[name])
-            self._require_moving(name)
-        batch = broadcast_batch({f"inertials[{name!r}]": inertials[name].shape[:-1] for name in names})
-        parameters = torch.stack([inertials[name].expand(*batch, 10) for name in names])
-        offsets = torch.stack([self._frames[name][1] for name in names])
-        factor = offsets.reshape(len(names), *(1 for _ in batch), 4, 4) @ pseudo_inertia_factor(parameters)
-        given = (factor @ factor.mT).movedim((-2, -1), (1, 2))
-        # sum over the links that stay rather than subtract those that change: no cancellation
-        tree, moving = self.tree, self.layout.moving
-        stay = [i for i, name in enumerate(moving) if name not in inertials]
-        kept = (tree.carried[:, stay] @ tree.link_inertias[stay].flatten(1)).unflatten(1, (4, 4))
-        change = [moving.index(name) for name in names]
-        added = (tree.carried[:, change] @ given.flatten(1)).unflatten(1, given.shape[1:])
-        return kept.reshape(self.nv, 4, 4, *(1 for _ in batch)) + added
-
-    def _require_moving(self, link: str) -> None:
-        placement = self.layout.links.get(link)
-        if placement is None:
-            raise UnknownLink(unknown_name_message("link", link, self.name, self.layout.links))
-        if placement.body == WORLD:
-            moving = ", ".join(self.layout.moving)
-            raise InvalidInput(
-                f"link {link!r} of {self.name} is fixed in the world, so its inertia never enters the dynamics and "
-                f"cannot be a parameter; name a moving link: {moving}"
-            )
+        check_mapping(inertials)
+        for name, parameters in inertials.items():
+            self.layout.require_moving(name, self.name)
+            self._check_parameters(name, parameters)
+        return merged_inertias(self.tree, self.layout, inertials)
 
     def _check_parameters(self, link: str, parameters: object) -> None:
         check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
@@ -24,7 +23,6 @@ from forcegp.errors import (
     MalformedUrdf,
     MissingElement,
     UnexpandedXacro,
-    UnreadableRobotFile,
     UnsafeXml,
     UnsupportedJoint,
 )
@@ -73,42 +71,6 @@ class RobotDescription:
     source: str
     links: dict[str, InertialDescription | None]
     joints: tuple[JointDescription, ...]
-
-
-def read_text(path: str | Path) -> str:
-    """Decode a URDF file; :class:`UnreadableRobotFile` where there is none or it is not text."""
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise UnreadableRobotFile(f"{path}: no such file; give the path of a URDF file.") from None
-    except IsADirectoryError:
-        inside = sorted(entry.name for entry in path.iterdir() if entry.suffix == ".urdf")
-        hint = f" It holds {', '.join(inside)}." if inside else ""
-        raise UnreadableRobotFile(f"{path}: is a directory; give the path of the URDF file itself.{hint}") from None
-    except OSError as error:
-        raise UnreadableRobotFile(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
-        ) from None
-    encoding = declared_encoding(data)
-    try:
-        return data.decode(encoding)
-    except (UnicodeDecodeError, LookupError):
-        raise UnreadableRobotFile(
-            f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
-            '(<?xml version="1.0" encoding="..."?>).'
-        ) from None
-
-
-def declared_encoding(data: bytes) -> str:
-    """Encoding of an XML file from its byte-order mark or XML declaration; UTF-8 by default."""
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "utf-16"
-    head = data.removeprefix(b"\xef\xbb\xbf")[:200].split(b"?>")[0].decode("ascii", errors="replace")
-    if head.startswith("<?xml") and "encoding" in head:
-        value = head.split("encoding", 1)[1].lstrip(" \t\r\n=")
-        return value[1:].split(value[:1], 1)[0] if value[:1] in "'\"" else "utf-8"
-    return "utf-8"
 
 
 def parse_urdf(text: str, *, source: str) -> RobotDescription:

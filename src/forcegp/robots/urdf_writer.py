@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
 
-from forcegp.errors import InvalidInput, UnknownLink
-from forcegp.robots.urdf import declared_encoding
+from forcegp.errors import UnknownLink
 
 
 def replace_inertial(
@@ -35,19 +32,6 @@ def replace_inertial(
         opened = data[: head_end - 2].rstrip() + b">"
         return (opened + element + newline + indent + b"</link>" + data[head_end:]).decode("utf-8")
     return (data[:head_end] + element + data[head_end:]).decode("utf-8")
-
-
-def write_text(text: str, path: Path) -> None:
-    """Write URDF text in the encoding that it declares, to a temporary file that is then renamed."""
-    if not path.parent.is_dir():
-        raise InvalidInput(f"{path}: the folder {path.parent} does not exist; create it first.")
-    data = text.encode(declared_encoding(text[:200].encode("utf-8")))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _find_link(data: bytes, link: str) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
