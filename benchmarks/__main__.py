@@ -1,7 +1,7 @@
 """Run every benchmark in one process on one thread, print, and write `results.json` and the table of `README.md`.
 
-    make bench                              all questions
-    python -m benchmarks likelihood         some of them (the others keep their stored results)
+make bench                              all questions
+python -m benchmarks likelihood         some of them (the others keep their stored results)
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How well does the structured model learn from 100 points, and is it calibrated?
 
-For each seed: a train and a test trajectory of `kuka-surface` with different way-points, 100 training points by farthest-point
-sampling, noise 0.1 rad/s^2; every 12th row of the test trajectory is scored.
+For each seed: a train and a test trajectory of `kuka-surface` with different way-points, 100 training points by
+farthest-point sampling, noise 0.1 rad/s^2; every 12th row of the test trajectory is scored.
 
     python -m benchmarks learning
 """
@@ -23,7 +23,7 @@ POINTS = 100
 def run() -> dict[str, float]:
     """Measure and print; returns the keys of results.json that this question answers."""
     scores: dict[str, list] = {"analytical": [], "zero": []}
-    print(f"{'seed':>4} {'mean':>10} {'MAE':>7} {'noise-free':>10} {'NLPD':>7} {'coverage':>8} {'|A a - b|':>9} {'CPU s':>6}")
+    print("seed       mean     MAE noise-free    NLPD coverage |A a - b|  CPU s")
     for seed in SEEDS:
         train = simulate_kuka_surface(KukaSurfaceConfig(seconds=SECONDS, seed=seed))
         test = simulate_kuka_surface(KukaSurfaceConfig(seconds=SECONDS, seed=1000 + seed)).rows(slice(0, None, 12))
