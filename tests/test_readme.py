@@ -1,0 +1,23 @@
+"""The README's Python example runs as it stands and prints what its comments say."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_the_python_example_runs(repository: Path, tmp_path: Path):
+    (example,) = re.findall(r"```python\n(.*?)```", (repository / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 12
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    acceleration, forces, error = done.stdout.splitlines()
+    assert acceleration == "torch.Size([1200, 7]) torch.Size([1200, 7, 7])"
+    assert forces == "torch.Size([1200, 1]) torch.Size([1200, 7])"
+    assert float(error.split()[3]) < 0.2
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"model.json", "tensors.safetensors", "robot.urdf"}
+
+
+def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
+    links = re.findall(r"\]\(([^)#]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
+    missing = [link for link in links if not link.startswith("http") and not (repository / link).exists()]
+    assert not missing
