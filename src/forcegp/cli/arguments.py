@@ -23,8 +23,8 @@ Begin with:
   forcegp demo
 
 or step by step:
-  forcegp simulate kuka-surface --seconds 60 --seed 1 --out train.h5
-  forcegp simulate kuka-surface --seconds 60 --seed 2 --out test.h5
+  forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
+  forcegp simulate kuka-surface --seconds 100 --seed 2 --out test.h5
   forcegp fit train.h5 --points 100 --out run
   forcegp evaluate run test.h5 --plots figures
 

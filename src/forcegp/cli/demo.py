@@ -60,7 +60,7 @@ class Demo(Command):
     """The training trajectory has seed K, the test trajectory K + 1."""
     points: Annotated[int, arg(metavar="N")] = 100
     """Training points."""
-    seconds: Annotated[float, arg(metavar="S")] = 60.0
+    seconds: Annotated[float, arg(metavar="S")] = 100.0
     """Length of each trajectory in s."""
     iterations: Annotated[int, arg(metavar="N")] = 200
     """Most iterations of each fit."""
@@ -87,7 +87,7 @@ class Demo(Command):
             terminal.note(f"drew {', '.join(pictures)}")
             results = self._results(models, evaluations, time.monotonic() - start)
             write_json(folder / "results.json", results)
-            options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations")}
+            options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
             write_config(folder, KIND, {"options": options, "machine": results["machine"]})
         self._show(terminal, evaluations, results["wall_seconds"])
         return results

@@ -71,7 +71,7 @@ class Evaluate(Command):
                 write_json(folder / "evaluation.json", scores)
                 write_config(folder, KIND, {"options": {name: scores[name] for name in ("run", "data", "every")}})
             terminal.note(f"plots: {self.plots}")
-        terminal.say(*_report(posterior, evaluation, self.data))
+        terminal.say(*_report(posterior, evaluation, dataset, self.data))
         return scores
 
 
@@ -110,11 +110,13 @@ def draw(terminal: Terminal, folder: Path, posterior: StructuredPosterior, datas
     return list(figures)
 
 
-def _report(posterior: StructuredPosterior, evaluation: Evaluation, data: Path) -> list[Any]:
+def _report(posterior: StructuredPosterior, evaluation: Evaluation, dataset: Dataset, data: Path) -> list[Any]:
     from forcegp.cli.tables import evaluation_table, facts, number
 
     points = len(posterior.likelihood.training.q)
-    title = f"{points} training points, {posterior.model.mean} mean; {evaluation.rows} rows of {data}"
+    units = dataset.units["a"]
+    unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
+    title = f"{points} training points, {posterior.model.mean} mean; {evaluation.rows} rows of {data}; errors in {unit}"
     floor = "" if evaluation.noise_floor is None else f" (a perfect model has {number(evaluation.noise_floor)})"
     values = {
         "MAE": f"{number(evaluation.mae)}{floor}",

@@ -162,7 +162,7 @@ def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fittin
     options: OptimizerOptions = how["options"]
     restarts = default_restarts(how["points"]) if how["restarts"] is None else how["restarts"]
     steps = options.iterations + options.adam_steps
-    with terminal.progress(f"{name}: {how['points']} points") as report:
+    with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
 
         def progress(restart: int, iteration: int, value: float) -> None:
             start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
@@ -201,6 +201,7 @@ def fit_summary(posterior: StructuredPosterior, wall_seconds: float) -> dict[str
         "objective_start": result.history[0],
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
+        "restarts": posterior.settings["restarts"],
         "iterations": len(result.history) - 1,
         "evaluations": result.evaluations,
         "converged": result.converged,
@@ -230,14 +231,15 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
 
     noise = summary["noise_std"]
     shown = f"{noise[0]:.4g}" if len(set(noise)) == 1 else " ".join(f"{std:.3g}" for std in noise)
+    ending = "converged" if summary["converged"] else f"not converged ({summary['status']})"
     table = facts(
         f"{run}: learned from {summary['points']} points",
         {
             "objective": f"{summary['objective_start']:.1f} → {summary['objective']:.1f} nats",
             "negative log likelihood": f"{summary['nll']:.1f} nats",
             "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
-            "search": "converged" if summary["converged"] else f"not converged: {summary['status']}",
-            "noise": f"{shown} (standard deviation)",
+            "search": f"{ending}, the best of {summary['restarts']} starts" if summary["restarts"] > 1 else ending,
+            "noise std": shown,
             "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
         },
     )

@@ -28,7 +28,7 @@ class Simulate(Command):
     (Rath, Geist, Trimpe 2021). Equal seeds give equal motions; train and test need different ones.
 
     For instance:
-      forcegp simulate kuka-surface --seconds 60 --seed 1 --out train.h5
+      forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
     """
 
     scenario: Positional[Literal["kuka-surface"]]

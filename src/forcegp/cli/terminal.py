@@ -90,14 +90,14 @@ class Terminal:
         self.err.print(f"warning: {' '.join(text.split())}", style="yellow", markup=False)
 
     @contextmanager
-    def progress(self, what: str) -> Iterator[Report]:
+    def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[Report]:
         """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
         if self.err.is_terminal:
-            yield from self._bar(what)
+            yield from self._bar(what, may_end_early)
         else:
-            yield _PlainProgress(self, what).report
+            yield _PlainProgress(self, what, may_end_early).report
 
-    def _bar(self, what: str) -> Iterator[Report]:
+    def _bar(self, what: str, may_end_early: bool) -> Iterator[Report]:
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
         columns = (
@@ -112,7 +112,7 @@ class Terminal:
             start = time.monotonic()
 
             def report(done: int, total: int, note: str = "") -> None:
-                remaining = _remaining(time.monotonic() - start, done, total)
+                remaining = _remaining(time.monotonic() - start, done, total, may_end_early)
                 bars.update(task, completed=done, total=total, note=note and f"  {note}", remaining=remaining)
 
             yield report
@@ -121,9 +121,10 @@ class Terminal:
 class _PlainProgress:
     """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
 
-    def __init__(self, terminal: Terminal, what: str) -> None:
+    def __init__(self, terminal: Terminal, what: str, may_end_early: bool) -> None:
         self.terminal = terminal
         self.what = what
+        self.may_end_early = may_end_early
         self.start = self.spoke = time.monotonic()
 
     def report(self, done: int, total: int, note: str = "") -> None:
@@ -131,13 +132,14 @@ class _PlainProgress:
         if now - self.spoke < PLAIN_SECONDS or done >= total:
             return
         self.spoke = now
-        parts = [f"{done / total:.0%}", _remaining(now - self.start, done, total), note]
+        parts = [f"{done / total:.0%}", _remaining(now - self.start, done, total, self.may_end_early), note]
         self.terminal.note(f"{self.what}: {', '.join(part for part in parts if part)}")
 
 
-def _remaining(elapsed: float, done: int, total: int) -> str:
-    """`12 s left`: at the speed so far, at most."""
+def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> str:
+    """`12 s left` at the speed so far, or `at most 12 s left`."""
     if not 0 < done < total or elapsed < 1.0:
         return ""
     seconds = elapsed * (total - done) / done
-    return f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"
+    time_left = f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"
+    return f"at most {time_left}" if may_end_early else time_left

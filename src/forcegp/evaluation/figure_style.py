@@ -83,7 +83,9 @@ def _render(figure: Figure) -> Image:
     canvas = figure.canvas
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas
-    return Image.fromarray(pixels[..., :3].copy()).quantize(256, dither=Image.Dither.NONE)
+    return Image.fromarray(pixels[..., :3].copy()).quantize(
+        256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+    )
 
 
 def window(dataset: Dataset, start: float, seconds: float) -> Dataset:
