@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.signal import butter, sosfiltfilt
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
@@ -40,6 +39,8 @@ def zero_phase_low_pass(
         )
     if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= 12:
         raise InvalidInput(f"order is {order!r}; it must be an integer from 1 to 12.")
+    from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
+
     sections = butter(order, cutoff, fs=sample_rate, output="sos")
     slowest = np.abs(butter(order, cutoff, fs=sample_rate, output="zpk")[1]).max()
     padding = max(int(np.ceil(np.log(TRANSIENT) / np.log(slowest))), order + 1)

@@ -181,10 +181,11 @@ def minimize_objective(
         )
         remaining -= int(result.nit)
         converged = bool(result.success)
-        status = str(result.message)
-        if result.status != LINE_SEARCH_FAILED or search.failures == failures_before:
-            break
-        status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
+        status = _sentence(int(result.status), str(result.message), options)
+        if result.status != LINE_SEARCH_FAILED or result.nit == 0:
+            break  # a line search that fails at once, with an empty memory, has nothing left to try
+        if search.failures > failures_before:
+            status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
     if search.failures:
         status += f" ({search.failures} of {search.evaluations} evaluations failed, the last because {search.cause})"
     return OptimizationResult(
@@ -196,6 +197,17 @@ def minimize_objective(
         evaluations=search.evaluations,
         cpu_seconds=time.process_time() - start_time,
     )
+
+
+def _sentence(status: int, message: str, options: OptimizerOptions) -> str:
+    """What scipy's L-BFGS-B says, in words that tell what to do."""
+    if status == 0 and "GRADIENT" in message:
+        return f"converged: the largest gradient entry is below {options.gradient_tolerance:g}"
+    if status == 0:
+        return f"converged: an iteration lowers the objective by less than {options.tolerance:g} of it"
+    if status == LINE_SEARCH_FAILED:
+        return "stopped where no step lowers the objective, as far as rounding lets it be seen"
+    return f"stopped at the limit of {options.iterations} iterations; raise `iterations` to search on"
 
 
 def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float], None]) -> None:

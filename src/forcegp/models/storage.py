@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -85,7 +86,7 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
         save_file(tensors, temporary / "tensors.safetensors")
         (temporary / "robot.urdf").write_text(urdf, encoding="utf-8")
         (temporary / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        temporary.chmod(0o755)
+        _share(temporary)
         if path.exists():
             shutil.rmtree(path)
         temporary.rename(path)
@@ -168,6 +169,15 @@ def _document(path: Path) -> dict[str, Any]:
             f"({document.get('forcegp_version')}) or fit again"
         )
     return document
+
+
+def _share(folder: Path) -> None:
+    """Give the folder and its files the permissions that the umask allows; temporary ones are private."""
+    mask = os.umask(0)
+    os.umask(mask)
+    folder.chmod(0o777 & ~mask)
+    for file in folder.iterdir():
+        file.chmod(0o666 & ~mask)
 
 
 def _is_model_folder(path: Path) -> bool:
