@@ -182,10 +182,10 @@ def minimize_objective(
         remaining -= int(result.nit)
         converged = bool(result.success)
         status = _sentence(int(result.status), str(result.message), options)
+        if result.status == LINE_SEARCH_FAILED and search.failures > failures_before:
+            status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
         if result.status != LINE_SEARCH_FAILED or result.nit == 0:
             break  # a line search that fails at once, with an empty memory, has nothing left to try
-        if search.failures > failures_before:
-            status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
     if search.failures:
         status += f" ({search.failures} of {search.evaluations} evaluations failed, the last because {search.cause})"
     return OptimizationResult(
