@@ -62,10 +62,10 @@ class StructuredPosterior:
     def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Prediction:
         """Distribution of the acceleration and of the forces behind it.
 
-        States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints).         Arrays, lists and tensors
-        are taken; results are float64 tensors. With `covariance=False` only means are computed, much faster.
-        Differentiable in q, v and u where these are tensors that require gradients. Raises InvalidInput for wrong
-        shapes or values that are not finite.
+        States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
+        taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
+        in q, v and u where these are tensors that require gradients.
+        Raises InvalidInput for wrong shapes or values that are not finite.
         """
         nv = self.system.robot.nv
         states = _broadcast(_tensor("q", q, nv), _tensor("v", v, nv), _tensor("u", u, nv))
