@@ -35,7 +35,7 @@ class Prediction(Gaussian):
     `multiplier` is lambda (..., m); `contact_force` the world force on the robot at each contact in turn (..., 3 m) in
     N; `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean
     includes Q_K. Accelerations show nothing of a force along the contact normals: that part of `unknown_force`, and
-    through it `multiplier` and `contact_force`, rests on the prior alone, and is no more certain than the prior is right.
+    through it `multiplier` and `contact_force`, rests on the prior alone, and is no surer than the prior is right.
     `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with noisy data.
     """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -31,6 +32,9 @@ RESTART_SPREAD = 0.7
 """Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
 none.
 """
+
+SMOOTHER = 4.0
+"""Factor on the length scales of odd restarts: measured, these escape the local optima of the start from moments."""
 
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
@@ -91,8 +95,8 @@ class StructuredGP:
         dataset: rows with the joints of the robot in its order; nothing in it is changed.
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
         restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
-            factors, and the best final value wins. None means 4 up to 400 points, where local optima cost most and
-            searches cost little, and 1 beyond.
+            factors, every other one from a smoother start; the best final value wins. None means 4 up to 400 points,
+            where local optima cost most and searches cost little, and 1 beyond.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
@@ -238,14 +242,20 @@ class _Search:
 
 
 def _perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
-    """Kernel parameters shifted by seeded normal numbers on their log scale; the noise keeps its start."""
+    """Kernel parameters shifted by seeded normal numbers on their log scale; the noise keeps its start.
+
+    Odd restarts begin near a linear function, at a multiple of the length scales and its square of the variance.
+    """
     generator = np.random.default_rng((seed, index))
-    return {
-        name: value
-        if name in (ACCELERATION, FORCE)
-        else value + RESTART_SPREAD * torch.as_tensor(generator.standard_normal(tuple(value.shape)))
-        for name, value in start.items()
-    }
+    shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
+    shifted = {}
+    for name, value in start.items():
+        if name in (ACCELERATION, FORCE):
+            shifted[name] = value
+            continue
+        shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)
+        shifted[name] = value + shift + RESTART_SPREAD * torch.as_tensor(generator.standard_normal(tuple(value.shape)))
+    return shifted
 
 
 def _blas_threads(likelihood: MarginalLikelihood) -> AbstractContextManager[Any]:
