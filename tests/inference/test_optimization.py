@@ -154,10 +154,9 @@ def test_adam_is_that_of_torch():
     adam, values = torch.optim.Adam([x], lr=0.05), []
     for _ in range(8):
         adam.zero_grad()
-        value = rosenbrock({"x": x})
-        values.append(float(value.detach()))
-        value.backward()
+        rosenbrock({"x": x}).backward()
         adam.step()
+        values.append(float(rosenbrock({"x": x}).detach()))
     result = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=8, adam_rate=0.05, iterations=0))
     assert result.history[1:] == pytest.approx(values)
 
@@ -300,3 +299,14 @@ def test_the_best_of_several_starts_says_so():
     assert chosen.value == near.value < far.value
     assert chosen.status.endswith("(best of 2 starts)")
     assert best_of([far]) is far
+
+
+def test_steps_that_shrink_before_a_wall_are_not_convergence():
+    def walled(parameters):
+        if float(parameters["x"].detach()[0]) > 2.0:
+            raise NumericalError("beyond the wall")
+        return (parameters["x"] - 3.0).square().sum()
+
+    result = minimize_objective(walled, {"x": tensor(0.0)})
+    assert not result.converged
+    assert "beyond the wall" in result.status

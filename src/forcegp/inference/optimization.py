@@ -19,6 +19,9 @@ ProgressCallback = Callable[[int, float], None]
 LINE_SEARCH_FAILED = 2
 """scipy's L-BFGS-B: neither converged (0) nor stopped by a limit (1)."""
 
+SOME_FAILURES = 10
+"""A line search that strays now and then meets this many points without a value at most; more of them are a wall."""
+
 
 @dataclass(frozen=True)
 class OptimizerOptions:
@@ -182,8 +185,13 @@ def minimize_objective(
         remaining -= int(result.nit)
         converged = bool(result.success)
         status = _sentence(int(result.status), str(result.message), options)
+        steep = bool(np.abs(search.best_slope).max() > options.gradient_tolerance)
         if result.status == LINE_SEARCH_FAILED and search.failures > failures_before:
             status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
+        elif converged and steep and search.failures > failures_before + SOME_FAILURES:
+            # Steps that shrink before a region without values look like convergence to the line search.
+            converged = False
+            status = "stopped beside parameters at which the objective cannot be evaluated"
         if result.status != LINE_SEARCH_FAILED or result.nit == 0:
             break  # a line search that fails at once, with an empty memory, has nothing left to try
     if search.failures:
@@ -214,13 +222,14 @@ def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float], 
     """Kingma & Ba (2015), algorithm 1; ends early at the first point that cannot be evaluated."""
     point = torch.as_tensor(search.best_point.copy()).requires_grad_()
     optimizer = torch.optim.Adam([point], lr=options.adam_rate)
+    slope = search.best_slope
     for _ in range(options.adam_steps):
+        point.grad = torch.as_tensor(slope.copy())
+        optimizer.step()
         evaluated = search.evaluate(point.detach().numpy())
         if evaluated is None:
             return
         value, slope = evaluated
-        point.grad = torch.as_tensor(slope)
-        optimizer.step()
         record(value)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, negative_log_likelihood
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.models.noise import Noise
+from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.priors import ForcePrior
 
 Mean = Literal["analytical", "zero"]
@@ -76,13 +76,21 @@ class MarginalLikelihood:
     def dynamics(self, parameters: Mapping[str, Tensor] | None = None) -> ConstrainedDynamics:
         """The constrained dynamics of the training states, at the inertial parameters among `parameters`."""
         inertials = inertials_of(parameters or {})
-        if not inertials:
+        if not inertials and not self._known_forces_are_learned:
             return self._nominal_dynamics
         return self.system.dynamics(self.training.q, self.training.v, self.training.u, inertials)
 
+    @property
+    def _known_forces_are_learned(self) -> bool:
+        """Whether a tensor inside a known force wants a gradient; then nothing that depends on it may be kept."""
+        forces = self.system.known_forces
+        values = [getattr(force, name) for force in forces for name in force.per_joint]
+        return any(isinstance(value, Tensor) and value.requires_grad for value in values)
+
     @cached_property
     def _nominal_dynamics(self) -> ConstrainedDynamics:
-        return self.system.dynamics(self.training.q, self.training.v, self.training.u)
+        with torch.no_grad():
+            return self.system.dynamics(self.training.q, self.training.v, self.training.u)
 
     @cached_property
     def standardization(self) -> Standardization:
@@ -128,7 +136,14 @@ class MarginalLikelihood:
         return LatentKernels(self.prior.kernels(tuple(z.shape[-1] for z in self._nominal_features), variances))
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
-        """The negative log marginal likelihood, exact and differentiable in every parameter."""
+        """The negative log marginal likelihood, exact and differentiable in every parameter.
+
+        Raises InvalidInput for a parameter of a name that means nothing here.
+        """
+        known = {*kernels.initial_parameters(), ACCELERATION, FORCE}
+        unknown = next((name for name in parameters if name not in known and not name.startswith(INERTIALS)), None)
+        if unknown is not None:
+            raise InvalidInput(f"no parameter {unknown!r}; there are {', '.join(sorted(known))} and {INERTIALS}<link>")
         features, W, residual, noise = self.terms(parameters)
         return negative_log_likelihood(W, residual, noise, kernels.matrices(parameters, features))
 

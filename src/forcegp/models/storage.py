@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from forcegp import __version__
 from forcegp.data import units_for
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import FileFormatError, ForceGPError
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.marginal_likelihood import TrainingData
@@ -84,7 +84,7 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
     try:
         save_file(tensors, temporary / "tensors.safetensors")
-        (temporary / "robot.urdf").write_text(urdf, encoding="utf-8")
+        (temporary / "robot.urdf").write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
         (temporary / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         _share(temporary)
         if path.exists():
@@ -102,12 +102,12 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
 
     Raises
     ------
-    FileFormatError: not such a folder, damaged, changed by hand, or written by a newer version.
+    FileFormatError: not such a folder, damaged, or written by another version.
     """
     path = Path(path)
     document = _document(path)
     try:
-        urdf = (path / "robot.urdf").read_text(encoding="utf-8")
+        urdf = (path / "robot.urdf").read_bytes().decode("utf-8")
         tensors = load_file(path / "tensors.safetensors")
     except (OSError, SafetensorError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
@@ -134,18 +134,32 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             float(result["cpu_seconds"]),
         )
         names = document["joint_names"]
-        settings = document["settings"]
-    except (KeyError, TypeError, InvalidInput) as error:
+        settings = dict(document["settings"])
+    except (KeyError, TypeError, ValueError, RuntimeError, ForceGPError) as error:
         raise FileFormatError(f"{path / 'model.json'} is incomplete or damaged: {error}") from None
+    if document.get("units") != _plain(units_for(system.robot)):
+        raise FileFormatError(f"{path / 'model.json'} states units that are not those of its robot's joints")
     if list(system.robot.joint_names) != names:
         raise FileFormatError(
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
-    expected = model.parameter_shapes(training)
-    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
-    if given != expected:
-        raise FileFormatError(f"{path / 'tensors.safetensors'} does not hold the parameters of its model")
+    _check_tensors(path / "tensors.safetensors", model, training, parameters)
     return model.condition(training, parameters, optimization, settings)
+
+
+def _check_tensors(
+    file: Path, model: StructuredGP, training: TrainingData, parameters: Mapping[str, torch.Tensor]
+) -> None:
+    states = {name: getattr(training, name) for name in STATES}
+    shape = (training.q.shape[0], model.system.robot.nv) if training.q.dim() == 2 else None
+    for name, value in {**states, **parameters}.items():
+        if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
+            raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
+        if name in states and value.shape != shape:
+            raise FileFormatError(f"{file} is damaged: training {name} has shape {tuple(value.shape)}")
+    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
+    if given != model.parameter_shapes(training):
+        raise FileFormatError(f"{file} does not hold the parameters of its model")
 
 
 def _document(path: Path) -> dict[str, Any]:

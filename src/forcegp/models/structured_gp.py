@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -115,7 +115,10 @@ class StructuredGP:
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         if restarts < 1 or jobs < 1:
             raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
-        training = TrainingData(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u, rows.a)))
+        if seed < 0:
+            raise InvalidInput(f"seed={seed} must be 0 or larger")
+        device = self.system.robot.device
+        training = TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
         kernels = likelihood.kernels()
@@ -130,7 +133,11 @@ class StructuredGP:
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
-        result = best_of(usable)
+        result = replace(
+            best_of(usable),
+            evaluations=sum(search.evaluations for search in usable),
+            cpu_seconds=sum(search.cpu_seconds for search in usable),
+        )
         settings = {
             "points": len(rows),
             "rows_available": len(dataset),

@@ -68,7 +68,8 @@ class StructuredPosterior:
         Raises InvalidInput for wrong shapes or values that are not finite.
         """
         nv = self.system.robot.nv
-        states = _broadcast(_tensor("q", q, nv), _tensor("v", v, nv), _tensor("u", u, nv))
+        device = self.system.robot.device
+        states = _broadcast(_tensor("q", q, nv, device), _tensor("v", v, nv, device), _tensor("u", u, nv, device))
         batch = states[0].shape[:-1]
         flat = [x.reshape(-1, nv) for x in states]
         rows = flat[0].shape[0]
@@ -120,12 +121,12 @@ class StructuredPosterior:
         return changed
 
 
-def _tensor(name: str, values: Array, nv: int) -> Tensor:
+def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
     if isinstance(values, Tensor):
         tensor = values.to(torch.float64)
     else:
         try:
-            tensor = torch.from_numpy(np.array(values, dtype=np.float64))  # a copy: datasets are read-only
+            tensor = torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
         except (TypeError, ValueError) as error:
             raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None
     if tensor.dim() == 0 or tensor.shape[-1] != nv:
