@@ -345,13 +345,15 @@ def test_wrong_options(options, message):
 
 
 def test_singular_mass_matrix_is_an_error():
-    point_on_axis = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
-      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial></link>
+    body = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
       <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+    vanishing = torch.zeros(10, dtype=torch.float64)
+    vanishing[0] = -400.0  # the mass e^-800 underflows to zero
     one = torch.ones(1, dtype=torch.float64)
     with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
-        Robot.from_urdf_text(point_on_axis).forward_dynamics(one, one, one)
-    acceleration = Robot.from_urdf_text(point_on_axis, armature=(0.5,)).forward_dynamics(one, one, one)
+        Robot.from_urdf_text(body).forward_dynamics(one, one, one, {"b": vanishing})
+    acceleration = Robot.from_urdf_text(body, armature=(0.5,)).forward_dynamics(one, one, one, {"b": vanishing})
     torch.testing.assert_close(acceleration, 2.0 * one)
 
 
@@ -365,3 +367,12 @@ def test_constants_move_to_another_device(chain):
     assert chain.device.type == "cpu"
     with pytest.raises(InvalidInput, match="q is on cpu but the robot on meta"):
         moved.mass_matrix(torch.zeros(4, dtype=torch.float64))
+
+
+def test_a_frame_is_given_as_a_copy(chain):
+    name = chain.frame_names[-1]
+    body, offset = chain.frame(name)
+    kept = offset.clone()
+    offset.fill_(7.0)
+    assert chain.frame(name)[0] == body
+    torch.testing.assert_close(chain.frame(name)[1], kept, rtol=0, atol=0)

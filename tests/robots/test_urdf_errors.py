@@ -42,6 +42,7 @@ def without_inertial(text: str) -> str:
 
 ENTITIES = '<!DOCTYPE robot [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>' + SMALL.replace("small", "&b;")
 IXX = 'ixx="0.1"'
+ROD = '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0"/>'  # along z, the axis of the hinge
 
 WRONG = {
     "empty": ("", errors.MalformedUrdf, ["is empty", "<robot name"]),
@@ -147,6 +148,32 @@ WRONG = {
         errors.NonPhysicalInertia,
         ["link 'arm'", "0.1, 0.1, 0.21", "triangle inequality", "Correct its <inertial>"],
     ),
+    "triangle inequality by little": (
+        changed(IXX, 'ixx="0.20000005"'),
+        errors.NonPhysicalInertia,
+        ["link 'arm'", "0.20000005", "triangle inequality"],
+    ),
+    "barely negative inertia": (
+        changed(IXX, 'ixx="-1e-10"'),
+        errors.NonPhysicalInertia,
+        ["link 'arm'", "not positive definite", "-1e-10"],
+    ),
+    "all mass on the joint axis": (
+        re.sub("<inertia .*/>", ROD, changed("0.1 0 0", "0 0 0.3")),
+        errors.NonPhysicalInertia,
+        ["link 'arm'", "joint 'hinge'", "no rotational inertia", "armature={'hinge': ...}"],
+    ),
+    **{
+        f"{attribute} {value}": (
+            changed("<limit ", f'<dynamics {attribute}="{value}"/><limit '),
+            errors.InvalidNumber,
+            ["joint 'hinge'", f"<dynamics> {attribute} is {value}", "finite number >= 0"],
+        )
+        for attribute in ("damping", "friction")
+        for value in ("-0.1", "inf", "-inf")
+    },
+    "negative effort": (changed('"5"', '"-5"'), errors.InvalidNumber, ["joint 'hinge'", "effort is -5", ">= 0"]),
+    "negative velocity": (changed('"3"', '"-3"'), errors.InvalidNumber, ["joint 'hinge'", "velocity is -3", ">= 0"]),
     "two parents": (
         with_joint("second", "base", "arm"),
         errors.KinematicLoop,
@@ -232,7 +259,21 @@ def test_rounding_of_an_ideal_plate_is_forgiven():
     plate = SMALL.replace('ixx="0.1"', 'ixx="0.0333333"').replace('iyy="0.1"', 'iyy="0.0666667"')
     assert Robot.from_urdf_text(plate).nv == 1
     with pytest.raises(errors.NonPhysicalInertia):
-        Robot.from_urdf_text(plate.replace('"0.0666667"', '"0.0666600"'))
+        Robot.from_urdf_text(plate.replace('"0.0666667"', '"0.0666666"'))
+
+
+def test_a_rod_turns_about_another_axis_slides_along_its_own_or_has_a_rotor():
+    rod = re.sub("<inertia .*/>", ROD, changed("0.1 0 0", "0 0 0.3"))
+    q = torch.zeros(1, dtype=torch.float64)
+    across = Robot.from_urdf_text(rod.replace('<axis xyz="0 0 1"/>', '<axis xyz="1 0 0"/>'))
+    assert across.mass_matrix(q).item() == pytest.approx(0.1 + 2 * 0.3**2)
+    assert Robot.from_urdf_text(rod.replace("revolute", "prismatic")).mass_matrix(q).item() == pytest.approx(2.0)
+    assert Robot.from_urdf_text(rod, armature={"hinge": 0.02}).mass_matrix(q).item() == pytest.approx(0.02)
+
+
+def test_infinite_limits_are_no_limits():
+    joint = Robot.from_urdf_text(changed('effort="5"', 'effort="inf"')).joint("hinge")
+    assert joint.effort_limit == np.inf
 
 
 def test_joints_may_stand_in_any_order_before_their_links():

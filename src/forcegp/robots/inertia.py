@@ -18,8 +18,8 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
-# relative to the largest principal moment: what printing an ideal rod or plate with six digits costs
-ROUNDING = 1e-6
+# relative to the trace of the inertia: what turning an ideal rod or plate in float64 costs, with a wide margin
+ROUNDING = 1e-10
 # relative thickness squared below which log-Cholesky parameters (logarithms) say nothing any more
 SINGULAR = 1e-12
 
@@ -96,7 +96,8 @@ def pseudo_inertia(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray)
 def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> str | None:
     """What makes these inertial parameters physically impossible, or ``None`` if a body can have them.
 
-    Ideal rods, plates and points (singular pseudo-inertia) are possible; a violation within rounding is forgiven.
+    Ideal rods, plates and points (singular pseudo-inertia) are possible; a violation within float64 rounding is
+    forgiven. Whether a joint can move such a body is for :func:`axis_inertia_vanishes` to say.
     """
     if not (np.isfinite(mass) and np.isfinite(center_of_mass).all() and np.isfinite(inertia).all()):
         return "it holds values that are not finite"
@@ -105,8 +106,8 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
     if mass == 0.0:
         return "its mass is zero but its inertia is not" if inertia.any() else None
     moments = np.linalg.eigvalsh(inertia)
-    listed = ", ".join(f"{moment:.6g}" for moment in moments)
-    slack = ROUNDING * max(abs(moments).max(), np.finfo(np.float64).tiny)
+    listed = ", ".join(f"{moment:.10g}" for moment in moments)
+    slack = ROUNDING * abs(moments).sum()
     if moments[0] < -slack:
         return f"its inertia is not positive definite (principal moments {listed} kg m^2)"
     if moments[0] + moments[1] < moments[2] - slack:
@@ -115,6 +116,16 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
             "(the two smaller must add up to the largest at least)"
         )
     return None
+
+
+def axis_inertia_vanishes(pseudo: np.ndarray) -> bool:
+    """Whether all mass of a body (pseudo-inertia (4, 4), joint axis along z through the origin) lies on that axis.
+
+    The inertia about the axis is ``P_xx + P_yy``; below ``SINGULAR`` of the trace of the second moments it is what
+    rounding left of zero.
+    """
+    second_moments = pseudo.diagonal()[:3]
+    return bool(second_moments[:2].sum() <= SINGULAR * second_moments.sum())
 
 
 def log_cholesky_of_link(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, link: str) -> Tensor:

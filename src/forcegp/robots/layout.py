@@ -24,7 +24,7 @@ from forcegp.errors import (
     UnsupportedJoint,
     unknown_name_message,
 )
-from forcegp.robots.inertia import physical_objection
+from forcegp.robots.inertia import axis_inertia_vanishes, physical_objection, pseudo_inertia
 from forcegp.robots.spatial import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.urdf import MOVABLE, InertialDescription, JointDescription, RobotDescription
 
@@ -156,9 +156,15 @@ def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
     return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
 
 
-def check_inertias(description: RobotDescription, layout: Layout) -> None:
-    """Every moving link must be physically possible and every body have mass; links fixed in the world need not be."""
+def check_inertias(description: RobotDescription, layout: Layout, armature: np.ndarray) -> None:
+    """Every moving link must be physically possible and every body resist its joint, by itself or by ``armature`` (n,).
+
+    A body resists a prismatic joint by its mass and any other joint by its inertia about the axis. Where all bodies do,
+    the mass matrix is positive definite at every position: the moving joint nearest to the base moves its body by
+    itself alone. Links fixed in the world need no inertia.
+    """
     mass = np.zeros(len(layout.joints))
+    bodies = np.zeros((len(layout.joints), 4, 4))
     for name, placement in layout.links.items():
         inertial: InertialDescription | None = description.links[name]
         if placement.body == WORLD or inertial is None:
@@ -170,13 +176,20 @@ def check_inertias(description: RobotDescription, layout: Layout) -> None:
                 "<inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)."
             )
         mass[placement.body] += inertial.mass
+        local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
+        bodies[placement.body] += placement.offset @ local @ placement.offset.T
     for body, joint in enumerate(layout.joints):
+        carried = [name for name, placement in layout.links.items() if placement.body == body and name != joint.child]
+        others = f" and the links fixed to it ({', '.join(map(repr, carried))})" if carried else ""
         if mass[body] == 0.0:
-            carried = [
-                name for name, placement in layout.links.items() if placement.body == body and name != joint.child
-            ]
-            others = f" and the links fixed to it ({', '.join(map(repr, carried))})" if carried else ""
             raise MissingInertia(
                 f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no mass; "
                 f"add an <inertial> element, make the joint fixed, or lock it with locked={{{joint.name!r}: 0.0}}."
+            )
+        if joint.type != "prismatic" and armature[body] == 0.0 and axis_inertia_vanishes(bodies[body]):
+            raise NonPhysicalInertia(
+                f"{description.source}: link {joint.child!r}{others} turns with joint {joint.name!r} but has no "
+                "rotational inertia about its axis, so any force would accelerate it infinitely; correct its "
+                "<inertial> element, or give the rotor inertia of the joint with "
+                f"armature={{{joint.name!r}: ...}} in kg m^2."
             )

@@ -90,13 +90,14 @@ class Robot:
         description = parse_urdf(text, source=source)
         locked = locked_positions(locked or {})
         layout = lay_out(description, locked)
-        check_inertias(description, layout)
         names = tuple(joint.name for joint in layout.joints)
+        rotor_inertias = armature_values(armature, names, description.name)
+        check_inertias(description, layout, rotor_inertias)
         tree = compile_tree(
             description,
             layout,
             gravity=finite_vector("gravity", gravity, 3),
-            armature=armature_values(armature, names, description.name),
+            armature=rotor_inertias,
             device=torch.device("cpu"),
         )
         frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
@@ -325,7 +326,8 @@ class Robot:
         found = self._frames.get(name)
         if found is None:
             raise UnknownFrame(unknown_name_message("frame", name, self.name, self._frames))
-        return found
+        body, offset = found
+        return body, offset.clone()
 
     def check_input(self, name: str, value: object) -> None:
         """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""

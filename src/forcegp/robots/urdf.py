@@ -183,6 +183,16 @@ def _scalar(element: Element | None, attribute: str, default: float, place: _Pla
     return value
 
 
+def _non_negative(element: Element | None, attribute: str, default: float, place: _Place) -> float:
+    """A number >= 0 that may be absent; only what may be absent as infinite may be infinite."""
+    value = _scalar(element, attribute, default, place)
+    if value < 0.0 or (math.isinf(value) and not math.isinf(default)):
+        allowed = "a number >= 0" if math.isinf(default) else "a finite number >= 0"
+        what = "" if element is None else f"<{element.tag}> "
+        raise InvalidNumber(f"{place}: {what}{attribute} is {value:g}; give {allowed}, or leave it out.")
+    return value
+
+
 def _vector(element: Element | None, attribute: str, default: tuple[float, ...], place: _Place) -> np.ndarray:
     if element is None or attribute not in element.attrib:
         return np.array(default, dtype=np.float64)
@@ -265,9 +275,9 @@ def _joint(
         axis=unit,
         lower=lower,
         upper=upper,
-        velocity_limit=_scalar(limit, "velocity", math.inf, place),
-        effort_limit=_scalar(limit, "effort", math.inf, place),
-        damping=_scalar(dynamics, "damping", 0.0, place),
-        friction=_scalar(dynamics, "friction", 0.0, place),
+        velocity_limit=_non_negative(limit, "velocity", math.inf, place),
+        effort_limit=_non_negative(limit, "effort", math.inf, place),
+        damping=_non_negative(dynamics, "damping", 0.0, place),
+        friction=_non_negative(dynamics, "friction", 0.0, place),
         mimics=None if mimic is None else mimic.get("joint", "another joint"),
     )
