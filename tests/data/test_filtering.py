@@ -121,6 +121,15 @@ def test_only_the_named_signals_change_and_the_noise_of_a_is_then_unknown():
         np.testing.assert_array_equal(values, kept[name])
 
 
+def test_truth_goes_where_the_rows_it_belongs_to_change():
+    data = dataset(80, truth={"a": np.zeros((80, 2))})
+    for signal in ("q", "v", "u"):
+        assert low_pass(data, 20.0, signals=(signal,)).truth == {}
+    assert differentiated(data, "q").truth == {}
+    for kept in (low_pass(data, 20.0, signals=("a",)), differentiated(data, "v")):
+        np.testing.assert_array_equal(kept.truth["a"], data.truth["a"])
+
+
 def test_what_cannot_be_filtered_is_named():
     data = dataset(80)
     with pytest.raises(InvalidInput, match="below 50"):

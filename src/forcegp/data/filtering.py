@@ -85,7 +85,8 @@ def low_pass(
 ) -> Dataset:
     """The Dataset with the named signals low-pass filtered (`zero_phase_low_pass`) within each episode.
 
-    Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Raises as
+    Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Filtering q,
+    v or u drops `truth`: with it, the equation of motion would no longer hold in the changed rows. Raises as
     `zero_phase_low_pass` and `uniform_step`, naming the episode; DatasetError for rows that are not in order of time
     and for positions that jump by a turn.
     """
@@ -98,15 +99,16 @@ def low_pass(
         return zero_phase_low_pass(getattr(rows, name), 1.0 / uniform_step(rows.time, label), cutoff, order)
 
     changed = _by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
-    return replace(dataset, **changed, noise_std=None if "a" in signals else dataset.noise_std)
+    noise_std = None if "a" in signals else dataset.noise_std
+    return replace(dataset, **changed, truth=dataset.truth if set(signals) == {"a"} else {}, noise_std=noise_std)
 
 
 def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset:
     """The Dataset with `a` computed from `v` by central differences, or `v` and `a` from `q`, within each episode.
 
-    Differences amplify noise: filter `source` first (`low_pass`). `noise_std` becomes None. Raises DatasetError for
-    rows that are not in order of time, episodes of fewer than 3 rows and positions that jump by a turn; InvalidInput
-    for another source.
+    Differences amplify noise: filter `source` first (`low_pass`). `noise_std` becomes None. `truth` is dropped where
+    `v` changes: the equation of motion would no longer hold with it. Raises DatasetError for rows that are not in
+    order of time, episodes of fewer than 3 rows and positions that jump by a turn; InvalidInput for another source.
     """
     if source not in ("q", "v"):
         raise InvalidInput(f"source is {source!r}; allowed: 'q' (gives v and a) or 'v' (gives a).")
@@ -118,7 +120,8 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
         velocity = differentiate(rows.q, rows.time)
         return {"v": velocity, "a": differentiate(velocity, rows.time)}
 
-    return replace(dataset, **_by_episode(dataset, derivatives), noise_std=None)
+    truth = dataset.truth if source == "v" else {}
+    return replace(dataset, **_by_episode(dataset, derivatives), truth=truth, noise_std=None)
 
 
 def resample(dataset: Dataset, step: float) -> Dataset:
