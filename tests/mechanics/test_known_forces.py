@@ -272,3 +272,10 @@ def test_a_force_of_the_user():
     assert_close(known(SpringPerJoint(NUMBERS)).dynamics(q, v, u).Q_K, -TENSOR * q, 1e-14)
     with pytest.raises(InvalidInput, match="a Spring cannot be stored; files carry actuation"):
         known(Spring(2.0)).to_json()
+
+
+def test_numbers_are_copied():
+    numbers = np.array(NUMBERS)
+    bound = ViscousJointFriction(torch.from_numpy(numbers)).bound_to(chain())
+    numbers[:] = -1.0
+    assert bound.coefficients.tolist() == NUMBERS

@@ -158,7 +158,7 @@ def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
 
 
 def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
-    """One non-negative float64 number per joint, on the robot's device; tensors keep their graph."""
+    """One non-negative float64 number per joint, on the robot's device: a copy, in which tensors keep their graph."""
     if isinstance(given, Mapping):
         unknown = next((joint for joint in given if joint not in robot.joint_names), None)
         if unknown is not None:
@@ -179,4 +179,4 @@ def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
         )
     if not bool(((values >= 0) & torch.isfinite(values)).all()):
         raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number >= 0.")
-    return values
+    return values.clone()
