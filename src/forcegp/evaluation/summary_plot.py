@@ -24,15 +24,18 @@ from forcegp.evaluation.figure_style import (
 )
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.evaluation.prediction_plot import legend_entries
-from forcegp.evaluation.tool_path_plot import draw_tool_path, finish_tool_path
+from forcegp.evaluation.tool_path_plot import (
+    draw_tool_path,
+    excerpt,
+    finish_tool_path,
+    fit_figure_to_path,
+    tool_path_title,
+)
 from forcegp.models import StructuredPosterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-PATH_SECONDS = 20.0
-"""Length of the path that is drawn: more becomes a tangle."""
 
 
 def summary_figure(
@@ -56,7 +59,9 @@ def summary_figure(
     figure = new_figure(10.0, 6.6)
     grid = figure.add_gridspec(3, len(joints), height_ratios=(1.15, 1.0, 1.0))
     top = figure.add_subplot(grid[0, :])
-    finish_tool_path(figure, top, draw_tool_path(top, posterior, window(dataset, start, PATH_SECONDS)))
+    lines = draw_tool_path(top, posterior, dataset, start=start)
+    fit_figure_to_path(figure, top, least=1.4, most=2.0)
+    finish_tool_path(figure, top, lines, tool_path_title(posterior.system, dataset, start=start))
     names = short_joint_names(rows.joint_names)
     units = {quantity: joint_units(rows, quantity) for quantity in ("a", "u")}
     for column, joint in enumerate(joints):
@@ -74,7 +79,8 @@ def summary_figure(
         handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False, markerscale=4
     )
     figure.suptitle(
-        f"{len(posterior.likelihood.training.q)} points teach the force that nobody modelled",
+        f"{len(posterior.likelihood.training.q)} points teach the force that nobody modelled"
+        + excerpt(rows, dataset, before=" (time panels: ", after=")"),
         fontsize=LARGE + 1,
         fontweight="bold",
         x=0.01,

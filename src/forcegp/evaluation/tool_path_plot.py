@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.figure_style import (
+    NORMAL,
     QUIET,
     SMALL,
     TRUTH,
@@ -18,7 +19,7 @@ from forcegp.evaluation.figure_style import (
     quiet,
     speed_colors,
 )
-from forcegp.mechanics import MechanicalSystem
+from forcegp.mechanics import MechanicalSystem, Plane
 from forcegp.models import StructuredPosterior
 
 if TYPE_CHECKING:
@@ -26,24 +27,34 @@ if TYPE_CHECKING:
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
+PATH_SECONDS = 20.0
+"""Length of the path that is drawn: more becomes a tangle."""
+
 
 def tool_path_figure(posterior: StructuredPosterior, dataset: Dataset) -> Figure:
-    """The first contact point seen from above, coloured by speed, the training points, and its distance to the surface.
+    """The first contact point on x, y, coloured by speed, the training points, and its distance to the surface.
 
     Raises InvalidInput for a system without contacts: there is no surface to show.
     """
-    figure = new_figure(9.0, 4.4)
-    path, height = figure.subplots(2, 1, height_ratios=(1.9, 1.0))
+    figure = new_figure(9.0, 4.6)
+    path, height = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
     lines = draw_tool_path(path, posterior, dataset)
-    finish_tool_path(figure, path, lines)
+    fit_figure_to_path(figure, path, least=2.0, most=4.0)
+    finish_tool_path(figure, path, lines, tool_path_title(posterior.system, dataset))
     _draw_height(height, posterior.system, dataset)
     return figure
 
 
-def draw_tool_path(axes: Axes, posterior: StructuredPosterior, dataset: Dataset) -> LineCollection:
-    """The path of the test data coloured by speed (m/s) and the training points on top; returns the coloured lines."""
+def draw_tool_path(
+    axes: Axes, posterior: StructuredPosterior, dataset: Dataset, *, start: float = 0.0
+) -> LineCollection:
+    """The path of the test data coloured by speed (m/s) and the training points on top; returns the coloured lines.
+
+    Drawn are at most PATH_SECONDS of the recording, from `start` seconds on.
+    """
     from matplotlib.collections import LineCollection
 
+    dataset = _path_rows(dataset, start)
     position, speed, _ = tool_motion(posterior.system, dataset.q, dataset.v)
     segments = np.stack([position[:-1, :2], position[1:, :2]], axis=1)
     pauses = np.diff(dataset.time)
@@ -65,19 +76,72 @@ def draw_tool_path(axes: Axes, posterior: StructuredPosterior, dataset: Dataset)
         markeredgewidth=0.9,
         label=f"training: {len(points)} points",
     )
-    axes.set_aspect("equal")
     axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="datalim")  # wider limits fill the panel; "box" would shrink it to a stamp
     return lines
 
 
-def finish_tool_path(figure: Figure, axes: Axes, lines: LineCollection) -> None:
+def fit_figure_to_path(figure: Figure, axes: Axes, *, least: float, most: float) -> None:
+    """Let the first row of the figure grow for a tall path: `least` and `most` are its parts of the row heights."""
+    grid = axes.get_gridspec()
+    assert grid is not None  # the axes come from subplots
+    rows = [least, *list(grid.get_height_ratios())[1:]]  # type: ignore[arg-type]
+    inch = figure.get_figheight() / sum(rows)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    wanted = 0.8 * figure.get_figwidth() * (high - low) / (right - left) / inch
+    rows[0] = float(np.clip(wanted, least, most))
+    grid.set_height_ratios(rows)
+    figure.set_figheight(inch * sum(rows))
+
+
+def tool_path_title(system: MechanicalSystem, dataset: Dataset, *, start: float = 0.0) -> str:
+    """What the map shows: from which side, and how much of the recording."""
+    surface = system.contacts[0].surface
+    level = isinstance(surface, Plane) and bool(np.hypot(*surface.normal[:2]) < 1e-6)
+    side = "seen from above" if level else "projected on x, y"
+    return f"Tool on the surface, {side}{excerpt(_path_rows(dataset, start), dataset, before=': ')}"
+
+
+def excerpt(part: Dataset, whole: Dataset, *, before: str = "", after: str = "") -> str:
+    """`20 s of 100 s` between the given texts if the part is shorter than the whole, nothing otherwise."""
+    shown, recorded = (_elapsed(dataset)[1].max(initial=0.0) for dataset in (part, whole))
+    texts = [f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s" for seconds in (shown, recorded)]
+    return "" if texts[0] == texts[1] else f"{before}{texts[0]} of {texts[1]}{after}"
+
+
+def _elapsed(dataset: Dataset) -> tuple[Int[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """The order of the rows by episode and time, and in it the recorded seconds, one episode after the other."""
+    order = np.lexsort((dataset.time, dataset.episode))
+    steps = np.diff(dataset.time[order], prepend=dataset.time[order[:1]])
+    steps[1:][np.diff(dataset.episode[order]) != 0] = 0.0
+    return order, np.cumsum(steps)
+
+
+def _path_rows(dataset: Dataset, start: float) -> Dataset:
+    order, elapsed = _elapsed(dataset)
+    chosen = order[(elapsed >= start) & (elapsed <= start + PATH_SECONDS)]
+    if not chosen.size:
+        raise InvalidInput(f"no rows from {start} s on: the recording lasts {elapsed.max(initial=0.0):.3g} s.")
+    return dataset.rows(chosen)
+
+
+def finish_tool_path(figure: Figure, axes: Axes, lines: LineCollection, title: str) -> None:
     """Labels, legend and the scale of speeds."""
-    quiet(axes, title="Tool on the surface, seen from above", x="x in m", y="y in m")
+    quiet(axes, x="x in m", y="y in m")
+    axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH, pad=20.0)  # a row of its own above the legend
     bar = figure.colorbar(lines, ax=axes, pad=0.01, aspect=12)
     bar.set_label("speed in m/s", fontsize=SMALL, color=QUIET)
     bar.ax.tick_params(labelsize=SMALL, labelcolor=QUIET)
     bar.outline.set_visible(False)  # type: ignore[operator]  # the stubs call it a spine with another signature
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=SMALL, frameon=False, borderaxespad=0.2)
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=2,
+        fontsize=SMALL,
+        frameon=False,
+        borderaxespad=0.1,
+        borderpad=0.2,
+    )
 
 
 def tool_motion(
