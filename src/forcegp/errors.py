@@ -117,6 +117,10 @@ class NumericalWarning(UserWarning):
     """Something was repaired (jitter added, say) and the result is still usable."""
 
 
+class DataWarning(UserWarning):
+    """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
+
+
 def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str]) -> str:
     """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Frames: ...`."""
     names = sorted(valid)

@@ -39,11 +39,22 @@ def unknown_force(v: torch.Tensor) -> torch.Tensor:
     return -0.8 * torch.tanh(v / 0.4) - 0.3 * v
 
 
+def on_the_plane(system: MechanicalSystem, q: np.ndarray) -> np.ndarray:
+    """The nearest postures with the tool on the first contact's surface, by Newton's method."""
+    at = torch.tensor(q)
+    rest = torch.zeros_like(at)
+    for _ in range(20 if system.contacts else 0):
+        A = system.dynamics(at, rest, rest).A[:, :1]
+        distance = system.contacts[0].distance(system.robot.kinematics(at))
+        at = at - (torch.linalg.pinv(A) @ distance[:, None, None])[..., 0]
+    return at.numpy()
+
+
 def arm_data(rows: int, seed: int, system: MechanicalSystem | None = None) -> Dataset:
     """Random states, the exact constrained acceleration and noise of standard deviation NOISE on it."""
     system = system or arm_system()
     generator = np.random.default_rng(seed)
-    q = generator.uniform([-1.0, 0.3, 0.3], [1.0, 1.2, 1.2], (rows, 3))
+    q = on_the_plane(system, generator.uniform([-1.0, 0.3, 0.3], [1.0, 1.2, 1.2], (rows, 3)))
     v = generator.normal(0.0, 0.7, (rows, 3))
     u = generator.normal(0.0, 3.0, (rows, 3))
     states = [torch.tensor(x) for x in (q, v, u)]

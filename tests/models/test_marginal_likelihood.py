@@ -7,6 +7,7 @@ from tests.inference.dense import dense_negative_log_likelihood
 from tests.models.arm import arm_data, arm_system
 
 from forcegp.errors import InvalidInput
+from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
 from forcegp.models import MarginalLikelihood, Noise, TrainingData
 from forcegp.priors import JointForces
 
@@ -94,3 +95,29 @@ def test_data_that_equal_the_mean_have_nothing_to_learn():
     exact = MarginalLikelihood(model.system, model.prior, "analytical", TrainingData(data.q, data.v, data.u, a))
     with pytest.raises(InvalidInput, match="equal the mean exactly"):
         exact.kernels()
+
+
+def test_a_known_force_that_is_being_learned_is_never_kept():
+    base = likelihood()
+    kernels = base.kernels()
+    parameters = kernels.initial_parameters() | Noise(0.1).parameters(3)
+
+    def with_damping(damping):
+        system = arm_system(known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(damping)))
+        return MarginalLikelihood(system, JointForces(), "analytical", base.training)
+
+    damping = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, requires_grad=True)
+    model = with_damping(damping)
+    model.kernels()  # fills whatever the model keeps
+    first, second = (torch.autograd.grad(model(kernels, parameters), damping)[0] for _ in range(2))
+    assert torch.equal(first, second)
+    for joint, step in enumerate(1e-5 * torch.eye(3, dtype=torch.float64)):
+        above, below = (float(with_damping(damping.detach() + sign * step)(kernels, parameters)) for sign in (1, -1))
+        assert (above - below) / 2e-5 == pytest.approx(float(first[joint]), rel=1e-5)
+
+
+def test_an_unknown_parameter_is_named():
+    model = likelihood()
+    kernels = model.kernels()
+    with pytest.raises(InvalidInput, match=r"no parameter 'inertial\.hand'"):
+        model(kernels, all_parameters(model, kernels) | {"inertial.hand": torch.zeros(10).double()})

@@ -6,12 +6,14 @@ import sys
 
 import pytest
 import torch
-from tests.models.arm import arm_data, arm_system
+from safetensors.torch import load_file, save_file
+from tests.models.arm import URDF, arm_data, arm_system
 
 from forcegp.errors import ContactError, FileFormatError
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, ImplicitSurface
 from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
+from forcegp.robots import Robot
 
 FILES = {"model.json", "tensors.safetensors", "robot.urdf"}
 OPTIONS = OptimizerOptions(iterations=3)
@@ -106,6 +108,9 @@ def test_a_missing_or_damaged_file_is_named(run, name):
         ({"joint_names": ["a", "b", "c"]}, "trained on joints a, b, c"),
         ({"model": {}}, "incomplete or damaged"),
         ({"urdf_sha256": "0"}, "hash differs"),
+        ({"units": {"q": "deg"}}, "units that are not those"),
+        ({"settings": 5}, "incomplete or damaged"),
+        ({"result": {"value": "abc"}}, "incomplete or damaged"),
     ],
 )
 def test_a_changed_document_is_refused(run, change, message):
@@ -133,3 +138,21 @@ def test_a_surface_that_is_code_cannot_be_stored(tmp_path):
     with pytest.raises(ContactError, match="never code"):
         save_posterior(fitted, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_urdf_with_other_line_ends_comes_back(data, tmp_path):
+    robot = Robot.from_urdf_text(URDF.replace("\n", "\r\n"))
+    fitted = StructuredGP(data.system.with_robot(robot)).fit(data, points=8, restarts=1, options=OPTIONS)
+    save_posterior(fitted, tmp_path / "run")
+    assert load_posterior(tmp_path / "run").system.robot.urdf_text == robot.urdf_text
+
+
+@pytest.mark.parametrize("name", ["training.a", "parameters.kernels.0.raw_outputscale"])
+@pytest.mark.parametrize(
+    "damage", [lambda x: x.float(), lambda x: x * float("nan"), lambda x: x.reshape(-1)[:1].repeat(2, 1)]
+)
+def test_tensors_of_another_type_shape_or_value_are_refused(run, name, damage):
+    tensors = load_file(run / "tensors.safetensors")
+    save_file(tensors | {name: damage(tensors[name]).contiguous()}, run / "tensors.safetensors")
+    with pytest.raises(FileFormatError, match="tensors"):
+        load_posterior(run)

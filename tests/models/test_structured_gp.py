@@ -6,7 +6,7 @@ import torch
 from tests.models.arm import NOISE, URDF, arm_data, arm_system
 
 from forcegp.data import Dataset
-from forcegp.errors import ContactError, FitError, InvalidInput
+from forcegp.errors import ContactError, DataWarning, FitError, InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, MechanicalSystem, Plane
 from forcegp.models import Noise, StructuredGP
@@ -168,7 +168,7 @@ def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
 def test_the_hyperprior_can_be_left_out(train):
     model = StructuredGP(train.system)
     options = OptimizerOptions(iterations=100)
-    plain = model.fit(train, points=20, restarts=1, hyperprior=False, options=options)
+    plain = model.fit(train, points=20, restarts=4, hyperprior=False, options=options)
     held = model.fit(train, points=20, restarts=1, options=options)
     assert plain.result.value == pytest.approx(plain.negative_log_likelihood, abs=1e-6)
     assert plain.negative_log_likelihood < held.negative_log_likelihood < held.result.value
@@ -206,6 +206,7 @@ def test_redundant_contacts_change_nothing(train, test):
         ({"points": 61}, "points=61 is not between 2 and the 60 rows"),
         ({"points": 1}, "points=1"),
         ({"restarts": 0}, "restarts=0"),
+        ({"seed": -1}, "seed=-1"),
     ],
 )
 def test_bad_numbers_are_refused(train, change, message):
@@ -234,6 +235,21 @@ def test_wrong_mean_and_contradictory_contacts_are_refused(train):
     )
     with pytest.raises(ContactError, match="contradict"):
         StructuredGP(system).fit(train)
+
+
+def test_a_surface_far_from_the_data_is_pointed_out(train):
+    raised = train.system.with_contacts((Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9)),))
+    with pytest.warns(DataWarning, match=r"more than 0\.49 m from the surface of contact 0 \(frame 'hand'\)"):
+        StructuredGP(raised).fit(train, points=10, restarts=1, options=OptimizerOptions(iterations=1))
+
+
+def test_parts_of_the_wrong_kind_are_named(train):
+    with pytest.raises(InvalidInput, match="system is a Robot; give a MechanicalSystem"):
+        StructuredGP(train.system.robot)
+    with pytest.raises(InvalidInput, match="Noise acceleration is 'loud'"):
+        StructuredGP(train.system, noise="loud")
+    assert StructuredGP(train.system, noise=0.2).noise == Noise(0.2)
+    assert Noise(np.array([0.1, 0.2])).acceleration == (0.1, 0.2)
 
 
 def test_a_fit_that_cannot_start_names_the_cause(train):

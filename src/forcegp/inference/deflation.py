@@ -16,7 +16,7 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 
-RANK_TOLERANCE = 1e-10
+RANK_TOLERANCE = 1e-12
 """Singular values of W~_i below this fraction of the largest one count as zero (they come from rounding in H A^T =
 0).
 """

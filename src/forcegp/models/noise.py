@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -24,6 +24,9 @@ class Noise:
     the hyperprior of a learned one is log-normal around its start value, with a factor of e as one standard deviation.
     The covariance of one row is diag(acceleration^2) + H diag(force^2) H^T.
     """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
 
     acceleration: float | tuple[float, ...] = 0.1
     force: float | tuple[float, ...] | None = None
@@ -87,9 +90,12 @@ class Noise:
         )
 
 
-def _positive(name: str, given: float | Sequence[float]) -> float | tuple[float, ...]:
-    several = isinstance(given, Sequence)
-    numbers = tuple(float(entry) for entry in given) if several else (float(given),)
-    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
-        raise InvalidInput(f"Noise {name} is {given!r}; standard deviations must be positive and finite.")
-    return numbers if several else numbers[0]
+def _positive(name: str, given: object) -> float | tuple[float, ...]:
+    message = f"Noise {name} is {given!r}; give a positive, finite standard deviation, or one per joint."
+    try:
+        values = torch.as_tensor(given, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(message) from None
+    if values.dim() > 1 or not values.numel() or not bool(((values > 0) & torch.isfinite(values)).all()):
+        raise InvalidInput(message)
+    return tuple(values.tolist()) if values.dim() else float(values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.errors import FitError, InvalidInput
+from forcegp.errors import DataWarning, FitError, InvalidInput
 from forcegp.inference import (
     LatentKernels,
     OptimizationResult,
@@ -39,6 +40,9 @@ SMOOTHER = 4.0
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
 
+FAR_FROM_SURFACE = 0.01
+"""Median distance of the training points from a contact's surface, in m, beyond which a warning is given."""
+
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
 
@@ -60,8 +64,8 @@ class StructuredGP:
     system: robot, contacts and known forces, for example `dataset.system`.
     prior: the unknown force Q_U = B f; the default is one Gaussian process per joint on (q, v, u).
     mean: "analytical" keeps the known forces Q_K in the mean; "zero" drops them, so that the processes carry Q_K + Q_U.
-    noise: measurement noise. None takes `dataset.noise_std`, and raises if the dataset does not know it: then pass
-        `Noise(0.1, learn=True)` to learn it.
+    noise: measurement noise, a `Noise` or just its standard deviation. None takes `dataset.noise_std`, and raises if
+        the dataset does not know it: then pass `Noise(0.1, learn=True)` to learn it.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -73,6 +77,12 @@ class StructuredGP:
     noise: Noise | None = None
 
     def __post_init__(self) -> None:
+        for name, kind in (("system", MechanicalSystem), ("prior", ForcePrior)):
+            if not isinstance(getattr(self, name), kind):
+                given = type(getattr(self, name)).__name__
+                raise InvalidInput(f"{name} is a {given}; give a {kind.__name__}, for example system=dataset.system")
+        if self.noise is not None and not isinstance(self.noise, Noise):
+            object.__setattr__(self, "noise", Noise(self.noise))
         if self.mean not in get_args(Mean):
             raise InvalidInput(f"mean is {self.mean!r}; allowed: {', '.join(map(repr, get_args(Mean)))}")
 
@@ -121,6 +131,7 @@ class StructuredGP:
         training = TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
+        _warn_of_distance(self.system, training)
         kernels = likelihood.kernels()
         noise_parameters = noise.parameters(self.system.robot.nv)
         fixed = {} if noise.learn else noise_parameters
@@ -246,6 +257,23 @@ class _Search:
             return minimize_objective(self.objective, first, self.options, note)
         except FitError as error:
             return error
+
+
+def _warn_of_distance(system: MechanicalSystem, training: TrainingData) -> None:
+    """Warn where most training states are far from a surface that is said to hold them."""
+    kinematics = system.robot.kinematics(training.q)
+    for index, contact in enumerate(system.contacts):
+        # divided by |s_p|, which is 1 for signed distances, the value of any surface is a distance near it
+        size = torch.linalg.vector_norm(contact.surface.gradient(contact.position(kinematics)), dim=-1)
+        distance = float((contact.distance(kinematics) / size).abs().median())
+        if distance > FAR_FROM_SURFACE:
+            warnings.warn(
+                f"half of the training points lie more than {distance:.3g} m from the surface of contact {index} "
+                "(frame "
+                f"{contact.frame!r}); check its surface, point and units (m), or leave the contact out",
+                DataWarning,
+                stacklevel=3,
+            )
 
 
 def _perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
