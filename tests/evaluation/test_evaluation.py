@@ -73,6 +73,26 @@ def test_without_truth_and_noise_level_only_measurements_are_scored(posterior, t
     assert scores["constraint_error"] == evaluation.constraint_error  # of the model's own contact
 
 
+def test_the_noise_of_the_data_counts_and_another_one_of_the_model_is_named(posterior, test_data):
+    std = NOISE * np.array([1.0, 1.4, 3.0])
+    noisier = dataclasses.replace(test_data, noise_std=std)
+    predicted = predict_rows(posterior, noisier)
+    np.testing.assert_allclose(predicted.measurement_variance - predicted.variance, np.tile(std**2, (60, 1)), rtol=1e-9)
+    prediction = posterior.predict(test_data.q[7], test_data.v[7], test_data.u[7])
+    joint = multivariate_normal(prediction.mean.numpy(), prediction.covariance.numpy() + np.diag(std**2))
+    assert predicted.negative_log_density[7] == pytest.approx(-joint.logpdf(test_data.a[7]), rel=1e-8)
+    (warning,) = evaluate(posterior, noisier).warnings
+    assert "the noise std of the model is 0.05, that of the data 0.15 (joint bend" in warning
+    for factor in (0.7, 1.4):
+        assert evaluate(posterior, dataclasses.replace(test_data, noise_std=np.full(3, factor * NOISE))).warnings == ()
+    assert len(evaluate(posterior, dataclasses.replace(test_data, noise_std=np.full(3, 0.6 * NOISE))).warnings) == 1
+
+
+def test_without_a_stated_noise_that_of_the_model_counts(posterior, test_data):
+    predicted = predict_rows(posterior, dataclasses.replace(test_data, noise_std=None))
+    np.testing.assert_allclose(predicted.measurement_variance - predicted.variance, NOISE**2, rtol=1e-9)
+
+
 def test_a_stored_model_scores_the_same(posterior, test_data, evaluation, tmp_path):
     save_posterior(posterior, tmp_path / "run")
     again = evaluate(load_posterior(tmp_path / "run"), test_data)

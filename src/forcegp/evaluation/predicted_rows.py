@@ -17,6 +17,7 @@ from forcegp.evaluation.metrics import negative_log_density
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models import StructuredPosterior
 from forcegp.models.marginal_likelihood import inertials_of
+from forcegp.models.prediction import Prediction
 from forcegp.models.structured_gp import SMALL_COVARIANCE
 
 ROWS_PER_BLOCK = 1024
@@ -26,11 +27,11 @@ ROWS_PER_BLOCK = 1024
 class PredictedRows:
     """What a model says about every row, and the mechanics there.
 
-    `mean`, `variance` of the acceleration without noise, `measurement_variance` with noise; `negative_log_density` of
-    the measured rows; `known_physics` the acceleration of the known forces alone; `moving_force`
-    M (mean - known_physics), the part of the unknown force that moves the robot (the other part presses on the
-    surface); `unknown_force` Q_U and `carried_known_force` what of it is known (Q_K without an analytical mean, else
-    0); `multiplier` lambda; `A`, `b` and the mass matrix `mass`.
+    `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the Dataset if it
+    states it, else with the model's; `negative_log_density` of the measured rows under that noise; `known_physics` the
+    acceleration of the known forces alone; `moving_force` M (mean - known_physics), the part of the unknown force that
+    moves the robot (the other part presses on the surface); `unknown_force` Q_U and `carried_known_force` what of it
+    is known (Q_K without an analytical mean, else 0); `multiplier` lambda; `A`, `b` and the mass matrix `mass`.
     """
 
     mean: Float[np.ndarray, "rows nv"]
@@ -82,7 +83,8 @@ def _predict_block(posterior: StructuredPosterior, dataset: Dataset, block: slic
     prediction = posterior.predict(q, v, u)
     dynamics = posterior.system.dynamics(q, v, u, inertials_of(posterior.parameters))
     own = dynamics if dataset.system is None else dataset.system.dynamics(q, v, u)
-    measurement = _array(_not_none(prediction.measurement.covariance))
+    covariance = _array(_not_none(prediction.covariance))
+    measurement = covariance + _noise_covariance(prediction, dataset)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
     known = _array(dynamics.acceleration_map(known=True).offset)
     return PredictedRows(
@@ -96,12 +98,19 @@ def _predict_block(posterior: StructuredPosterior, dataset: Dataset, block: slic
         multiplier_variance=_array(prediction.multiplier.variance),
         known_physics=known,
         moving_force=(mass @ (mean - known)[..., None])[..., 0],
-        moving_force_variance=np.einsum("nij,njk,nik->ni", mass, _array(_not_none(prediction.covariance)), mass),
+        moving_force_variance=np.einsum("nij,njk,nik->ni", mass, covariance, mass),
         carried_known_force=_carried_known_force(posterior, dynamics),
         A=_array(own.A),
         b=_array(own.b),
         mass=mass,
     )
+
+
+def _noise_covariance(prediction: Prediction, dataset: Dataset) -> Float[np.ndarray, "*rows nv nv"]:
+    """Of the measurements compared with: as the Dataset states it, for they may be noisier than those learned from."""
+    if dataset.noise_std is None:
+        return _array(prediction.noise_covariance)
+    return np.diag(np.square(dataset.noise_std))
 
 
 def _carried_known_force(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> Float[np.ndarray, "rows nv"]:

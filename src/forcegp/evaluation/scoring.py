@@ -15,6 +15,9 @@ from forcegp.evaluation.overlap import overlap_warnings
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models import StructuredPosterior
 
+NOISE_FACTOR = 1.5
+"""Noise levels of model and Dataset that differ by more than this factor are named in a warning."""
+
 
 def evaluate(
     posterior: StructuredPosterior, dataset: Dataset, *, progress: Callable[[int, int], None] | None = None
@@ -37,10 +40,25 @@ def evaluate(
         if dataset.noise_std is None
         else _numbers(metrics.noise_floor(np.asarray(dataset.noise_std))),
         known_physics_mae_per_joint=_numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
-        warnings=overlap_warnings(posterior, dataset),
+        warnings=(*overlap_warnings(posterior, dataset), *_noise_warnings(posterior, dataset)),
         **_against_measurements(predicted, dataset),
         **_against_truth(predicted, dataset),
         **_constraint(predicted),
+    )
+
+
+def _noise_warnings(posterior: StructuredPosterior, dataset: Dataset) -> tuple[str, ...]:
+    """A sentence if model and Dataset disagree about the noise of some joint by more than NOISE_FACTOR."""
+    if dataset.noise_std is None:
+        return ()
+    model, stated = posterior.noise_std.detach().cpu().numpy(), np.asarray(dataset.noise_std)
+    ratio = np.maximum(model / stated, stated / model)
+    joint = int(ratio.argmax())
+    if ratio[joint] <= NOISE_FACTOR:
+        return ()
+    return (
+        f"the noise std of the model is {model[joint]:.3g}, that of the data {stated[joint]:.3g} "
+        f"(joint {dataset.joint_names[joint]}, where they differ most); coverage and NLPD use that of the data.",
     )
 
 
