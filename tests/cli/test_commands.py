@@ -72,6 +72,8 @@ def test_evaluate_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert len(lines) == 7
     assert len({len(line.split()) for line in lines}) == 1
     assert "mean" in done.stdout
+    told = " ".join(done.stdout.split())
+    assert re.search(r"multiplier\) MAE \S+ N, \S+ % in the 95 % band; forces along the contact normal rest on", told)
     names = {file.name for file in figures.iterdir()}
     pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png"}
     assert names == pictures | {"evaluation.json", "config.json"}
@@ -97,12 +99,13 @@ def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path,
     assert done.returncode == 0, done.stderr
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert json.loads(done.stdout) == results
-    assert results["seeds"] == {"train": 1, "test": 2}
+    assert results["seeds"] == {"train": 21, "test": 22}
     models = results["models"]
     assert list(models) == ["S-GP", "S-GP + analytical mean"]
     for model in models.values():
         assert model["evaluation"]["constraint_error"] < 1e-10
         assert model["evaluation"]["warnings"] == []
+        assert 0 < model["fit"]["wall_seconds"] < results["wall_seconds"]
         assert model["published_mae"] is None  # the paper has no value for 12 points
         assert len(load_posterior(tmp_path / model["run"]).likelihood.training.q) == 12
     assert (tmp_path / "demo" / "summary.png").read_bytes().startswith(PNG)
@@ -117,6 +120,7 @@ def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path,
     told = capfd.readouterr().out
     for row in ("known physics alone", "S-GP ", "S-GP + analytical mean", "noise floor"):
         assert re.search(rf"^\s*{re.escape(row)}.*\d\.\d{{4}}", told, re.M), told
+    assert "rest on the prior alone" in " ".join(told.split())
     assert json.loads((tmp_path / "demo" / "results.json").read_text())["seeds"]["train"] == 5
 
 

@@ -1,15 +1,23 @@
 """Whatever goes wrong ends in one line that names it, exit code 2, and no output files."""
 
 import dataclasses
+import os
+import signal
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.models.arm import URDF, arm_data, arm_system
 
 from forcegp.cli.arguments import one_line
+from forcegp.cli.fit import _report
 from forcegp.cli.main import main
-from forcegp.data import Dataset
+from forcegp.cli.terminal import Terminal
+from forcegp.data import Dataset, units_for
+from forcegp.mechanics import MechanicalSystem
 from forcegp.models import load_posterior
+from forcegp.robots import Robot
 
 CONTACT = "hand@0,0,0.2:plane:0.2,0,1,0.4"
 QUICK = ("--points", "8", "--iterations", "2", "--restarts", "1")
@@ -42,9 +50,10 @@ WRONG = [
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --robot missing.urdf --out run", "missing.urdf: no such file"),
     ("fit arm.h5 --points 1 --out run", "points=1 is not between 2 and the 20 rows"),
+    ("fit arm.h5 --seed -1 --out run", "--seed is -1; it must be at least 0"),
     ("fit arm.h5 --restarts 0 --out run", "restarts=0"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
-    ("fit arm.h5 --noise -0.1 --out run", "must be positive"),
+    ("fit arm.h5 --noise -0.1 --out run", "give a positive, finite standard deviation"),
     ("fit arm.h5 --contact plane --out run", "is not FRAME@x,y,z:SURFACE"),
     ("fit arm.h5 --contact hand:plane --out run", "plane needs 4 numbers nx,ny,nz,offset"),
     ("fit arm.h5 --contact hand@0,0:plane:0,0,1,0 --out run", "the point needs 3 numbers"),
@@ -129,6 +138,65 @@ def test_robot_and_contact_replace_those_of_the_dataset(folder):
     np.testing.assert_allclose(system.robot.gravity, [0, 0, -9.81])
     assert main(["fit", "arm.h5", "--contact", "none", *QUICK, "--out", "free"]) == 0
     assert load_posterior("free").system.contacts == ()
+
+
+def test_another_robot_keeps_gravity_armature_and_locked_joints_of_the_recording(folder):
+    recorded = Robot.from_urdf_text(URDF, gravity=(0.0, 1.0, -9.0), armature=(0.1, 0.2), locked={"bend": 0.6})
+    data = arm_data(20, seed=0)
+    two = {name: getattr(data, name)[:, :2] for name in "qvua"}  # any numbers will do
+    dataclasses.replace(
+        data,
+        **two,
+        system=MechanicalSystem(recorded),
+        joint_names=recorded.joint_names,
+        units=units_for(recorded),
+        noise_std=np.full(2, 0.5),
+        truth={},
+    ).save("locked.h5")
+    (folder / "heavier.urdf").write_text(URDF.replace('value="0.6"', 'value="0.9"'))
+    assert main(["fit", "locked.h5", "--robot", "heavier.urdf", *QUICK, "--out", "run"]) == 0
+    robot = load_posterior("run").system.robot
+    np.testing.assert_allclose(robot.gravity, recorded.gravity)
+    np.testing.assert_allclose(robot.armature, [0.1, 0.2])
+    assert robot.locked == {"bend": 0.6}
+    assert 'value="0.9"' in robot.urdf_text
+
+
+@pytest.mark.parametrize("words", ["fit arm.h5 --out run --json", "fit missing.h5 --out run --json"])
+def test_a_program_that_calls_main_goes_on_as_it_was(folder, capfd, words):
+    def handler(number, frame):
+        pass
+
+    before = signal.signal(signal.SIGTERM, handler)
+    shown, target = warnings.showwarning, os.fstat(1)
+    try:
+        main([*words.split(), *QUICK])
+        assert signal.getsignal(signal.SIGTERM) is handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert warnings.showwarning is shown
+    assert os.path.samestat(os.fstat(1), target)
+    capfd.readouterr()
+    os.write(1, b"after")
+    assert capfd.readouterr().out == "after"
+
+
+@pytest.mark.parametrize(
+    ("converged", "status", "shown"),
+    [
+        (True, "converged: flat (3 of 9 evaluations failed, the last because of x)", "search converged: flat (3 of 9"),
+        (False, "stopped at the limit", "search not converged: stopped at the limit"),
+    ],
+)
+def test_the_report_of_a_fit_tells_how_the_search_ended(capsys, converged, status, shown):
+    summary = {
+        **{name: 1.0 for name in ("objective_start", "objective", "nll", "cpu_seconds", "wall_seconds")},
+        **{"points": 5, "iterations": 1, "evaluations": 9, "restarts": 1, "noise_std": [0.1]},
+        "converged": converged,
+        "status": status,
+    }
+    Terminal(json=False).say(*_report(Path("run"), summary))
+    assert shown in " ".join(capsys.readouterr().out.split())
 
 
 def test_known_forces_replace_those_of_the_dataset(folder):

@@ -111,7 +111,7 @@ def draw(terminal: Terminal, folder: Path, posterior: StructuredPosterior, datas
 
 
 def _report(posterior: StructuredPosterior, evaluation: Evaluation, dataset: Dataset, data: Path) -> list[Any]:
-    from forcegp.cli.tables import evaluation_table, facts, number
+    from forcegp.cli.tables import NORMAL_FORCES, evaluation_table, facts, multiplier_scores, number
 
     points = len(posterior.likelihood.training.q)
     units = dataset.units["a"]
@@ -126,4 +126,6 @@ def _report(posterior: StructuredPosterior, evaluation: Evaluation, dataset: Dat
     }
     if evaluation.force_mae is not None:
         values["force that moves the robot"] = f"MAE {number(evaluation.force_mae)} against the truth"
+    if evaluation.multiplier_mae is not None:
+        values["contact force (multiplier)"] = f"{multiplier_scores(evaluation)}; {NORMAL_FORCES}"
     return [evaluation_table(title, evaluation), facts("", values)]

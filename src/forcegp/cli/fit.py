@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from forcegp.inference import OptimizerOptions
     from forcegp.mechanics import MechanicalSystem
     from forcegp.models import Noise, StructuredPosterior
+    from forcegp.robots import Robot
 
 KIND = "forcegp fit"
 START_NOISE = 0.1
@@ -88,6 +89,8 @@ class Fit(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit and save."""
+        if self.seed < 0:
+            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
         from forcegp.data import Dataset
         from forcegp.inference import OptimizerOptions
@@ -124,8 +127,7 @@ class Fit(Command):
         contacts = parse_contacts(self.contact)
         system = dataset.system
         if self.robot is not None:
-            gravity = (0.0, 0.0, -9.81) if system is None else system.robot.gravity.tolist()
-            robot = Robot.from_urdf(self.robot, gravity=gravity)
+            robot = Robot.from_urdf(self.robot) if system is None else _robot_like(system.robot, self.robot)
             if robot.joint_names != tuple(dataset.joint_names):
                 raise InvalidInput(
                     f"{self.robot} has joints {', '.join(robot.joint_names)}; {self.data} has "
@@ -212,6 +214,15 @@ def fit_summary(posterior: StructuredPosterior, wall_seconds: float) -> dict[str
     }
 
 
+def _robot_like(recorded: Robot, urdf: Path) -> Robot:
+    """The robot of that URDF; what no URDF holds is as recorded: gravity, armature, locked joints."""
+    from forcegp.robots import Robot
+
+    robot = Robot.from_urdf(urdf, gravity=recorded.gravity.tolist(), locked=recorded.locked)
+    # Robots with other joints are refused by their names, which says more than the length of the armature.
+    return robot if robot.joint_names != recorded.joint_names else robot.with_armature(recorded.armature.tolist())
+
+
 def _with_known_forces(system: MechanicalSystem, names: tuple[str, ...]) -> MechanicalSystem:
     from dataclasses import replace
 
@@ -231,14 +242,14 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
 
     noise = summary["noise_std"]
     shown = f"{noise[0]:.4g}" if len(set(noise)) == 1 else " ".join(f"{std:.3g}" for std in noise)
-    ending = "converged" if summary["converged"] else f"not converged ({summary['status']})"
+    status = summary["status"]  # names failed evaluations, too, and the number of starts
     table = facts(
         f"{run}: learned from {summary['points']} points",
         {
             "objective": f"{summary['objective_start']:.1f} → {summary['objective']:.1f} nats",
             "negative log likelihood": f"{summary['nll']:.1f} nats",
             "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
-            "search": f"{ending}, the best of {summary['restarts']} starts" if summary["restarts"] > 1 else ending,
+            "search": status if summary["converged"] else f"not converged: {status}",
             "noise std": shown,
             "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
         },

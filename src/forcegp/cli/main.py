@@ -31,8 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"forcegp {__version__}")
         return OK
     debug = "--debug" in given
+    showwarning, terminate = warnings.showwarning, None
     with contextlib.suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGTERM, _terminate)  # so that temporary files are removed then, too
+        terminate = signal.signal(signal.SIGTERM, _terminate)  # so that temporary files are removed then, too
     try:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
@@ -52,6 +53,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
         return _fail(f"an error in forcegp itself, {what} (--debug shows where)", INTERNAL_ERROR, debug)
+    finally:  # a program that calls this goes on as it was
+        warnings.showwarning = showwarning
+        if terminate is not None:
+            signal.signal(signal.SIGTERM, terminate)
     return OK
 
 

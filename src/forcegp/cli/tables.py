@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 
 NONE = "–"
+NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
 
 
 def facts(title: str, values: Mapping[str, str]) -> Table:
@@ -64,6 +65,12 @@ def evaluation_table(title: str, evaluation: Evaluation) -> Table:
         rows.append([name, *cells])
     means = [show(getattr(evaluation, score)) for score, show in formats.items()]
     return columns(title, header, rows, last=["mean (NLPD: joint)", *means])
+
+
+def multiplier_scores(evaluation: Evaluation) -> str:
+    """`MAE 1.2345 N, 90.1 % in the 95 % band`, against the true multipliers."""
+    inside = percent(evaluation.multiplier_coverage_95)
+    return f"MAE {number(evaluation.multiplier_mae)} N, {inside} in the 95 % band"
 
 
 def number(value: float | None) -> str:

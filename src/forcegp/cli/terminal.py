@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import sys
@@ -30,7 +31,7 @@ class Terminal:
     """A context in which a command runs.
 
     With `json`, the process's stdout is pointed at stderr until the result is printed, so that nothing a library prints
-    (not even from C) can stand before or after the one JSON object. It stays there: C prints when the process ends.
+    (not even from C) can stand before or after the one JSON object; it is put back at the end of the context.
     """
 
     def __init__(self, *, json: bool) -> None:
@@ -64,8 +65,13 @@ class Terminal:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._stdout is not None:
-            os.close(self._stdout)
-            self._stdout = None
+            try:
+                sys.stdout.flush()
+                ctypes.CDLL(None).fflush(None)  # what C has kept until now belongs on stderr, too
+            finally:
+                os.dup2(self._stdout, 1)
+                os.close(self._stdout)
+                self._stdout = None
 
     def result(self, value: Mapping[str, Any]) -> None:
         """Print the result of the command as one JSON object, if that was asked for."""
