@@ -14,7 +14,16 @@ def test_the_python_example_runs(repository: Path, tmp_path: Path):
     assert acceleration == "torch.Size([1200, 7]) torch.Size([1200, 7, 7])"
     assert forces == "torch.Size([1200, 1]) torch.Size([1200, 7])"
     assert float(error.split()[3]) < 0.2
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {"model.json", "tensors.safetensors", "robot.urdf"}
+    assert {path.name for path in (tmp_path / "model").iterdir()} == {"model.json", "tensors.safetensors", "robot.urdf"}
+
+
+def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "your-robot.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    noise, error, *_ = done.stdout.splitlines()
+    assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
+    assert float(error) < 0.3
 
 
 def test_the_pictures_and_pages_that_it_names_exist(repository: Path):

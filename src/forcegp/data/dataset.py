@@ -34,8 +34,9 @@ class Dataset:
     q, v, u: (rows, nv) positions, velocities and actuator forces [units].
     a: (rows, nv) measured acceleration, with its noise.
     time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
-    joint_names: nv names, in the order of the columns; those of `system.robot` if a system is given.
-    units: mapping of "q", "v", "u", "a", "time" to SI units; one text, or one per joint where joints differ.
+    joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `system.robot`.
+    units: mapping of "q", "v", "u", "a", "time" to SI units; one text, or one per joint where joints differ. By default
+        those that the joint types of `system.robot` ask for. Without a system both must be given.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     system: the robot and what it touches, or None.
     noise_std: (nv,) standard deviation of the noise on `a`, if known.
@@ -55,8 +56,8 @@ class Dataset:
     u: Float[np.ndarray, "rows nv"]
     a: Float[np.ndarray, "rows nv"]
     time: Float[np.ndarray, " rows"]
-    joint_names: tuple[str, ...]
-    units: Mapping[str, Any]
+    joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
+    units: Mapping[str, Any] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
     system: MechanicalSystem | None = None
     noise_std: Float[np.ndarray, " nv"] | None = None
@@ -68,6 +69,12 @@ class Dataset:
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
+        for name in ("joint_names", "units"):
+            if getattr(self, name) is None:
+                if self.system is None:
+                    raise DatasetError(f"{name} are missing; give them, or a system whose robot has them.")
+                robot = self.system.robot
+                put(name, robot.joint_names if name == "joint_names" else units_for(robot))
         names = _joint_names(self.joint_names, self.system)
         put("joint_names", names)
         put("q", finite_columns("q", self.q, names))
