@@ -88,7 +88,7 @@ def test_testing_on_the_training_data_is_said(workshop, forcegp):
     done = forcegp("evaluate", "run", "train.h5", "--json", folder=workshop)
     assert done.returncode == 0
     (warning,) = json.loads(done.stdout)["warnings"]
-    assert "15 of 480 test rows are also training rows" in warning
+    assert "15 of 480 test rows have the very (q, v, u) of training rows" in warning
     assert f"warning: {warning}" in done.stderr
 
 

@@ -106,7 +106,7 @@ def test_debug_shows_the_traceback_before_the_line(folder, capfd, words):
 def test_overwriting_needs_a_word_and_replaces_the_whole_run(folder, capfd):
     assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 0
     assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 2
-    assert "run exists already; choose another name for --out, or add --overwrite" in capfd.readouterr().err
+    assert "run exists already; choose another name, or add --overwrite" in capfd.readouterr().err
     assert main(["fit", "arm.h5", *QUICK, "--mean", "zero", "--out", "run", "--overwrite"]) == 0
     assert load_posterior("run").model.mean == "zero"
     assert not list(folder.glob(".*"))

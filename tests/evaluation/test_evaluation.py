@@ -145,7 +145,7 @@ def test_training_rows_among_the_test_rows_are_counted(posterior, train, test_da
         test_data, **{name: np.vstack([getattr(test_data, name)[:-2], getattr(train, name)[:2]]) for name in "qvua"}
     )
     (warning,) = evaluate(posterior, mixed).warnings
-    assert "2 of 60 test rows are also training rows (the first: row 58)" in warning
+    assert "2 of 60 test rows have the very (q, v, u) of training rows (the first: row 58)" in warning
 
 
 def test_other_rows_of_the_training_recording_are_noticed(posterior, train, test_data):

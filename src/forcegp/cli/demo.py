@@ -24,6 +24,7 @@ from forcegp.cli.whole_folders import (
     write_config,
     write_json,
 )
+from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
@@ -74,6 +75,8 @@ class Demo(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """All four steps."""
+        if self.points < 2:
+            raise InvalidInput(f"--points is {self.points}; at least 2 are needed.")
         replaceable = self.overwrite or holds_only_own_files(self.out, KIND)
         require_free_folder(self.out, kind=KIND, overwrite=replaceable)
         start = time.monotonic()

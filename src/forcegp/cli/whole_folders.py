@@ -23,7 +23,7 @@ def require_free_file(path: Path, *, overwrite: bool) -> None:
     if path.is_dir():
         raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
     if path.exists() and not overwrite:
-        raise InvalidInput(f"{path} exists already; choose another name for --out, or add --overwrite.")
+        raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
     if not path.parent.is_dir():
         raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
 
@@ -40,7 +40,7 @@ def require_free_folder(path: Path, *, kind: str, overwrite: bool) -> None:
             f"{path} exists and was not written by `{kind}`, so it is not overwritten; choose another name."
         )
     if not overwrite:
-        raise InvalidInput(f"{path} exists already; choose another name for --out, or add --overwrite.")
+        raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
 
 
 def holds_only_own_files(path: Path, kind: str) -> bool:

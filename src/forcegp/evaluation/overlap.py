@@ -29,8 +29,8 @@ def _warnings(posterior: StructuredPosterior, dataset: Dataset) -> Iterator[str]
     repeated = shared_rows(posterior, dataset)
     if repeated.size:
         yield (
-            f"{repeated.size} of {len(dataset)} test rows are also training rows (the first: row {repeated[0]}), "
-            "so these scores flatter the model; test on another trajectory."
+            f"{repeated.size} of {len(dataset)} test rows have the very (q, v, u) of training rows (the first: row "
+            f"{repeated[0]}); where they are the same rows, these scores flatter the model: test on another trajectory."
         )
     else:
         source = posterior.settings.get("data") or {}
