@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.urdf import InertialDescription, JointDescription
 
 
@@ -46,3 +51,8 @@ class Link:
             return cls(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
         rows = tuple(tuple(row) for row in inertial.inertia.tolist())
         return cls(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
+
+    def log_cholesky(self, owner: str) -> Float[Tensor, "10"]:
+        """Log-Cholesky parameters; ``owner`` is the robot that error messages name. Raises as log_cholesky_of_link."""
+        center, inertia = np.array(self.center_of_mass), np.array(self.inertia)
+        return log_cholesky_of_link(self.mass, center, inertia, f"{self.name!r} of {owner}")

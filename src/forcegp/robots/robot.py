@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -22,7 +21,7 @@ from forcegp.robots.arguments import (
     finite_vector,
     locked_positions,
 )
-from forcegp.robots.inertia import log_cholesky_of_link, physical_from_parameters
+from forcegp.robots.inertia import physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import WORLD, Layout, check_inertias, lay_out
 from forcegp.robots.parts import Joint, Link
@@ -213,16 +212,9 @@ class Robot:
         Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
         :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
         """
-        out = {}
         for name in links:
             self.layout.require_moving(name, self.name)
-            link = self.link(name)
-            inertia = np.array(link.inertia)
-            parameters = log_cholesky_of_link(
-                link.mass, np.array(link.center_of_mass), inertia, f"{name!r} of {self.name}"
-            )
-            out[name] = parameters.to(self.device)
-        return out
+        return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given."""
