@@ -136,7 +136,7 @@ class ImplicitSurface(Surface):
     """s(p) = function(p) for any twice differentiable `function` of one point (3,) -> scalar, written in torch.
 
     The multiplier of a contact is then the normal force divided by |s_p|. A function cannot be stored in a file (files
-    never carry code): pass the surface again when loading.
+    never carry code): a subclass of `Surface` with numbers as fields can.
     """
 
     function: Callable[[Tensor], Tensor] = field(compare=True)
@@ -170,8 +170,7 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
     if name is None:
         raise ContactError(
             f"a {type(surface).__name__} cannot be stored: files carry numbers, never code. Use one of "
-            f"{', '.join(SURFACES)}, or save "
-            "without contacts and pass them again when loading."
+            f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
         )
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]
 
