@@ -15,8 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
 from forcegp.mechanics.state import State
+from forcegp.mechanics.stored_objects import object_from_dict
 from forcegp.robots import Robot
 
 PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
@@ -145,16 +146,7 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
 
 def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
     """The force that `known_force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
-    if not isinstance(stored, Mapping):
-        raise FileFormatError(f"a stored known force is {stored!r}; expected an object with a type")
-    values = dict(stored)
-    name = values.pop("type", None)
-    if not isinstance(name, str) or name not in KNOWN_FORCES:
-        raise FileFormatError(f"unknown known force {name!r}; known: {', '.join(KNOWN_FORCES)}")
-    try:
-        return KNOWN_FORCES[name](**values)
-    except TypeError as error:
-        raise FileFormatError(f"known force {name!r} has wrong fields {sorted(values)}: {error}") from None
+    return object_from_dict("known force", KNOWN_FORCES, stored)
 
 
 def _per_joint(name: str, given: object, robot: Robot) -> Tensor:

@@ -19,7 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.errors import ContactError, InvalidInput
+from forcegp.mechanics.stored_objects import object_from_dict
 
 Vector = tuple[float, float, float]
 
@@ -177,18 +178,7 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
 
 def surface_from_dict(stored: dict[str, Any]) -> Surface:
     """The surface that `surface_to_dict` stored. Raises FileFormatError for an unknown type or missing fields."""
-    if not isinstance(stored, dict):
-        raise FileFormatError(f"a stored surface is {stored!r}; expected an object with a type")
-    fields = dict(stored)
-    name = fields.pop("type", None)
-    if not isinstance(name, str) or name not in SURFACES:
-        raise FileFormatError(f"unknown surface type {name!r}; known types: {', '.join(SURFACES)}")
-    try:
-        return SURFACES[name](
-            **{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
-        )
-    except TypeError as error:
-        raise FileFormatError(f"surface {name!r} has wrong fields {sorted(fields)}: {error}") from None
+    return object_from_dict("surface", SURFACES, stored)
 
 
 def _distance_hessian(ray: Tensor, projector: Tensor) -> Tensor:

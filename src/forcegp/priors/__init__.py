@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import InvalidInput
+from forcegp.mechanics.stored_objects import object_from_dict
 from forcegp.priors.force_prior import ForcePrior
 from forcegp.priors.joint_forces import JointForces
 
@@ -27,11 +28,4 @@ def prior_to_dict(prior: ForcePrior) -> dict[str, Any]:
 
 def prior_from_dict(stored: Mapping[str, Any]) -> ForcePrior:
     """The prior that `prior_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
-    fields = dict(stored)
-    name = fields.pop("type", None)
-    if name not in PRIORS:
-        raise FileFormatError(f"unknown prior {name!r}; registered: {', '.join(PRIORS)}")
-    try:
-        return PRIORS[name](**{key: tuple(x) if isinstance(x, list) else x for key, x in fields.items()})
-    except TypeError as error:
-        raise FileFormatError(f"prior {name!r} has wrong fields {sorted(fields)}: {error}") from None
+    return object_from_dict("prior", PRIORS, stored)
