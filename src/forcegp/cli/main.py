@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), USER_ERROR, debug)
     except MemoryError as error:
         return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
-    except Exception as error:
+    except Exception as error:  # the last resort: one line also for a defect of ours, with its own exit code
         what = f"{type(error).__name__}: {error}"
         return _fail(f"an error in forcegp itself, {what} (--debug shows where)", INTERNAL_ERROR, debug)
     finally:  # a program that calls this goes on as it was

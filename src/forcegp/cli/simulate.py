@@ -88,7 +88,7 @@ def simulate(terminal: Terminal, scenario: str, **options: Any) -> Dataset:
 def _import_silently(name: str) -> None:
     """PyBullet announces the time of its build on the process's stderr, which would stand between our own lines."""
     stderr = os.dup(2)
-    with open(os.devnull, "wb") as nothing:  # noqa: PTH123
+    with open(os.devnull, "wb") as nothing:  # noqa: PTH123  # a device, not a path
         os.dup2(nothing.fileno(), 2)
     try:
         with contextlib.suppress(ImportError):  # the simulation says what to install
