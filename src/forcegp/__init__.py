@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         ViscousJointFriction,
     )
     from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
-    from forcegp.priors import JointForces
+    from forcegp.priors import JointAccelerations, JointForces, NoForces
     from forcegp.robots import Robot
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -52,6 +52,8 @@ __all__ = [
     "simulate_kuka_surface",
     # what is unknown, and the model that learns it
     "JointForces",
+    "JointAccelerations",
+    "NoForces",
     "Noise",
     "StructuredGP",
     "save_posterior",
@@ -66,7 +68,7 @@ _ROOMS = {
     "mechanics": {"MechanicalSystem", "Contact", "Plane", "Sphere", "Cylinder", "ImplicitSurface", "Baumgarte"}
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"},
     "data": {"Dataset"},
-    "priors": {"JointForces"},
+    "priors": {"JointForces", "JointAccelerations", "NoForces"},
     "models": {"StructuredGP", "Noise", "save_posterior", "load_posterior"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
     "evaluation": {"Evaluation", "evaluate"},

@@ -74,8 +74,9 @@ def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> D
         _require_finite(W_white, "the mixing vectors W", "check q, v, u and the contact geometry")
         _require_finite(y_white, "the residuals y - m", "check the measured accelerations and the mean")
         U, singular, _ = torch.linalg.svd(W_white, full_matrices=False)
-        largest = singular.amax(dim=-1, keepdim=True)
-        rank = int((singular > RANK_TOLERANCE * largest).sum(-1).max()) if singular.numel() else 0
+        rank = 0
+        if singular.numel():
+            rank = int((singular > RANK_TOLERANCE * singular.amax(dim=-1, keepdim=True)).sum(-1).max())
         U = U[..., :rank].contiguous()
         C = U.mT @ W_white
         t = (U.mT @ y_white[..., None])[..., 0]

@@ -93,6 +93,8 @@ class _Panel:
 
 def _panels(C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> Iterator[_Panel]:
     count, rank, latents = C.shape
+    if not latents:
+        return
     C_by_latent = C.permute(2, 0, 1).contiguous()
     height = max(1, min(count, PANEL_BYTES // max(1, 8 * latents * count * rank)))
     for start in range(0, count, height):
@@ -117,7 +119,9 @@ class _DeflatedNLL(torch.autograd.Function):
         gradients: list[Tensor | None] = [None] * (2 + len(kernel_matrices))
         if y_needed:
             gradients[1] = (deflation.U @ alpha[..., None])[..., 0] + deflation.remainder
-        if W_needed or any(K_needed):
+        if not kernel_matrices:
+            gradients[0] = torch.zeros_like(W_white)
+        elif W_needed or any(K_needed):
             C_gradient, K_gradients = _inverse_contractions(system, kernel_matrices, W_needed, K_needed)
             gradients[2:] = K_gradients
             if C_gradient is not None:

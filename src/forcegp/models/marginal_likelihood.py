@@ -126,7 +126,7 @@ class MarginalLikelihood:
         estimate = (torch.linalg.pinv(W, rtol=1e-8) @ (self.training.a - offset)[..., None])[..., 0]
         variances = estimate.square().mean(0)
         largest = float(variances.max()) if variances.numel() else 0.0
-        if not largest > 0.0:
+        if variances.numel() and not largest > 0.0:
             raise InvalidInput(
                 "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was "
                 "measured and not computed from "

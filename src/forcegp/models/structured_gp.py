@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, get_args
 
-import numpy as np
 import torch
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from forcegp.data import Dataset, farthest_rows
+from forcegp.data import Dataset
 from forcegp.errors import DataWarning, FitError, InvalidInput
 from forcegp.inference import (
     LatentKernels,
@@ -24,35 +20,15 @@ from forcegp.inference import (
     minimize_objective,
 )
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models.fit_arguments import check_search_numbers, resolved_noise, training_rows
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
-from forcegp.models.noise import ACCELERATION, FORCE, Noise
+from forcegp.models.noise import Noise
+from forcegp.models.search import FitProgress, blas_threads, default_restarts, perturbed, run_restarts
 from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
 
-RESTART_SPREAD = 0.7
-"""Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
-none.
-"""
-
-SMOOTHER = 4.0
-"""Factor on the length scales of odd restarts: measured, these escape the local optima of the start from moments."""
-
-MOST_POINTS_FOR_RESTARTS = 400
-"""Training points up to which several starts are the default."""
-
 FAR_FROM_SURFACE = 0.01
 """Median distance of the training points from a contact's surface, in m, beyond which a warning is given."""
-
-SMALL_COVARIANCE = 2000
-"""Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
-
-
-def default_restarts(points: int) -> int:
-    """Starts of the search where none are asked for."""
-    return 4 if points <= MOST_POINTS_FOR_RESTARTS else 1
-
-
-FitProgress = Callable[[int, int, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +72,7 @@ class StructuredGP:
         jobs: int = 1,
         hyperprior: bool = True,
         options: OptimizerOptions | None = None,
+        start: Mapping[str, Tensor] | None = None,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
         """Find all kernel and learned noise parameters by marginal likelihood, then condition on the same points.
@@ -112,6 +89,8 @@ class StructuredGP:
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
             maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
         options: the search itself.
+        start: unconstrained parameters at which the first search begins instead of moments, for example
+            `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
 
         Raises
@@ -120,13 +99,10 @@ class StructuredGP:
         ContactError: a contact cannot hold at some row.
         FitError: no restart could be evaluated; the message names the cause.
         """
-        noise = self._resolved_noise(dataset)
-        rows = self._training_rows(dataset, points)
+        noise = resolved_noise(self.noise, dataset)
+        rows = training_rows(self.system.robot.joint_names, dataset, points)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
-        if restarts < 1 or jobs < 1:
-            raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
-        if seed < 0:
-            raise InvalidInput(f"seed={seed} must be 0 or larger")
+        check_search_numbers(restarts, jobs, seed)
         device = self.system.robot.device
         training = TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
         likelihood = self._likelihood(training)
@@ -135,11 +111,12 @@ class StructuredGP:
         kernels = likelihood.kernels()
         noise_parameters = noise.parameters(self.system.robot.nv)
         fixed = {} if noise.learn else noise_parameters
-        start = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
+        moments = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
         options = options or OptimizerOptions()
-        search = _Search(_Objective(likelihood, kernels, noise, fixed, hyperprior), start, seed, options)
-        with _blas_threads(likelihood):
-            results = _run_restarts(search, restarts, jobs, progress)
+        first = _first_start(moments, start or {}, fixed)
+        search = _Search(_Objective(likelihood, kernels, noise, fixed, hyperprior), moments, first, seed, options)
+        with blas_threads(training.q.numel()):
+            results = run_restarts(search, restarts, jobs, progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
@@ -154,6 +131,7 @@ class StructuredGP:
             "rows_available": len(dataset),
             "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
             "restarts": restarts,
+            "warm_start": start is not None,
             "seed": seed,
             "mean": self.mean,
             "prior": prior_to_dict(self.prior),
@@ -197,31 +175,6 @@ class StructuredGP:
     def _likelihood(self, training: TrainingData) -> MarginalLikelihood:
         return MarginalLikelihood(self.system, self.prior, self.mean, training)
 
-    def _resolved_noise(self, dataset: Dataset) -> Noise:
-        if self.noise is not None:
-            return self.noise
-        if dataset.noise_std is None:
-            raise InvalidInput(
-                "the dataset does not know its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
-                "noise=Noise(0.1, learn=True) "
-                "to learn it from there"
-            )
-        return Noise(tuple(float(std) for std in dataset.noise_std))
-
-    def _training_rows(self, dataset: Dataset, points: int | None) -> Dataset:
-        names = self.system.robot.joint_names
-        if tuple(dataset.joint_names) != names:
-            raise InvalidInput(
-                f"the dataset has joints {', '.join(dataset.joint_names)}; the robot has {', '.join(names)}"
-            )
-        if len(dataset) < 2:
-            raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
-        if points is None:
-            return dataset
-        if not 2 <= points <= len(dataset):
-            raise InvalidInput(f"points={points} is not between 2 and the {len(dataset)} rows of the dataset")
-        return farthest_rows(dataset, points)
-
 
 @dataclass(frozen=True, eq=False)
 class _Objective:
@@ -243,20 +196,39 @@ class _Objective:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """One optimisation from start number `index`."""
+    """One optimisation from start number `index`: 0 begins at `first`, the others around the moments."""
 
     objective: _Objective
-    start: Mapping[str, Tensor]
+    moments: Mapping[str, Tensor]
+    first: Mapping[str, Tensor]
     seed: int
     options: OptimizerOptions
 
     def __call__(self, index: int, progress: FitProgress | None = None) -> OptimizationResult | FitError:
-        first = _perturbed(self.start, self.seed, index) if index else self.start
+        first = perturbed(self.moments, self.seed, index) if index else self.first
         note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
         try:
             return minimize_objective(self.objective, first, self.options, note)
         except FitError as error:
             return error
+
+
+def _first_start(
+    moments: Mapping[str, Tensor], given: Mapping[str, Tensor], fixed: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """The moments, with what the caller gives in their place. Raises InvalidInput for what the model does not have."""
+    first = dict(moments)
+    for name, value in given.items():
+        if name in fixed:
+            continue  # the noise that this fit holds fixed
+        if name not in first:
+            raise InvalidInput(f"start has {name!r}; the parameters of this model are {', '.join(sorted(first))}")
+        if value.shape != first[name].shape or not bool(torch.isfinite(value).all()):
+            raise InvalidInput(
+                f"start[{name!r}] has shape {tuple(value.shape)} or is not finite; give {tuple(first[name].shape)}"
+            )
+        first[name] = value.detach().to(first[name])
+    return first
 
 
 def _warn_of_distance(system: MechanicalSystem, training: TrainingData) -> None:
@@ -274,36 +246,3 @@ def _warn_of_distance(system: MechanicalSystem, training: TrainingData) -> None:
                 DataWarning,
                 stacklevel=3,
             )
-
-
-def _perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
-    """Kernel parameters shifted by seeded normal numbers on their log scale; the noise keeps its start.
-
-    Odd restarts begin near a linear function, at a multiple of the length scales and its square of the variance.
-    """
-    generator = np.random.default_rng((seed, index))
-    shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
-    shifted = {}
-    for name, value in start.items():
-        if name in (ACCELERATION, FORCE):
-            shifted[name] = value
-            continue
-        shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)
-        shifted[name] = value + shift + RESTART_SPREAD * torch.as_tensor(generator.standard_normal(tuple(value.shape)))
-    return shifted
-
-
-def _blas_threads(likelihood: MarginalLikelihood) -> AbstractContextManager[Any]:
-    """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times as much."""
-    rows, joints = likelihood.training.q.shape
-    return threadpool_limits(1) if rows * joints <= SMALL_COVARIANCE else nullcontext()
-
-
-def _run_restarts(
-    search: _Search, restarts: int, jobs: int, progress: FitProgress | None
-) -> Sequence[OptimizationResult | FitError]:
-    if jobs == 1 or restarts == 1:
-        return [search(index, progress) for index in range(restarts)]
-    from joblib import Parallel, delayed
-
-    return Parallel(n_jobs=min(jobs, restarts))(delayed(search)(index) for index in range(restarts))  # type: ignore[return-value]

@@ -85,8 +85,11 @@ class StructuredPosterior:
         known = self.model.mean == "analytical"
         features = self.likelihood.standardization(self.model.prior.features(dynamics))
         B = self.model.prior.mixing(dynamics)
-        mean = self.latent.mean(features)
-        cov = self.latent.covariance(features) if covariance else None
+        rows, latents = len(q), B.shape[-1]
+        mean = self.latent.mean(features) if latents else q.new_zeros(rows, 0)
+        cov = None
+        if covariance:
+            cov = self.latent.covariance(features) if latents else q.new_zeros(rows, 0, 0)
 
         def through(affine: AffineMap) -> Gaussian:
             W = affine.matrix @ B

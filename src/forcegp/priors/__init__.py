@@ -6,12 +6,26 @@ from typing import Any
 from forcegp.errors import InvalidInput
 from forcegp.mechanics.stored_objects import object_from_dict
 from forcegp.priors.force_prior import ForcePrior
+from forcegp.priors.joint_accelerations import JointAccelerations
 from forcegp.priors.joint_forces import JointForces
+from forcegp.priors.no_forces import NoForces
 
-PRIORS: dict[str, type[ForcePrior]] = {"joint-forces": JointForces}
+PRIORS: dict[str, type[ForcePrior]] = {
+    "joint-forces": JointForces,
+    "joint-accelerations": JointAccelerations,
+    "no-forces": NoForces,
+}
 """Priors that stored models can name."""
 
-__all__ = ["PRIORS", "ForcePrior", "JointForces", "prior_from_dict", "prior_to_dict"]
+__all__ = [
+    "PRIORS",
+    "ForcePrior",
+    "JointAccelerations",
+    "JointForces",
+    "NoForces",
+    "prior_from_dict",
+    "prior_to_dict",
+]
 
 
 def prior_to_dict(prior: ForcePrior) -> dict[str, Any]:
