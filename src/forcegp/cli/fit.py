@@ -159,7 +159,7 @@ class Fit(Command):
 
 def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> StructuredPosterior:
     """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
-    from forcegp.models.structured_gp import default_restarts
+    from forcegp.models.search import default_restarts
 
     options: OptimizerOptions = how["options"]
     restarts = default_restarts(how["points"]) if how["restarts"] is None else how["restarts"]

@@ -18,7 +18,7 @@ from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models import StructuredPosterior
 from forcegp.models.marginal_likelihood import inertials_of
 from forcegp.models.prediction import Prediction
-from forcegp.models.structured_gp import SMALL_COVARIANCE
+from forcegp.models.search import SMALL_COVARIANCE
 
 ROWS_PER_BLOCK = 1024
 

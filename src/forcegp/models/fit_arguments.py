@@ -1,0 +1,54 @@
+"""What every model asks of the data and numbers that its `fit` is given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.errors import InvalidInput
+from forcegp.models.noise import Noise
+
+
+def checked_rows(joint_names: Sequence[str], dataset: Dataset) -> Dataset:
+    """`dataset`, if it has these joints and at least 2 rows. Raises InvalidInput otherwise."""
+    if tuple(dataset.joint_names) != tuple(joint_names):
+        raise InvalidInput(
+            f"the dataset has joints {', '.join(dataset.joint_names)}; the robot has {', '.join(joint_names)}"
+        )
+    if len(dataset) < 2:
+        raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
+    return dataset
+
+
+def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | None) -> Dataset:
+    """The `points` rows that lie farthest apart in (q, v, u); all of them for None.
+
+    Raises InvalidInput for other joints, fewer than 2 rows and numbers that are out of range.
+    """
+    checked_rows(joint_names, dataset)
+    if points is None:
+        return dataset
+    if not 2 <= points <= len(dataset):
+        raise InvalidInput(f"points={points} is not between 2 and the {len(dataset)} rows of the dataset")
+    return farthest_rows(dataset, points)
+
+
+def resolved_noise(noise: Noise | None, dataset: Dataset) -> Noise:
+    """The noise given, else that which the dataset states. Raises InvalidInput where neither is known."""
+    if noise is not None:
+        return noise
+    if dataset.noise_std is None:
+        raise InvalidInput(
+            "the dataset does not know its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
+            "noise=Noise(0.1, learn=True) "
+            "to learn it from there"
+        )
+    return Noise(tuple(float(std) for std in dataset.noise_std))
+
+
+def check_search_numbers(restarts: int, jobs: int, seed: int) -> None:
+    """Raises InvalidInput for numbers that are out of range."""
+    if restarts < 1 or jobs < 1:
+        raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
+    if seed < 0:
+        raise InvalidInput(f"seed={seed} must be 0 or larger")

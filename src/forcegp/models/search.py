@@ -1,0 +1,72 @@
+"""Several seeded starts of one search: what every model that is fitted by marginal likelihood shares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from forcegp.models.noise import ACCELERATION, FORCE
+
+RESTART_SPREAD = 0.7
+"""Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
+none.
+"""
+
+SMOOTHER = 4.0
+"""Factor on the length scales of odd restarts: measured, these escape the local optima of the start from moments."""
+
+MOST_POINTS_FOR_RESTARTS = 400
+"""Training points up to which several starts are the default."""
+
+SMALL_COVARIANCE = 2000
+"""Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
+
+FitProgress = Callable[[int, int, float], None]
+"""Called as progress(restart, iteration, objective)."""
+
+Outcome = TypeVar("Outcome")
+
+
+def default_restarts(points: int) -> int:
+    """Starts of the search where none are asked for."""
+    return 4 if points <= MOST_POINTS_FOR_RESTARTS else 1
+
+
+def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
+    """Kernel parameters shifted by seeded normal numbers on their log scale; the noise keeps its start.
+
+    Odd restarts begin near a linear function, at a multiple of the length scales and its square of the variance.
+    """
+    generator = np.random.default_rng((seed, index))
+    shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
+    shifted = {}
+    for name, value in start.items():
+        if name in (ACCELERATION, FORCE):
+            shifted[name] = value
+            continue
+        shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)
+        shifted[name] = value + shift + RESTART_SPREAD * torch.as_tensor(generator.standard_normal(tuple(value.shape)))
+    return shifted
+
+
+def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
+    """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times as much."""
+    return threadpool_limits(1) if covariance_rows <= SMALL_COVARIANCE else nullcontext()
+
+
+def run_restarts(
+    search: Callable[[int, FitProgress | None], Outcome], restarts: int, jobs: int, progress: FitProgress | None
+) -> Sequence[Outcome]:
+    """`search(0, progress)`, `search(1, progress)`, ... in `jobs` processes, on which the outcomes do not depend."""
+    if jobs == 1 or restarts == 1:
+        return [search(index, progress) for index in range(restarts)]
+    from joblib import Parallel, delayed
+
+    return Parallel(n_jobs=min(jobs, restarts))(delayed(search)(index, None) for index in range(restarts))  # type: ignore[return-value]
