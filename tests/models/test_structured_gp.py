@@ -111,7 +111,7 @@ def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
     assert single.mean.shape == (3,)
     assert torch.allclose(single.mean, flat.mean[0], atol=1e-12)
     assert posterior.predict(*(x[:0] for x in states)).mean.shape == (0, 3)
-    monkeypatch.setattr("forcegp.models.structured_posterior.ROWS_PER_BLOCK", 4)
+    monkeypatch.setattr("forcegp.models.protocol.ROWS_PER_BLOCK", 4)
     assert torch.allclose(posterior.predict(*states).covariance, flat.covariance, atol=1e-12)
     assert posterior.predict(*states, covariance=False).covariance is None
 

@@ -9,23 +9,23 @@ import numpy as np
 from jaxtyping import Int
 
 from forcegp.data import Dataset
-from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
 
 
-def overlap_warnings(posterior: StructuredPosterior, dataset: Dataset) -> tuple[str, ...]:
+def overlap_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
     """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
     return tuple(_warnings(posterior, dataset))
 
 
-def shared_rows(posterior: StructuredPosterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
+def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
     """Numbers of the rows of `dataset` whose (q, v, u) is exactly that of a training point."""
-    training = posterior.likelihood.training
+    training = posterior.training
     trained = {row.tobytes() for row in _inputs(*(getattr(training, name).cpu().numpy() for name in ("q", "v", "u")))}
     rows = _inputs(dataset.q, dataset.v, dataset.u)
     return np.array([number for number, row in enumerate(rows) if row.tobytes() in trained], dtype=np.int64)
 
 
-def _warnings(posterior: StructuredPosterior, dataset: Dataset) -> Iterator[str]:
+def _warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     repeated = shared_rows(posterior, dataset)
     if repeated.size:
         yield (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,9 +16,8 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.evaluation.metrics import negative_log_density
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.models import StructuredPosterior
-from forcegp.models.marginal_likelihood import inertials_of
-from forcegp.models.prediction import Prediction
+from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.protocol import Posterior
 from forcegp.models.search import SMALL_COVARIANCE
 
 ROWS_PER_BLOCK = 1024
@@ -31,21 +31,22 @@ class PredictedRows:
     states it, else with the model's; `negative_log_density` of the measured rows under that noise; `known_physics` the
     acceleration of the known forces alone; `moving_force` M (mean - known_physics), the part of the unknown force that
     moves the robot (the other part presses on the surface); `unknown_force` Q_U and `carried_known_force` what of it
-    is known (Q_K without an analytical mean, else 0); `multiplier` lambda; `A`, `b` and the mass matrix `mass`.
+    is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all three None for a model that does not
+    speak of forces; `A`, `b` and the mass matrix `mass`.
     """
 
     mean: Float[np.ndarray, "rows nv"]
     variance: Float[np.ndarray, "rows nv"]
     measurement_variance: Float[np.ndarray, "rows nv"]
     negative_log_density: Float[np.ndarray, " rows"]
-    unknown_force: Float[np.ndarray, "rows nv"]
-    unknown_force_variance: Float[np.ndarray, "rows nv"]
-    multiplier: Float[np.ndarray, "rows m"]
-    multiplier_variance: Float[np.ndarray, "rows m"]
+    unknown_force: Float[np.ndarray, "rows nv"] | None
+    unknown_force_variance: Float[np.ndarray, "rows nv"] | None
+    multiplier: Float[np.ndarray, "rows m"] | None
+    multiplier_variance: Float[np.ndarray, "rows m"] | None
     known_physics: Float[np.ndarray, "rows nv"]
     moving_force: Float[np.ndarray, "rows nv"]
     moving_force_variance: Float[np.ndarray, "rows nv"]
-    carried_known_force: Float[np.ndarray, "rows nv"]
+    carried_known_force: Float[np.ndarray, "rows nv"] | None
     A: Float[np.ndarray, "rows c nv"]
     b: Float[np.ndarray, "rows c"]
     mass: Float[np.ndarray, "rows nv nv"]
@@ -62,10 +63,10 @@ class PredictedRows:
 
 
 def predict_rows(
-    posterior: StructuredPosterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
+    posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
 ) -> PredictedRows:
     """Predict all rows. `A` and `b` are those of the Dataset's own system if it has one, else the model's."""
-    small = posterior.likelihood.training.q.numel() <= SMALL_COVARIANCE
+    small = posterior.training.q.numel() <= SMALL_COVARIANCE
     blocks = []
     # On small matrices threads wait for each other: measured 8 times slower with 2 busy cores.
     with torch.no_grad(), threadpool_limits(1) if small else nullcontext():
@@ -74,14 +75,17 @@ def predict_rows(
             blocks.append(_predict_block(posterior, dataset, block))
             if progress is not None:
                 progress(block.stop, len(dataset))
-    columns = {field.name: [getattr(block, field.name) for block in blocks] for field in fields(PredictedRows)}
-    return PredictedRows(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    joined: dict[str, Any] = {}
+    for field in fields(PredictedRows):
+        parts = [getattr(block, field.name) for block in blocks]
+        joined[field.name] = None if parts[0] is None else np.concatenate(parts)
+    return PredictedRows(**joined)
 
 
-def _predict_block(posterior: StructuredPosterior, dataset: Dataset, block: slice) -> PredictedRows:
+def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> PredictedRows:
     q, v, u = (torch.tensor(values[block]) for values in (dataset.q, dataset.v, dataset.u))
     prediction = posterior.predict(q, v, u)
-    dynamics = posterior.system.dynamics(q, v, u, inertials_of(posterior.parameters))
+    dynamics = posterior.dynamics(q, v, u)
     own = dynamics if dataset.system is None else dataset.system.dynamics(q, v, u)
     covariance = _array(_not_none(prediction.covariance))
     measurement = covariance + _noise_covariance(prediction, dataset)
@@ -92,14 +96,14 @@ def _predict_block(posterior: StructuredPosterior, dataset: Dataset, block: slic
         variance=_array(prediction.variance),
         measurement_variance=np.diagonal(measurement, axis1=-2, axis2=-1),
         negative_log_density=negative_log_density(mean, measurement, np.asarray(dataset.a[block])),
-        unknown_force=_array(prediction.unknown_force.mean),
-        unknown_force_variance=_array(prediction.unknown_force.variance),
-        multiplier=_array(prediction.multiplier.mean),
-        multiplier_variance=_array(prediction.multiplier.variance),
+        unknown_force=_mean(prediction.unknown_force),
+        unknown_force_variance=_variance(prediction.unknown_force),
+        multiplier=_mean(prediction.multiplier),
+        multiplier_variance=_variance(prediction.multiplier),
         known_physics=known,
         moving_force=(mass @ (mean - known)[..., None])[..., 0],
         moving_force_variance=np.einsum("nij,njk,nik->ni", mass, covariance, mass),
-        carried_known_force=_carried_known_force(posterior, dynamics),
+        carried_known_force=None if prediction.unknown_force is None else _carried_known_force(posterior, dynamics),
         A=_array(own.A),
         b=_array(own.b),
         mass=mass,
@@ -113,8 +117,16 @@ def _noise_covariance(prediction: Prediction, dataset: Dataset) -> Float[np.ndar
     return np.diag(np.square(dataset.noise_std))
 
 
-def _carried_known_force(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> Float[np.ndarray, "rows nv"]:
-    return _array(torch.zeros_like(dynamics.Q_K) if posterior.model.mean == "analytical" else dynamics.Q_K)
+def _carried_known_force(posterior: Posterior, dynamics: ConstrainedDynamics) -> Float[np.ndarray, "rows nv"]:
+    return _array(dynamics.Q_K if posterior.carries_known_forces else torch.zeros_like(dynamics.Q_K))
+
+
+def _mean(force: Gaussian | None) -> np.ndarray | None:
+    return None if force is None else _array(force.mean)
+
+
+def _variance(force: Gaussian | None) -> np.ndarray | None:
+    return None if force is None else _array(force.variance)
 
 
 def _not_none(covariance: Tensor | None) -> Tensor:

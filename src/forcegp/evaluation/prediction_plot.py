@@ -20,7 +20,7 @@ from forcegp.evaluation.figure_style import (
     window,
 )
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
-from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -28,9 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def prediction_figure(
-    posterior: StructuredPosterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0
-) -> Figure:
+def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
     """One row per joint: acceleration on the left, errors on the right, over `seconds` of the first episode.
 
     The dark band is 2 sigma of the acceleration, the light one adds the measurement noise.
@@ -59,7 +57,7 @@ def prediction_figure(
         fontsize=NORMAL,
         frameon=False,
         markerscale=4,
-        title=f"Prediction after {len(posterior.likelihood.training.q)} training points",
+        title=f"Prediction after {len(posterior.training.q)} training points",
         title_fontproperties={"size": LARGE, "weight": "bold"},
         alignment="left",
     )

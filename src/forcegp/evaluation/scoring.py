@@ -13,14 +13,14 @@ from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Evaluation, Numbers
 from forcegp.evaluation.overlap import overlap_warnings
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
-from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
 
 NOISE_FACTOR = 1.5
 """Noise levels of model and Dataset that differ by more than this factor are named in a warning."""
 
 
 def evaluate(
-    posterior: StructuredPosterior, dataset: Dataset, *, progress: Callable[[int, int], None] | None = None
+    posterior: Posterior, dataset: Dataset, *, progress: Callable[[int, int], None] | None = None
 ) -> Evaluation:
     """Predict every row of `dataset` and compare; `progress(rows done, rows in total)` is called now and then.
 
@@ -47,7 +47,7 @@ def evaluate(
     )
 
 
-def _noise_warnings(posterior: StructuredPosterior, dataset: Dataset) -> tuple[str, ...]:
+def _noise_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
     """A sentence if model and Dataset disagree about the noise of some joint by more than NOISE_FACTOR."""
     if dataset.noise_std is None:
         return ()
@@ -87,16 +87,21 @@ def _against_truth(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]
             metrics.mean_absolute_error(predicted.known_physics, a)
         )
         out["force_mae_per_joint"] = _numbers(np.abs(force_error).mean(axis=0))
-    if "Q_U" in dataset.truth:
+    if "Q_U" in dataset.truth and predicted.carried_known_force is not None:
         truth = dataset.truth["Q_U"] + predicted.carried_known_force
         out |= _forces("unknown_force", "_per_joint", predicted.unknown_force, predicted.unknown_force_variance, truth)
-    if "lambda" in dataset.truth and dataset.truth["lambda"].shape == predicted.multiplier.shape:
+    if "lambda" in dataset.truth:
         truth = dataset.truth["lambda"]
         out |= _forces("multiplier", "_per_contact", predicted.multiplier, predicted.multiplier_variance, truth)
     return out
 
 
-def _forces(name: str, per: str, mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -> dict[str, Numbers]:
+def _forces(
+    name: str, per: str, mean: np.ndarray | None, variance: np.ndarray | None, truth: np.ndarray
+) -> dict[str, Numbers]:
+    """Scores of a force; none where the model does not speak of it, or of another number of contacts."""
+    if mean is None or variance is None or mean.shape != truth.shape:
+        return {}
     return {
         f"{name}_mae{per}": _numbers(metrics.mean_absolute_error(mean, truth)),
         f"{name}_rmse{per}": _numbers(metrics.root_mean_square_error(mean, truth)),

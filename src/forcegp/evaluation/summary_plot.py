@@ -31,7 +31,7 @@ from forcegp.evaluation.tool_path_plot import (
     fit_figure_to_path,
     tool_path_title,
 )
-from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def summary_figure(
-    posterior: StructuredPosterior,
+    posterior: Posterior,
     dataset: Dataset,
     *,
     start: float = 0.0,
@@ -79,7 +79,7 @@ def summary_figure(
         handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False, markerscale=4
     )
     figure.suptitle(
-        f"{len(posterior.likelihood.training.q)} points teach the force that nobody modelled"
+        f"{len(posterior.training.q)} points teach the force that nobody modelled"
         + excerpt(rows, dataset, before=" (time panels: ", after=")"),
         fontsize=LARGE + 1,
         fontweight="bold",

@@ -20,7 +20,7 @@ from forcegp.evaluation.figure_style import (
     speed_colors,
 )
 from forcegp.mechanics import MechanicalSystem, Plane
-from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,7 @@ PATH_SECONDS = 20.0
 """Length of the path that is drawn: more becomes a tangle."""
 
 
-def tool_path_figure(posterior: StructuredPosterior, dataset: Dataset) -> Figure:
+def tool_path_figure(posterior: Posterior, dataset: Dataset) -> Figure:
     """The first contact point on x, y, coloured by speed, the training points, and its distance to the surface.
 
     Raises InvalidInput for a system without contacts: there is no surface to show.
@@ -45,9 +45,7 @@ def tool_path_figure(posterior: StructuredPosterior, dataset: Dataset) -> Figure
     return figure
 
 
-def draw_tool_path(
-    axes: Axes, posterior: StructuredPosterior, dataset: Dataset, *, start: float = 0.0
-) -> LineCollection:
+def draw_tool_path(axes: Axes, posterior: Posterior, dataset: Dataset, *, start: float = 0.0) -> LineCollection:
     """The path of the test data coloured by speed (m/s) and the training points on top; returns the coloured lines.
 
     Drawn are at most PATH_SECONDS of the recording, from `start` seconds on.
@@ -64,7 +62,7 @@ def draw_tool_path(
     lines.set_array(speed[:-1][joined])
     axes.add_collection(lines)
     axes.plot([], [], color=speed_colors()(0.55), linewidth=1.3, label="test: path of the tool")
-    training = posterior.likelihood.training
+    training = posterior.training
     points, _, _ = tool_motion(posterior.system, training.q.cpu().numpy(), training.v.cpu().numpy())
     axes.plot(
         points[:, 0],

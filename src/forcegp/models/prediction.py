@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -36,12 +38,13 @@ class Prediction(Gaussian):
     N; `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean
     includes Q_K. Accelerations show nothing of a force along the contact normals: that part of `unknown_force`, and
     through it `multiplier` and `contact_force`, rests on the prior alone, and is no surer than the prior is right.
+    The three are None where a model does not speak of forces.
     `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with noisy data.
     """
 
-    multiplier: Gaussian
-    contact_force: Gaussian
-    unknown_force: Gaussian
+    multiplier: Gaussian | None
+    contact_force: Gaussian | None
+    unknown_force: Gaussian | None
     noise_covariance: Float[Tensor, "*batch nv nv"]
 
     @property
@@ -53,3 +56,29 @@ class Prediction(Gaussian):
     def measurement(self) -> Gaussian:
         """The acceleration as a sensor with the model's noise would report it."""
         return Gaussian(self.mean, None if self.covariance is None else self.covariance + self.noise_covariance)
+
+
+def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Prediction:
+    """One prediction from blocks of rows, with these batch dimensions."""
+
+    def join(parts: Sequence[Tensor]) -> Tensor:
+        rows = torch.cat(list(parts))
+        return rows.reshape(*batch, *rows.shape[1:])
+
+    def gaussian(parts: Sequence[Gaussian | None]) -> Gaussian | None:
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        covariances = [part.covariance for part in known if part.covariance is not None]
+        return Gaussian(join([part.mean for part in known]), join(covariances) if covariances else None)
+
+    acceleration = gaussian([block.acceleration for block in blocks])
+    assert acceleration is not None, "there is at least one block"
+    return Prediction(
+        acceleration.mean,
+        acceleration.covariance,
+        multiplier=gaussian([block.multiplier for block in blocks]),
+        contact_force=gaussian([block.contact_force for block in blocks]),
+        unknown_force=gaussian([block.unknown_force for block in blocks]),
+        noise_covariance=join([block.noise_covariance for block in blocks]),
+    )

@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
 from forcegp.mechanics import AffineMap, ConstrainedDynamics, MechanicalSystem
-from forcegp.models.marginal_likelihood import MarginalLikelihood, inertials_of
+from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.protocol import Posterior
 
 if TYPE_CHECKING:
     from forcegp.models.structured_gp import StructuredGP
 
-ROWS_PER_BLOCK = 4096
-"""States that are predicted at once; bounds the memory of long recordings."""
-
-Array = Tensor | np.ndarray | Sequence[Any]
-
 
 @dataclass(frozen=True, eq=False)
-class StructuredPosterior:
+class StructuredPosterior(Posterior):
     """A `StructuredGP` conditioned on training data; made by `StructuredGP.fit` or `load_posterior`.
 
     `result` holds the history of the optimisation, `settings` the resolved configuration of the fit (plain JSON
@@ -50,38 +44,36 @@ class StructuredPosterior:
         return self.likelihood.condition(self.kernels, self.parameters)
 
     @property
+    @override
     def system(self) -> MechanicalSystem:
-        """The robot, contacts and known forces of the model."""
         return self.model.system
 
     @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The joints in the order of every last dimension."""
-        return self.system.robot.joint_names
+    @override
+    def training(self) -> TrainingData:
+        return self.likelihood.training
 
-    def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Prediction:
-        """Distribution of the acceleration and of the forces behind it.
+    @property
+    @override
+    def description(self) -> str:
+        return f"{self.model.mean} mean"
 
-        States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
-        taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
-        in q, v and u where these are tensors that require gradients.
-        Raises InvalidInput for wrong shapes or values that are not finite.
-        """
-        nv = self.system.robot.nv
-        device = self.system.robot.device
-        states = _broadcast(_tensor("q", q, nv, device), _tensor("v", v, nv, device), _tensor("u", u, nv, device))
-        batch = states[0].shape[:-1]
-        flat = [x.reshape(-1, nv) for x in states]
-        rows = flat[0].shape[0]
-        blocks = [
-            self._predict_rows([x[start : start + ROWS_PER_BLOCK] for x in flat], covariance)
-            for start in range(0, max(rows, 1), ROWS_PER_BLOCK)
-        ]
-        return _join(blocks, batch)
+    @property
+    @override
+    def carries_known_forces(self) -> bool:
+        return self.model.mean == "zero"
 
-    def _predict_rows(self, states: Sequence[Tensor], covariance: bool) -> Prediction:
-        q, v, u = states
-        dynamics = self.system.dynamics(q, v, u, inertials_of(self.parameters) or None)
+    @override
+    def dynamics(
+        self, q: Float[Tensor, "*batch nv"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nv"]
+    ) -> ConstrainedDynamics:
+        return self.system.dynamics(q, v, u, inertials_of(self.parameters) or None)
+
+    @override
+    def predict_rows(
+        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
+    ) -> Prediction:
+        dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         features = self.likelihood.standardization(self.model.prior.features(dynamics))
         B = self.model.prior.mixing(dynamics)
@@ -113,40 +105,9 @@ class StructuredPosterior:
             return float(self.likelihood(self.kernels, self.parameters))
 
     @property
+    @override
     def noise_std(self) -> Float[Tensor, "nv"]:
-        """Standard deviation of the acceleration noise per joint, given or learned."""
         return self.parameters[ACCELERATION].exp()
-
-    def with_settings(self, **settings: Any) -> StructuredPosterior:
-        """The same posterior with more entries in `settings`."""
-        changed = copy.copy(self)
-        object.__setattr__(changed, "settings", {**self.settings, **settings})
-        return changed
-
-
-def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
-    if isinstance(values, Tensor):
-        tensor = values.to(torch.float64)
-    else:
-        try:
-            tensor = torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
-        except (TypeError, ValueError) as error:
-            raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None
-    if tensor.dim() == 0 or tensor.shape[-1] != nv:
-        raise InvalidInput(
-            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {nv}, one value per joint."
-        )
-    if not bool(torch.isfinite(tensor).all()):
-        raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
-    return tensor
-
-
-def _broadcast(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-    try:
-        return list(torch.broadcast_tensors(q, v, u))
-    except RuntimeError:
-        shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
-        raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state.") from None
 
 
 def _identity_map(dynamics: ConstrainedDynamics) -> AffineMap:
@@ -162,31 +123,3 @@ def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDyn
 
 def _symmetric(matrix: Tensor) -> Tensor:
     return 0.5 * (matrix + matrix.mT)
-
-
-def _join(blocks: Sequence[Prediction], batch: torch.Size) -> Prediction:
-    """One prediction from blocks of rows, with the caller's batch dimensions."""
-
-    def join(parts: Sequence[Tensor | None]) -> Tensor | None:
-        if any(part is None for part in parts):
-            return None
-        rows = torch.cat([part for part in parts if part is not None])
-        return rows.reshape(*batch, *rows.shape[1:])
-
-    def gaussian(name: str) -> Gaussian:
-        parts = [getattr(block, name) for block in blocks]
-        mean = join([part.mean for part in parts])
-        assert mean is not None
-        return Gaussian(mean, join([part.covariance for part in parts]))
-
-    acceleration = gaussian("acceleration")
-    noise = join([block.noise_covariance for block in blocks])
-    assert noise is not None
-    return Prediction(
-        acceleration.mean,
-        acceleration.covariance,
-        gaussian("multiplier"),
-        gaussian("contact_force"),
-        gaussian("unknown_force"),
-        noise,
-    )

@@ -1,0 +1,155 @@
+"""What every model and every posterior offers: `model.fit(dataset, ...) -> posterior`, `posterior.predict(q, v, u)`."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.inference import OptimizationResult
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.models.marginal_likelihood import TrainingData
+from forcegp.models.prediction import Prediction, join_predictions
+from forcegp.models.search import FitProgress
+
+ROWS_PER_BLOCK = 4096
+"""States that are predicted at once; bounds the memory of long recordings."""
+
+AnyPosterior = TypeVar("AnyPosterior", bound="Posterior")  # beartype cannot check Self where a module is hooked
+
+Array = Tensor | np.ndarray | Sequence[Any]
+
+
+class Posterior(ABC):
+    """What a fitted model knows, as a frozen value.
+
+    `settings` is the resolved configuration of the fit (plain JSON values), with at least `points` (training rows),
+    `seed` and `data` (metadata and episodes of the training data); `result` the parameters that the search found, its
+    history and why it ended. A subclass is a frozen dataclass that holds these two, implements the abstract members,
+    and is registered in `forcegp.models.storage.KINDS`.
+    """
+
+    settings: Mapping[str, Any]
+    result: OptimizationResult
+
+    @property
+    @abstractmethod
+    def system(self) -> MechanicalSystem:
+        """The robot, contacts and known forces."""
+
+    @property
+    @abstractmethod
+    def training(self) -> TrainingData:
+        """The rows that the model was trained on."""
+
+    @property
+    @abstractmethod
+    def noise_std(self) -> Float[Tensor, "nv"]:
+        """Standard deviation of the acceleration noise per joint, given, learned or estimated."""
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """The model in a few words, for titles and tables."""
+
+    @abstractmethod
+    def predict_rows(
+        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
+    ) -> Prediction:
+        """`predict` for one block of checked states."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints in the order of every last dimension."""
+        return self.system.robot.joint_names
+
+    @property
+    def carries_known_forces(self) -> bool:
+        """Whether the predicted `unknown_force` holds the known forces, too."""
+        return False
+
+    def dynamics(
+        self, q: Float[Tensor, "*batch nv"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nv"]
+    ) -> ConstrainedDynamics:
+        """The constrained dynamics of these states, with the model's inertial parameters."""
+        return self.system.dynamics(q, v, u)
+
+    def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Prediction:
+        """Distribution of the acceleration and, where the model speaks of them, of the forces behind it.
+
+        States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
+        taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
+        in q, v and u where these are tensors that require gradients.
+        Raises InvalidInput for wrong shapes or values that are not finite.
+        """
+        nv = self.system.robot.nv
+        device = self.system.robot.device
+        states = _broadcast(_tensor("q", q, nv, device), _tensor("v", v, nv, device), _tensor("u", u, nv, device))
+        batch = states[0].shape[:-1]
+        q, v, u = (x.reshape(-1, nv) for x in states)
+        blocks = [
+            self.predict_rows(q[block], v[block], u[block], covariance)
+            for start in range(0, max(q.shape[0], 1), ROWS_PER_BLOCK)
+            for block in [slice(start, start + ROWS_PER_BLOCK)]
+        ]
+        return join_predictions(blocks, batch)
+
+    def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
+        """The same posterior with more entries in `settings`."""
+        changed = copy.copy(self)
+        object.__setattr__(changed, "settings", {**self.settings, **settings})
+        return changed
+
+
+class Model(ABC):
+    """A model of the forward dynamics of one `system`. `fit` may take more keywords than those named here."""
+
+    system: MechanicalSystem
+
+    @abstractmethod
+    def fit(
+        self,
+        dataset: Dataset,
+        *,
+        points: int | None = None,
+        seed: int = 0,
+        progress: FitProgress | None = None,
+    ) -> Posterior:
+        """Learn from `points` rows that lie far apart in (q, v, u) (None: from all rows).
+
+        Equal seeds give equal posteriors; no global random state is read or written. `progress(start, iteration,
+        objective)` is called now and then. Raises InvalidInput for data of another robot and numbers out of range.
+        """
+
+
+def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
+    if isinstance(values, Tensor):
+        tensor = values.to(torch.float64)
+    else:
+        try:
+            tensor = torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
+        except (TypeError, ValueError) as error:
+            raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None
+    if tensor.dim() == 0 or tensor.shape[-1] != nv:
+        raise InvalidInput(
+            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {nv}, one value per joint."
+        )
+    if not bool(torch.isfinite(tensor).all()):
+        raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
+    return tensor
+
+
+def _broadcast(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+    try:
+        return list(torch.broadcast_tensors(q, v, u))
+    except RuntimeError:
+        shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
+        raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state.") from None
