@@ -22,10 +22,22 @@ ROOMS = {
     "data": {"errors", "robots", "mechanics"},
     "priors": {"errors", "robots", "mechanics"},
     "inference": {"errors"},
-    "models": {"errors", "robots", "mechanics", "data", "priors", "inference"},
+    "integration": {"errors", "robots", "mechanics"},
+    "models": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration"},
     "simulation": {"errors", "robots", "mechanics", "data"},
-    "evaluation": {"errors", "robots", "mechanics", "data", "priors", "inference", "models"},
-    "cli": {"errors", "robots", "mechanics", "data", "priors", "inference", "models", "simulation", "evaluation"},
+    "evaluation": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration", "models"},
+    "cli": {
+        "errors",
+        "robots",
+        "mechanics",
+        "data",
+        "priors",
+        "inference",
+        "integration",
+        "models",
+        "simulation",
+        "evaluation",
+    },
 }
 
 # Optional or slow to import: imported inside the function that uses them. The rooms named here may import them at once.

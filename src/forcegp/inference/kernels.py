@@ -24,7 +24,7 @@ from forcegp.errors import InvalidInput
 
 def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N"]:
     """k(z_i, z_j), dense and differentiable in the kernel's parameters and in z."""
-    squared_exponential = _squared_exponential_parameters(kernel)
+    squared_exponential = squared_exponential_parameters(kernel)
     if squared_exponential is not None:
         return cast(Tensor, _SquaredExponential.apply(z, *squared_exponential))
     if not torch.is_grad_enabled():
@@ -46,7 +46,7 @@ def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N
 
 def kernel_cross(kernel: Kernel, z: Float[Tensor, "n d"], z_train: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
     """k(z_i, z_train_j), dense."""
-    squared_exponential = _squared_exponential_parameters(kernel)
+    squared_exponential = squared_exponential_parameters(kernel)
     if squared_exponential is not None:
         lengthscale, outputscale = squared_exponential
         return outputscale * torch.exp(-0.5 * _squared_distance(z / lengthscale, z_train / lengthscale))
@@ -129,7 +129,7 @@ class _DenseKernel(torch.nn.Module):
         return self.kernel(z, z).to_dense()
 
 
-def _squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
+def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
     """Length scales and output scale of a plain scaled squared exponential; None for every other kernel."""
     if type(kernel) is not ScaleKernel or type(kernel.base_kernel) is not RBFKernel:
         return None

@@ -1,0 +1,166 @@
+"""Pathwise conditioning: functions drawn from the posterior, and its mean, evaluated fast at few points many times.
+
+A drawn function is a prior sample plus an update by the data (Matheron's rule; Wilson et al. 2020, "Efficiently
+sampling functions from Gaussian process posteriors", eq. 10), here in deflated coordinates:
+
+    f_s(z) = g_s(z) + sum_j k(z, z_j) beta_s,j,      beta_s = C^T T^-1 (t - C g_s(Z) - eps_s),   eps_s ~ N(0, I)
+
+with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
+many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
+approximate, and the better the more cosines there are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from gpytorch.kernels import Kernel
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.inference.kernels import squared_exponential_parameters
+from forcegp.inference.posterior import LatentPosterior
+
+FREQUENCIES = 256
+"""Random frequencies of one drawn function, each with a cosine and a sine."""
+
+
+@dataclass(frozen=True, eq=False)
+class StackedKernels:
+    """The squared exponentials of all latents as one batched operation, with their training points.
+
+    Features are divided by their length scales; latents with fewer features are padded with zeros, which changes no
+    distance.
+    """
+
+    lengthscales: tuple[Float[Tensor, " _"], ...]
+    variances: Float[Tensor, " C"]
+    centers: Float[Tensor, "C 1 d"]
+    training: Float[Tensor, "C N d"]
+
+    @classmethod
+    def of(cls, latent: LatentPosterior) -> StackedKernels | None:
+        """None if some kernel is not a scaled squared exponential, or if there are no latents."""
+        parameters = [squared_exponential_parameters(kernel) for kernel in latent.kernels]
+        if not parameters or any(found is None for found in parameters):
+            return None
+        lengthscales, variances = zip(*(found for found in parameters if found is not None), strict=True)
+        lengthscales = tuple(
+            scale.detach().expand(z.shape[-1]) for scale, z in zip(lengthscales, latent.features, strict=True)
+        )
+        training = _scaled(latent.features, lengthscales)
+        centers = training.mean(1, keepdim=True)
+        return cls(lengthscales, torch.stack([s.detach() for s in variances]), centers, training - centers)
+
+    def scaled(self, features: Sequence[Float[Tensor, "*n _"]]) -> Float[Tensor, "C n d"]:
+        """Features over length scales about the centre of the training points, flattened to one batch dimension."""
+        return _scaled([z.reshape(-1, z.shape[-1]) for z in features], self.lengthscales) - self.centers
+
+    def cross(self, scaled: Float[Tensor, "C n d"]) -> Float[Tensor, "C n N"]:
+        """k_c(z, z_j) for points from `scaled`."""
+        squares = scaled.square().sum(-1)[..., :, None] + self.training.square().sum(-1)[..., None, :]
+        distance = torch.baddbmm(squares, scaled, self.training.mT, alpha=-2.0).clamp_min_(0.0)
+        return distance.mul_(-0.5).exp_().mul_(self.variances[:, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class StackedFunctions:
+    """The posterior mean of all latents, for many calls with few points: the same values as `LatentPosterior.mean`."""
+
+    latent: LatentPosterior
+    kernels: StackedKernels | None
+
+    @classmethod
+    def mean_of(cls, latent: LatentPosterior) -> StackedFunctions:
+        """Prepared once for a posterior; kernels that cannot be stacked are evaluated one by one."""
+        with torch.no_grad():
+            return cls(latent, StackedKernels.of(latent))
+
+    def __call__(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
+        """E f_c at the points."""
+        if self.kernels is None:
+            return self.latent.mean(features)
+        cross = self.kernels.cross(self.kernels.scaled(features))
+        return (cross @ self.latent.system.beta.mT[..., None])[..., 0].mT
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionSamples:
+    """S functions drawn from the posterior of the latents; the same points always give the same values.
+
+    `frequencies` are those of the scaled features; `amplitudes` hold the weights of cosines and sines, `beta` those of
+    the training points.
+    """
+
+    kernels: StackedKernels
+    frequencies: Float[Tensor, "S C d P"]
+    amplitudes: Float[Tensor, "2 S C P"]
+    beta: Float[Tensor, "S C N"]
+
+    @classmethod
+    def draw(cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES) -> FunctionSamples:
+        """Draw functions; the same seed gives the same ones.
+
+        Raises InvalidInput if a kernel is not a scaled squared exponential, whose spectrum is known to be normal.
+        """
+        with torch.no_grad():
+            kernels = StackedKernels.of(latent)
+            if kernels is None:
+                raise InvalidInput(
+                    f"functions can be drawn for ScaleKernel(RBFKernel()) without active_dims only, not for "
+                    f"{_names(latent.kernels)}; use such kernels, or ask for no samples."
+                )
+            system = latent.system
+            count, rank, latents = system.deflation.C.shape
+            generator = torch.Generator(device=kernels.training.device).manual_seed(seed)
+            like = {"generator": generator, "dtype": torch.float64, "device": kernels.training.device}
+            omega = torch.randn(samples, latents, kernels.training.shape[-1], frequencies, **like)
+            scale = (kernels.variances / frequencies).sqrt()[:, None]
+            amplitudes = scale * torch.randn(2, samples, latents, frequencies, **like)
+            noise = math.sqrt(1.0 + system.factor.jitter) * torch.randn(samples, count, rank, **like)
+            prior = torch.stack(  # one function at a time, for all its cosines at all points are many numbers
+                [_cosines(kernels.training, omega[s], amplitudes[:, s]) for s in range(samples)]
+            )
+            residual = system.deflation.t - torch.einsum("jac,scj->sja", system.deflation.C, prior) - noise
+            alpha = system.factor.solve(residual.reshape(samples, -1).mT.contiguous()).mT
+            beta = torch.einsum("jac,sja->scj", system.deflation.C, alpha.reshape(samples, count, rank))
+        return cls(kernels, omega, amplitudes, beta)
+
+    def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
+        """Every function at points of its own: f_s,c(z_s,i)."""
+        samples, latents = self.beta.shape[:2]
+        scaled = self.kernels.scaled(features)
+        cross = self.kernels.cross(scaled).unflatten(1, (samples, -1))  # C S n N
+        update = (cross @ self.beta.transpose(0, 1)[..., None])[..., 0]
+        points = scaled.unflatten(1, (samples, -1)).transpose(0, 1)
+        prior = _cosines(points, self.frequencies, self.amplitudes)
+        assert update.shape[0] == latents
+        return prior.movedim(1, -1) + update.permute(1, 2, 0)
+
+
+def _cosines(
+    points: Float[Tensor, "*batch n d"],
+    frequencies: Float[Tensor, "*batch d P"],
+    amplitudes: Float[Tensor, "2 *batch P"],
+) -> Float[Tensor, "*batch n"]:
+    """sum_p amplitude_0p cos(omega_p z) + amplitude_1p sin(omega_p z)."""
+    phase = points @ frequencies
+    return (phase.cos() @ amplitudes[0][..., None] + phase.sin() @ amplitudes[1][..., None])[..., 0]
+
+
+def _scaled(features: Sequence[Tensor], lengthscales: Sequence[Tensor]) -> Float[Tensor, "C n d"]:
+    widest = max(z.shape[-1] for z in features)
+    return torch.stack(
+        [
+            torch.nn.functional.pad(z / scale, (0, widest - z.shape[-1]))
+            for z, scale in zip(features, lengthscales, strict=True)
+        ]
+    )
+
+
+def _names(kernels: Sequence[Kernel] | object) -> str:
+    return ", ".join(sorted({type(kernel).__name__ for kernel in kernels})) or "no kernel at all"  # type: ignore[attr-defined]

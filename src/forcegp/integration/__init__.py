@@ -1,0 +1,30 @@
+"""From accelerations to motion: integrators, the projection onto constraints, and trajectories that may diverge."""
+
+from forcegp.integration.constraint_manifold import ConstraintManifold, ProjectedPosition
+from forcegp.integration.integrators import (
+    INTEGRATORS,
+    Acceleration,
+    Integrator,
+    Projected,
+    RungeKutta4,
+    Step,
+    SymplecticEuler,
+    integrator_named,
+)
+from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, integrate
+
+__all__ = [
+    "INTEGRATORS",
+    "SPEED_LIMIT",
+    "Acceleration",
+    "ConstraintManifold",
+    "Integrator",
+    "Projected",
+    "ProjectedPosition",
+    "RungeKutta4",
+    "Step",
+    "SymplecticEuler",
+    "Trajectory",
+    "integrate",
+    "integrator_named",
+]

@@ -1,0 +1,126 @@
+"""One step of time: symplectic Euler, classical Runge-Kutta, and a projected scheme that stays on the constraint.
+
+An integrator asks for accelerations a(q, v) and knows nothing of where they come from; actuator forces are constant
+over the step. All states are batched, (n, nv).
+"""
+
+from __future__ import annotations
+
+import difflib
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.integration.constraint_manifold import ConstraintManifold
+from forcegp.mechanics import MechanicalSystem
+
+Acceleration = Callable[[Tensor, Tensor], Tensor]
+"""(q, v), each (n, nv), -> a (n, nv)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The state after one step, the acceleration at its beginning, and whether the constraint could be met."""
+
+    q: Float[Tensor, "n nv"]
+    v: Float[Tensor, "n nv"]
+    a: Float[Tensor, "n nv"]
+    on_constraint: Bool[Tensor, " n"]
+
+
+class Integrator(ABC):
+    """A one-step method for q'' = a(q, q')."""
+
+    def start(
+        self, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"]
+    ) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
+        """The state at which a motion from (q, v) begins: itself, unless the method needs another."""
+        return q, v
+
+    @abstractmethod
+    def step(self, acceleration: Acceleration, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"], dt: float) -> Step:
+        """The state `dt` seconds later."""
+
+
+@dataclass(frozen=True, eq=False)
+class SymplecticEuler(Integrator):
+    """v+ = v + dt a(q, v), q+ = q + dt v+: first order, one evaluation; what PyBullet and Rath et al. (2021) do."""
+
+    @override
+    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
+        a = acceleration(q, v)
+        v = v + dt * a
+        return Step(q + dt * v, v, a, _all(q))
+
+
+@dataclass(frozen=True, eq=False)
+class RungeKutta4(Integrator):
+    """The classical method of fourth order, four evaluations (Hairer, Norsett & Wanner 1993, table II.1.2)."""
+
+    @override
+    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
+        a1 = acceleration(q, v)
+        v2 = v + 0.5 * dt * a1
+        a2 = acceleration(q + 0.5 * dt * v, v2)
+        v3 = v + 0.5 * dt * a2
+        a3 = acceleration(q + 0.5 * dt * v2, v3)
+        v4 = v + dt * a3
+        a4 = acceleration(q + dt * v3, v4)
+        q_next = q + dt / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+        return Step(q_next, v + dt / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1, _all(q))
+
+
+@dataclass(frozen=True, eq=False)
+class Projected(Integrator):
+    """A RATTLE-like scheme of second order: after every step c(q) = 0 to 1e-12 m and A v = 0 to rounding.
+
+    Velocity Verlet whose position is projected onto c = 0 and whose velocity onto A v = 0, both along M^-1 A^T, as in
+    RATTLE (Andersen 1983; Hairer, Lubich & Wanner 2006, VII.1.4). As the accelerations may depend on v, the second one
+    is taken at the velocity that Euler's rule predicts. Two evaluations per step. A motion begins at the state nearest
+    to the given one that meets the constraint.
+    """
+
+    manifold: ConstraintManifold
+
+    @override
+    def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return self.manifold.project(q, v)
+
+    @override
+    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
+        a = acceleration(q, v)
+        at = self.manifold.project_position(q + dt * v + 0.5 * dt**2 * a)
+        # Where it failed, the step is refused anyway: go on from the old position, at which models can be asked.
+        reached = torch.where(at.converged[:, None], at.q, q)
+        predicted = torch.where(at.converged[:, None], self.manifold.project_velocity(at, v + dt * a), v)
+        later = acceleration(reached, predicted)
+        halfway = (at.q - q) / dt  # v + dt a / 2 and the impulse of the position's correction
+        v_next = self.manifold.project_velocity(at, halfway + 0.5 * dt * later)
+        return Step(at.q, v_next, a, at.converged)
+
+
+INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
+    "symplectic-euler": lambda system: SymplecticEuler(),
+    "rk4": lambda system: RungeKutta4(),
+    "projected": lambda system: Projected(ConstraintManifold(system)),
+}
+"""Integrators by the name that rollouts and the command line use."""
+
+
+def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
+    """The integrator of that name for motions of `system`. Raises InvalidInput for any other name."""
+    if not isinstance(name, str) or name not in INTEGRATORS:
+        close = difflib.get_close_matches(str(name), INTEGRATORS, n=1)
+        hint = f" did you mean {close[0]!r}?" if close else ""
+        raise InvalidInput(f"integrator is {name!r};{hint} allowed: {', '.join(INTEGRATORS)}.")
+    return INTEGRATORS[name](system)
+
+
+def _all(q: Tensor) -> Tensor:
+    return torch.ones(q.shape[0], dtype=torch.bool, device=q.device)

@@ -1,0 +1,124 @@
+"""`integrate`: many motions at once, each until its end or until it diverges."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.integration.integrators import Acceleration, Integrator
+
+SPEED_LIMIT = 100.0
+"""A motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """n motions of T steps: q, v (T+1, n, nv) and a (T, n, nv), the acceleration at the beginning of each step.
+
+    `diverged_at` (n,) is the first row of q and v that does not exist (NaN from there on), -1 for a motion that lasted
+    to the end.
+    """
+
+    q: Float[Tensor, "rows n nv"]
+    v: Float[Tensor, "rows n nv"]
+    a: Float[Tensor, "steps n nv"]
+    diverged_at: Int[Tensor, " n"]
+
+
+def integrate(
+    integrator: Integrator,
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor],
+    q0: Float[Tensor, "n nv"],
+    v0: Float[Tensor, "n nv"],
+    u: Float[Tensor, "steps n nv"],
+    dt: float,
+    *,
+    what: str = "motions",
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Carry n states through T steps of `dt` seconds; u[k] acts from row k to row k + 1.
+
+    A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that cannot be kept on its
+    constraint, ends there: the rest of it is NaN, `diverged_at` tells the row, and a NumericalWarning says so. The
+    others go on. `acceleration` is called with finite states only. `what` names the motions in the warning,
+    `progress(step, steps)` is called after every step.
+    Raises InvalidInput where `dt` is no positive number or a start is faster than the limit.
+    """
+    if not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
+        raise InvalidInput(f"dt is {dt!r}; give the time step as a positive number of seconds.")
+    if bool((v0.abs() > SPEED_LIMIT).any()):
+        raise InvalidInput(
+            f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
+            "m/s counts as diverged, check its units."
+        )
+    q, v = integrator.start(q0, v0)
+    steps, n = u.shape[:2]
+    rows_q, rows_v = (x.new_full((steps + 1, *x.shape), math.nan) for x in (q, v))
+    rows_a = torch.full_like(u, math.nan)
+    rows_q[0], rows_v[0] = q, v
+    diverged_at = torch.full((n,), -1, dtype=torch.int64, device=q.device)
+    off_constraint = torch.zeros(n, dtype=torch.bool, device=q.device)
+    alive = torch.ones(n, dtype=torch.bool, device=q.device)
+    for k in range(steps):
+        step = integrator.step(_at_finite_states(acceleration, q, v, u[k]), q, v, dt)
+        rows_a[k] = torch.where(alive[:, None], step.a, math.nan)
+        bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
+        good = alive & bounded & step.on_constraint
+        if not bool(good.all()):
+            ended = alive & ~good
+            diverged_at[ended] = k + 1
+            off_constraint |= ended & ~step.on_constraint
+            alive = good
+            # A motion that has ended stays where it last was: there its acceleration can be computed.
+            q, v = torch.where(good[:, None], step.q, q), torch.where(good[:, None], step.v, v)
+            rows_q[k + 1, good], rows_v[k + 1, good] = q[good], v[good]
+            if not bool(alive.any()):
+                break
+        else:
+            q, v = step.q, step.v
+            rows_q[k + 1], rows_v[k + 1] = q, v
+        if progress is not None:
+            progress(k + 1, steps)
+    _warn_of_divergence(diverged_at, off_constraint, dt, what)
+    return Trajectory(rows_q, rows_v, rows_a, diverged_at)
+
+
+def _at_finite_states(
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], q0: Tensor, v0: Tensor, u: Tensor
+) -> Acceleration:
+    """a(q, v) under u, which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
+
+    def guarded(q: Tensor, v: Tensor) -> Tensor:
+        finite = (torch.isfinite(q) & torch.isfinite(v)).all(-1, keepdim=True)
+        if bool(finite.all()):
+            return acceleration(q, v, u)
+        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)
+
+    return guarded
+
+
+def _warn_of_divergence(diverged_at: Tensor, off_constraint: Tensor, dt: float, what: str) -> None:
+    ended = diverged_at >= 0
+    if not bool(ended.any()):
+        return
+    first = int(diverged_at[ended].min())
+    lost = int(off_constraint.sum())
+    cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
+    if lost:
+        cause = "no position on the surfaces of the contacts near the predicted one" + (
+            f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else ""
+        )
+    warnings.warn(
+        f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
+        f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model that knows more physics "
+        "avoids this.",
+        NumericalWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,206 @@
+"""`Rollout`: where a fitted model says that a robot goes, as a frozen value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.integration import ConstraintManifold, Trajectory, integrate, integrator_named
+from forcegp.mechanics import Baumgarte
+from forcegp.models.accelerations import AccelerationFunction, AccelerationModel
+from forcegp.models.search import blas_threads
+
+ROWS_PER_BLOCK = 4096
+"""States whose constraint is evaluated at once."""
+
+Quantity = Literal["q", "v", "a", "constraint", "velocity_constraint"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Motions of T steps from one or more initial states; batch dimensions are those of q0.
+
+    Fields
+    ------
+    time: (T+1,) in s, from 0.
+    q, v: (..., T+1, nv) in rad and rad/s (m and m/s); row 0 is the initial state, which `integrator="projected"` moves
+        onto the constraint first. Angles are not wrapped.
+    a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k].
+    constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
+        signed distances).
+    velocity_constraint: A(q) v (..., T+1, m) in m/s.
+    initial_correction: (..., 2) largest change of any joint's position and velocity that the projection of the initial
+        state made; 0 for integrators that do not project.
+    diverged_at: (...) the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    integrator, baumgarte: how the motion was computed.
+    samples: with samples=S, the same for S functions drawn from the model's posterior, shapes (S, ..., T+1, nv);
+        None without. Each sample is one function: it answers the same state always with the same force.
+    """
+
+    time: Float[Tensor, " rows"]
+    q: Float[Tensor, "*batch rows nv"]
+    v: Float[Tensor, "*batch rows nv"]
+    a: Float[Tensor, "*batch steps nv"]
+    constraint: Float[Tensor, "*batch rows m"]
+    velocity_constraint: Float[Tensor, "*batch rows m"]
+    initial_correction: Float[Tensor, "*batch 2"]
+    diverged_at: Int[Tensor, "*batch"]
+    integrator: str
+    baumgarte: Baumgarte | None
+    samples: Rollout | None = None
+
+    def std(self, quantity: Quantity = "q") -> Tensor:
+        """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.
+
+        Raises InvalidInput for a rollout with fewer than two samples.
+        """
+        return self._sampled(quantity, least=2).std(0)
+
+    def quantiles(self, levels: Sequence[float] = (0.025, 0.5, 0.975), quantity: Quantity = "q") -> Tensor:
+        """Quantiles (levels, ...) over the samples; NaN from where one sample diverged.
+
+        Raises InvalidInput for a rollout without samples, or levels outside 0 to 1.
+        """
+        if not all(0.0 <= level <= 1.0 for level in levels):
+            raise InvalidInput(f"quantile levels are {tuple(levels)}; each must be from 0 to 1.")
+        values = self._sampled(quantity, least=1)
+        return torch.quantile(values, torch.tensor(levels, dtype=values.dtype, device=values.device), dim=0)
+
+    def _sampled(self, quantity: Quantity, least: int) -> Tensor:
+        count = 0 if self.samples is None else self.samples.q.shape[0]
+        if count < least:
+            raise InvalidInput(
+                f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
+            )
+        return getattr(self.samples, quantity)
+
+
+def roll_out(
+    model: AccelerationModel,
+    q0: Any,
+    v0: Any,
+    u: Any,
+    dt: float,
+    *,
+    integrator: str = "symplectic-euler",
+    samples: int = 0,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Rollout:
+    """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
+    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 0:
+        raise InvalidInput(f"samples is {samples!r}; give the number of sampled motions, 0 for none.")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InvalidInput(f"seed is {seed!r}; give an integer of at least 0.")
+    method = integrator_named(integrator, model.system)
+    q, v, forces, batch = _checked_start(model, q0, v0, u)
+    runs = _Runs(model, integrator, dt)
+    steps = forces.shape[0]
+    total = steps * (1 + bool(samples))
+    with torch.no_grad(), blas_threads(0):
+        report = None if progress is None else lambda done, _: progress(done, total)
+        mean = integrate(method, model.mean(), q, v, forces, dt, what="rollouts", progress=report)
+        drawn = None
+        if samples:
+            later = None if progress is None else lambda done, _: progress(steps + done, total)
+            function = _by_sample(model.sampled(samples, seed), samples)
+            many = q.repeat(samples, 1), v.repeat(samples, 1)
+            repeated = forces.repeat(1, samples, 1)
+            sampled = integrate(
+                method, function, many[0], many[1], repeated, dt, what="sampled rollouts", progress=later
+            )
+            drawn = runs.rollout(sampled, many[0], many[1], (samples, *batch), None)
+        return runs.rollout(mean, q, v, batch, drawn)
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """What the mean and the sampled motions of one rollout have in common."""
+
+    model: AccelerationModel
+    integrator: str
+    dt: float
+
+    def rollout(
+        self, motion: Trajectory, q0: Tensor, v0: Tensor, batch: Sequence[int], samples: Rollout | None
+    ) -> Rollout:
+        """The value with the caller's batch dimensions in front of time."""
+
+        def shaped(rows: Tensor) -> Tensor:
+            return rows.movedim(0, 1).reshape(*batch, rows.shape[0], rows.shape[-1])
+
+        q, v = shaped(motion.q), shaped(motion.v)
+        c, rate = self._violation(q, v)
+        change = [(after[0] - before).abs().amax(-1) for after, before in ((motion.q, q0), (motion.v, v0))]
+        return Rollout(
+            time=self.dt * torch.arange(motion.q.shape[0], dtype=q.dtype, device=q.device),
+            q=q,
+            v=v,
+            a=shaped(motion.a),
+            constraint=c,
+            velocity_constraint=rate,
+            initial_correction=torch.stack(change, dim=-1).reshape(*batch, 2),
+            diverged_at=motion.diverged_at.reshape(*batch),
+            integrator=self.integrator,
+            baumgarte=self.model.baumgarte,
+            samples=samples,
+        )
+
+    def _violation(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        manifold = ConstraintManifold(self.model.system)
+        flat = [x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q, v)]
+        parts = [manifold.violation(*block) for block in zip(*flat, strict=True)]
+        c, rate = (torch.cat(part).reshape(*q.shape[:-1], -1) for part in zip(*parts, strict=True))
+        return c, rate
+
+
+def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
+    """A function of (samples, n, nv) as one of (samples * n, nv)."""
+
+    def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        return function(*(x.reshape(samples, -1, x.shape[-1]) for x in (q, v, u))).reshape(q.shape)
+
+    return flat
+
+
+def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
+    """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions."""
+    robot = model.system.robot
+    given = {name: _numbers(name, values, robot.device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
+    for name, values in given.items():
+        least = 2 if name == "u" else 1
+        if values.dim() < least or values.shape[-1] != robot.nv:
+            wanted = f"(..., T, {robot.nv})" if name == "u" else f"(..., {robot.nv})"
+            raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
+        if not bool(torch.isfinite(values).all()):
+            raise InvalidInput(f"{name} has values that are not finite; drop or repair them.")
+    q, v, forces = given.values()
+    steps = forces.shape[-2]
+    if not steps:
+        raise InvalidInput("u has no rows; a rollout has at least one step.")
+    try:
+        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], forces.shape[:-2])
+    except RuntimeError:
+        shapes = f"q0 {tuple(q.shape)}, v0 {tuple(v.shape)}, u {tuple(forces.shape)}"
+        raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q0 and v0 per motion.") from None
+    if not batch.numel():
+        raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
+    q, v = (x.expand(*batch, -1).reshape(-1, robot.nv) for x in (q, v))
+    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, robot.nv).movedim(1, 0).contiguous()
+    return q, v, forces, batch
+
+
+def _numbers(name: str, values: Any, device: torch.device) -> Tensor:
+    if isinstance(values, Tensor):
+        return values.detach().to(device, torch.float64)
+    try:
+        return torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None
