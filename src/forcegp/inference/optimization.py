@@ -30,7 +30,7 @@ class OptimizerOptions:
     `iterations`: most L-BFGS iterations; `tolerance`: stop when an iteration lowers the objective by less than this
     fraction of it;
     `gradient_tolerance`: stop when the largest gradient entry is below this; `adam_steps`, `adam_rate`: optional warm-
-    up.
+    up; `keep_iterates`: keep the parameters after every iteration, too.
     """
 
     iterations: int = 200
@@ -39,6 +39,7 @@ class OptimizerOptions:
     memory: int = 20
     adam_steps: int = 0
     adam_rate: float = 0.1
+    keep_iterates: bool = False
 
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.adam_steps < 0:
@@ -49,7 +50,10 @@ class OptimizerOptions:
 
 @dataclass(frozen=True)
 class OptimizationResult:
-    """The best parameters seen, the objective there, its value after every iteration, and why the search ended."""
+    """The best parameters seen, the objective there, its value after every iteration, and why the search ended.
+
+    `iterates` are the parameters that belong to `history`, where `keep_iterates` asked for them; else it is empty.
+    """
 
     parameters: dict[str, Tensor]
     value: float
@@ -58,6 +62,7 @@ class OptimizationResult:
     converged: bool
     evaluations: int
     cpu_seconds: float
+    iterates: tuple[dict[str, Tensor], ...] = ()
 
 
 class _Search:
@@ -151,9 +156,12 @@ def minimize_objective(
     if search.evaluate(search.best_point) is None:
         raise FitError(f"the marginal likelihood cannot be evaluated at the start values: {search.cause}")
     history = [search.best_value]
+    points = [search.best_point.copy()]
 
-    def record(value: float) -> None:
+    def record(value: float, point: np.ndarray) -> None:
         history.append(value)
+        if options.keep_iterates:
+            points.append(point.copy())
         if progress is not None:
             progress(len(history) - 1, value)
 
@@ -173,7 +181,7 @@ def minimize_objective(
             search.best_point,
             jac=True,
             method="L-BFGS-B",
-            callback=lambda intermediate_result: record(float(intermediate_result.fun)),
+            callback=lambda intermediate_result: record(float(intermediate_result.fun), intermediate_result.x),
             options={
                 "maxiter": remaining,
                 "maxfun": 4 * remaining,
@@ -204,6 +212,7 @@ def minimize_objective(
         converged=converged,
         evaluations=search.evaluations,
         cpu_seconds=time.process_time() - start_time,
+        iterates=tuple(map(search.unflatten, points)) if options.keep_iterates else (),
     )
 
 
@@ -218,7 +227,7 @@ def _sentence(status: int, message: str, options: OptimizerOptions) -> str:
     return f"stopped at the limit of {options.iterations} iterations; raise `iterations` to search on"
 
 
-def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float], None]) -> None:
+def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float, np.ndarray], None]) -> None:
     """Kingma & Ba (2015), algorithm 1; ends early at the first point that cannot be evaluated."""
     point = torch.as_tensor(search.best_point.copy()).requires_grad_()
     optimizer = torch.optim.Adam([point], lr=options.adam_rate)
@@ -226,11 +235,12 @@ def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float], 
     for _ in range(options.adam_steps):
         point.grad = torch.as_tensor(slope.copy())
         optimizer.step()
-        evaluated = search.evaluate(point.detach().numpy())
+        at = point.detach().numpy()
+        evaluated = search.evaluate(at)
         if evaluated is None:
             return
         value, slope = evaluated
-        record(value)
+        record(value, at)
 
 
 def best_of(results: list[OptimizationResult]) -> OptimizationResult:

@@ -29,6 +29,9 @@ class KnownForce(ABC):
     per_joint: ClassVar[tuple[str, ...]] = ()
     """Names of the fields with one non-negative number per joint."""
 
+    learned: ClassVar[str | None] = None
+    """Name of the one of them that an identification estimates."""
+
     @abstractmethod
     def force(self, state: State) -> Float[Tensor, "*#batch nv"]:
         """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""
@@ -71,6 +74,7 @@ class ViscousJointFriction(KnownForce):
 
     coefficients: PerJoint
     per_joint: ClassVar[tuple[str, ...]] = ("coefficients",)
+    learned: ClassVar[str | None] = "coefficients"
 
     @classmethod
     def from_robot(cls, robot: Robot) -> ViscousJointFriction:
@@ -89,6 +93,7 @@ class CoulombJointFriction(KnownForce):
     coefficients: PerJoint
     velocity_scale: PerJoint = 0.01
     per_joint: ClassVar[tuple[str, ...]] = ("coefficients", "velocity_scale")
+    learned: ClassVar[str | None] = "coefficients"
 
     @classmethod
     def from_robot(cls, robot: Robot, velocity_scale: PerJoint = 0.01) -> CoulombJointFriction:
@@ -113,6 +118,7 @@ class Armature(KnownForce):
 
     inertia: PerJoint
     per_joint: ClassVar[tuple[str, ...]] = ("inertia",)
+    learned: ClassVar[str | None] = "inertia"
 
     @override
     def force(self, state: State) -> Tensor:

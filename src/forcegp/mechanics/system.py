@@ -15,6 +15,7 @@ from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidI
 from forcegp.mechanics.contacts import Baumgarte, Contact
 from forcegp.mechanics.gauss_principle import ConstrainedDynamics
 from forcegp.mechanics.known_forces import (
+    KNOWN_FORCES,
     Actuation,
     KnownForce,
     RigidBodyBias,
@@ -129,6 +130,34 @@ class MechanicalSystem:
     def with_contacts(self, contacts: Sequence[Contact]) -> MechanicalSystem:
         """The same robot and forces under other contacts."""
         return replace(self, contacts=tuple(contacts))
+
+    def force_index(self, name: str) -> int:
+        """Position of the one known force that files call `name`, among those whose coefficients can be estimated.
+
+        Raises InvalidInput where there is none, or more than one.
+        """
+        kinds = {key: kind for key, kind in KNOWN_FORCES.items() if kind.learned is not None}
+        if name not in kinds:
+            raise InvalidInput(f"no coefficients are called {name!r}; there are {', '.join(kinds)}")
+        found = [index for index, force in enumerate(self.known_forces) if type(force) is kinds[name]]
+        if len(found) != 1:
+            kind = kinds[name].__name__
+            raise InvalidInput(
+                f"the system lists {len(found)} known forces {name!r}; to learn its coefficients list {kind}(...) once "
+                "in known_forces"
+            )
+        return found[0]
+
+    def with_coefficients(self, coefficients: Mapping[str, Tensor]) -> MechanicalSystem:
+        """The same system where the known forces of these names have other coefficients (nv,), which keep their graph.
+
+        Raises InvalidInput for names that `force_index` refuses.
+        """
+        forces = list(self.known_forces)
+        for name, values in coefficients.items():
+            index = self.force_index(name)
+            forces[index] = replace(forces[index], **{str(forces[index].learned): values})  # type: ignore[type-var]
+        return replace(self, known_forces=tuple(forces))
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON values, the robot as URDF text.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
@@ -52,3 +55,21 @@ def check_search_numbers(restarts: int, jobs: int, seed: int) -> None:
         raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
     if seed < 0:
         raise InvalidInput(f"seed={seed} must be 0 or larger")
+
+
+def first_start(
+    moments: Mapping[str, Tensor], given: Mapping[str, Tensor], fixed: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """The moments, with what the caller gives in their place. Raises InvalidInput for what the model does not have."""
+    first = dict(moments)
+    for name, value in given.items():
+        if name in fixed:
+            continue  # the noise that this fit holds fixed
+        if name not in first:
+            raise InvalidInput(f"start has {name!r}; the parameters of this model are {', '.join(sorted(first))}")
+        if value.shape != first[name].shape or not bool(torch.isfinite(value).all()):
+            raise InvalidInput(
+                f"start[{name!r}] has shape {tuple(value.shape)} or is not finite; give {tuple(first[name].shape)}"
+            )
+        first[name] = value.detach().to(first[name])
+    return first

@@ -19,6 +19,7 @@ from forcegp.priors import ForcePrior
 
 Mean = Literal["analytical", "zero"]
 INERTIALS = "inertials."
+COEFFICIENTS = "coefficients."
 RESIDUAL_FLOOR = 1e-6
 """Smallest start variance of a latent as a fraction of the largest: a latent that the start residual does not
 excite can still grow.
@@ -46,11 +47,12 @@ class Standardization:
     def of(cls, features: Sequence[Float[Tensor, "N _"]]) -> Standardization:
         """Mean and standard deviation over the points."""
         shift = tuple(z.mean(0) for z in features)
-        spread = [z.std(0, correction=0) for z in features]
-        # below rounding of the values themselves a feature counts as constant
+        variances = [z.var(0, correction=0) for z in features]
+        # below rounding of the values themselves a feature counts as constant; the root comes after that choice,
+        # for its derivative at 0 is infinite
         scale = tuple(
-            torch.where(std > 1e-12 * (1.0 + mean.abs()), std, torch.ones_like(std))
-            for std, mean in zip(spread, shift, strict=True)
+            torch.where(variance > (1e-12 * (1.0 + mean.abs())).square(), variance, torch.ones_like(variance)).sqrt()
+            for variance, mean in zip(variances, shift, strict=True)
         )
         return cls(shift, scale)
 
@@ -64,8 +66,8 @@ class MarginalLikelihood:
     """-log p(a | q, v, u, parameters) of one model on one training set, as a function of unconstrained parameters.
 
     Parameters by name: those of the kernels, `noise.log_acceleration` (nv,), optionally `noise.log_force` (nv,), and
-    optionally `inertials.<link>` (10,) log-Cholesky parameters of links. All of them receive gradients in one backward
-    pass.
+    optionally `inertials.<link>` (10,) log-Cholesky parameters of links and `coefficients.<known force>` (nv,). All of
+    them receive gradients in one backward pass.
     """
 
     system: MechanicalSystem
@@ -74,11 +76,12 @@ class MarginalLikelihood:
     training: TrainingData
 
     def dynamics(self, parameters: Mapping[str, Tensor] | None = None) -> ConstrainedDynamics:
-        """The constrained dynamics of the training states, at the inertial parameters among `parameters`."""
-        inertials = inertials_of(parameters or {})
-        if not inertials and not self._known_forces_are_learned:
+        """The constrained dynamics of the training states, at the physical parameters among `parameters`."""
+        inertials, coefficients = inertials_of(parameters or {}), coefficients_of(parameters or {})
+        if not inertials and not coefficients and not self._known_forces_are_learned:
             return self._nominal_dynamics
-        return self.system.dynamics(self.training.q, self.training.v, self.training.u, inertials)
+        system = self.system.with_coefficients(coefficients) if coefficients else self.system
+        return system.dynamics(self.training.q, self.training.v, self.training.u, inertials)
 
     @property
     def _known_forces_are_learned(self) -> bool:
@@ -112,18 +115,21 @@ class MarginalLikelihood:
         noise = Noise.covariance(parameters, dynamics.H)
         if dynamics is self._nominal_dynamics:
             return self._nominal_features, self._nominal_mixing, self.training.a - offset, noise
-        features = self.standardization(self.prior.features(dynamics))
+        # shifted and scaled at these parameters, as a posterior does that has them in its system
+        given = self.prior.features(dynamics)
+        features = Standardization.of(given)(given)
         return features, dynamics.H @ self.prior.mixing(dynamics), self.training.a - offset, noise
 
-    def kernels(self) -> LatentKernels:
-        """Kernels with moment-based start values.
+    def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
+        """Kernels with moment-based start values, at the physical parameters among `parameters`.
 
         Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force
         residual.
         """
-        offset = self._nominal_dynamics.acceleration_map(known=self.mean == "analytical").offset
-        W = self._nominal_mixing
-        estimate = (torch.linalg.pinv(W, rtol=1e-8) @ (self.training.a - offset)[..., None])[..., 0]
+        any_noise = {ACCELERATION: torch.zeros_like(self.training.a[0])}
+        with torch.no_grad():
+            features, W, residual, _ = self.terms({**any_noise, **(parameters or {})})
+        estimate = (torch.linalg.pinv(W, rtol=1e-8) @ residual[..., None])[..., 0]
         variances = estimate.square().mean(0)
         largest = float(variances.max()) if variances.numel() else 0.0
         if variances.numel() and not largest > 0.0:
@@ -133,7 +139,7 @@ class MarginalLikelihood:
                 "the model itself"
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
-        return LatentKernels(self.prior.kernels(tuple(z.shape[-1] for z in self._nominal_features), variances))
+        return LatentKernels(self.prior.kernels(tuple(z.shape[-1] for z in features), variances))
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood, exact and differentiable in every parameter.
@@ -141,9 +147,13 @@ class MarginalLikelihood:
         Raises InvalidInput for a parameter of a name that means nothing here.
         """
         known = {*kernels.initial_parameters(), ACCELERATION, FORCE}
-        unknown = next((name for name in parameters if name not in known and not name.startswith(INERTIALS)), None)
+        physical = (INERTIALS, COEFFICIENTS)
+        unknown = next((name for name in parameters if name not in known and not name.startswith(physical)), None)
         if unknown is not None:
-            raise InvalidInput(f"no parameter {unknown!r}; there are {', '.join(sorted(known))} and {INERTIALS}<link>")
+            raise InvalidInput(
+                f"no parameter {unknown!r}; there are {', '.join(sorted(known))}, {INERTIALS}<link> and "
+                f"{COEFFICIENTS}<known force>"
+            )
         features, W, residual, noise = self.terms(parameters)
         return negative_log_likelihood(W, residual, noise, kernels.matrices(parameters, features))
 
@@ -157,3 +167,8 @@ class MarginalLikelihood:
 def inertials_of(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Link name -> log-Cholesky parameters, from the entries `inertials.<link>`."""
     return {name[len(INERTIALS) :]: value for name, value in parameters.items() if name.startswith(INERTIALS)}
+
+
+def coefficients_of(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Known force -> coefficients (nv,), from the entries `coefficients.<known force>`."""
+    return {name[len(COEFFICIENTS) :]: value for name, value in parameters.items() if name.startswith(COEFFICIENTS)}

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from forcegp.models.noise import ACCELERATION, FORCE
+from forcegp.models.physical_parameters import PHYSICAL
 
 RESTART_SPREAD = 0.7
 """Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
@@ -40,7 +41,7 @@ def default_restarts(points: int) -> int:
 
 
 def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
-    """Kernel parameters shifted by seeded normal numbers on their log scale; the noise keeps its start.
+    """Kernel parameters shifted by seeded normal numbers on their log scale; noise and physical parameters keep theirs.
 
     Odd restarts begin near a linear function, at a multiple of the length scales and its square of the variance.
     """
@@ -48,7 +49,7 @@ def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, T
     shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
     shifted = {}
     for name, value in start.items():
-        if name in (ACCELERATION, FORCE):
+        if name in (ACCELERATION, FORCE, PHYSICAL):
             shifted[name] = value
             continue
         shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, get_args
 
@@ -20,9 +20,13 @@ from forcegp.inference import (
     minimize_objective,
 )
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.fit_arguments import check_search_numbers, resolved_noise, training_rows
+from forcegp.models.fit_arguments import check_search_numbers, first_start, resolved_noise, training_rows
+from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import Noise
+from forcegp.models.physical_parameters import PHYSICAL, Learned, PhysicalParameters, learn_to_list
+from forcegp.models.physical_start import PhysicalStart
+from forcegp.models.protocol import Model
 from forcegp.models.search import FitProgress, blas_threads, default_restarts, perturbed, run_restarts
 from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
@@ -32,7 +36,7 @@ FAR_FROM_SURFACE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class StructuredGP:
+class StructuredGP(Model):
     """a = M^-1 Q_b + H (Q_K + B f) + noise with f ~ GP (Rath et al. 2021, eq. 6; eq. 7 with the analytical mean).
 
     Parameters
@@ -73,6 +77,7 @@ class StructuredGP:
         hyperprior: bool = True,
         options: OptimizerOptions | None = None,
         start: Mapping[str, Tensor] | None = None,
+        learn: Learned | Sequence[Learned] | None = None,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
         """Find all kernel and learned noise parameters by marginal likelihood, then condition on the same points.
@@ -91,6 +96,9 @@ class StructuredGP:
         options: the search itself.
         start: unconstrained parameters at which the first search begins instead of moments, for example
             `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
+        learn: physical parameters to estimate along with all others, from the values that the system has:
+            `robot.link("tool").inertial("mass", "com")`, `Coefficients("viscous-joint-friction")`, or several of them.
+            Then `posterior.system` has the estimates, and `posterior.identification` tells all about them.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
 
         Raises
@@ -108,21 +116,30 @@ class StructuredGP:
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
         _warn_of_distance(self.system, training)
-        kernels = likelihood.kernels()
         noise_parameters = noise.parameters(self.system.robot.nv)
-        fixed = {} if noise.learn else noise_parameters
-        moments = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
+        learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
+        begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters)
+        kernels = likelihood.kernels() if begin is None else begin.kernels
+        moments = (kernels.initial_parameters() if begin is None else begin.path[-1]) | learned_noise
         options = options or OptimizerOptions()
-        first = _first_start(moments, start or {}, fixed)
-        search = _Search(_Objective(likelihood, kernels, noise, fixed, hyperprior), moments, first, seed, options)
+        first = first_start(moments, start or {}, fixed)
+        objective = _Objective(likelihood, kernels, noise, fixed, hyperprior, begin.physical if begin else None)
+        kept = options if begin is None else replace(options, keep_iterates=True)
+        search = _Search(objective, moments, first, seed, kept)
         with blas_threads(training.q.numel()):
             results = run_restarts(search, restarts, jobs, progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
+        result = best_of(usable)
+        if begin is not None:  # the steps before the search are its first iterations
+            before = [point | learned_noise for point in begin.path[:-1]]
+            with torch.no_grad():
+                values = [float(objective(point)) for point in before]
+            result = replace(result, history=(*values, *result.history), iterates=(*before, *result.iterates))
         result = replace(
-            best_of(usable),
+            result,
             evaluations=sum(search.evaluations for search in usable),
             cpu_seconds=sum(search.cpu_seconds for search in usable),
         )
@@ -141,7 +158,15 @@ class StructuredGP:
             "restart_objective": [r.value if isinstance(r, OptimizationResult) else None for r in results],
         }
         fitted = StructuredGP(self.system, self.prior, self.mean, noise)
-        return fitted._posterior(likelihood, kernels, result.parameters | fixed, result, settings)
+        if begin is None:
+            return fitted._posterior(likelihood, kernels, result.parameters | fixed, result, settings)
+        settings["learned"] = learn_to_list(begin.physical)
+        identification = Identification.of(begin.physical, objective, result)
+        parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
+        posterior = replace(fitted, system=identification.system).condition(
+            training, parameters | fixed, replace(result, parameters=parameters), settings
+        )
+        return replace(posterior, identification=identification)
 
     def condition(
         self,
@@ -185,9 +210,13 @@ class _Objective:
     noise: Noise
     fixed: Mapping[str, Tensor]
     hyperprior: bool
+    physical: PhysicalParameters | None = None
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        value = self.likelihood(self.kernels, {**self.fixed, **parameters})
+        named = {**self.fixed, **parameters}
+        if self.physical is not None:
+            named |= self.physical.tensors(named.pop(PHYSICAL))
+        value = self.likelihood(self.kernels, named)
         if not self.hyperprior:
             return value
         nv = self.likelihood.system.robot.nv
@@ -211,24 +240,6 @@ class _Search:
             return minimize_objective(self.objective, first, self.options, note)
         except FitError as error:
             return error
-
-
-def _first_start(
-    moments: Mapping[str, Tensor], given: Mapping[str, Tensor], fixed: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
-    """The moments, with what the caller gives in their place. Raises InvalidInput for what the model does not have."""
-    first = dict(moments)
-    for name, value in given.items():
-        if name in fixed:
-            continue  # the noise that this fit holds fixed
-        if name not in first:
-            raise InvalidInput(f"start has {name!r}; the parameters of this model are {', '.join(sorted(first))}")
-        if value.shape != first[name].shape or not bool(torch.isfinite(value).all()):
-            raise InvalidInput(
-                f"start[{name!r}] has shape {tuple(value.shape)} or is not finite; give {tuple(first[name].shape)}"
-            )
-        first[name] = value.detach().to(first[name])
-    return first
 
 
 def _warn_of_distance(system: MechanicalSystem, training: TrainingData) -> None:

@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
 from forcegp.mechanics import AffineMap, ConstrainedDynamics, MechanicalSystem
+from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Gaussian, Prediction
@@ -28,7 +29,7 @@ class StructuredPosterior(Posterior):
     """A `StructuredGP` conditioned on training data; made by `StructuredGP.fit` or `load_posterior`.
 
     `result` holds the history of the optimisation, `settings` the resolved configuration of the fit (plain JSON
-    values).
+    values), `identification` what was learned of the system itself, after a fit with `learn` (not after loading).
     """
 
     model: StructuredGP
@@ -37,6 +38,7 @@ class StructuredPosterior(Posterior):
     parameters: Mapping[str, Tensor]
     result: OptimizationResult
     settings: Mapping[str, Any]
+    identification: Identification | None = None
 
     @cached_property
     def latent(self) -> LatentPosterior:

@@ -6,13 +6,14 @@ from forcegp.robots.inertia import (
     pseudo_inertia_from_parameters,
 )
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.parts import Joint, Link
+from forcegp.robots.parts import Joint, Link, LinkInertia
 from forcegp.robots.robot import Robot
 
 __all__ = [
     "Joint",
     "Kinematics",
     "Link",
+    "LinkInertia",
     "Robot",
     "parameters_from_physical",
     "physical_from_parameters",
