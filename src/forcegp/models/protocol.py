@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,9 +16,11 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizationResult
-from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
+from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
 from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.prediction import Prediction, join_predictions
+from forcegp.models.rollout import Rollout, roll_out
 from forcegp.models.search import FitProgress
 
 ROWS_PER_BLOCK = 4096
@@ -31,12 +34,14 @@ Array = Tensor | np.ndarray | Sequence[Any]
 class Posterior(ABC):
     """What a fitted model knows, as a frozen value.
 
-    `settings` is the resolved configuration of the fit (plain JSON values), with at least `points` (training rows),
-    `seed` and `data` (metadata and episodes of the training data); `result` the parameters that the search found, its
-    history and why it ended. A subclass is a frozen dataclass that holds these two, implements the abstract members,
-    and is registered in `forcegp.models.storage.KINDS`.
+    `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
+    (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
+    training data); `result` is the history of the search and why it ended. A subclass is a frozen dataclass with these
+    four and the abstract members; an entry in `forcegp.models.storage.KINDS` lets it be stored.
     """
 
+    model: Any  # the Model, of which every subclass names its own
+    parameters: Mapping[str, Tensor]
     settings: Mapping[str, Any]
     result: OptimizationResult
 
@@ -59,6 +64,11 @@ class Posterior(ABC):
     @abstractmethod
     def description(self) -> str:
         """The model in a few words, for titles and tables."""
+
+    @cached_property
+    @abstractmethod
+    def negative_log_likelihood(self) -> float:
+        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
 
     @abstractmethod
     def predict_rows(
@@ -102,6 +112,43 @@ class Posterior(ABC):
         ]
         return join_predictions(blocks, batch)
 
+    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
+        """What `rollout` integrates, under this stabilisation; for models that know no constraint it must be None."""
+        return PredictedAccelerations(self, baumgarte)
+
+    def rollout(
+        self,
+        q0: Array,
+        v0: Array,
+        u: Array,
+        dt: float,
+        *,
+        integrator: str = "symplectic-euler",
+        baumgarte: Baumgarte | None = None,
+        samples: int = 0,
+        seed: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Rollout:
+        """Where the robot goes from (q0, v0) under the forces u: the integrated mean acceleration.
+
+        Parameters
+        ----------
+        q0, v0: initial states (..., nv) in rad and rad/s (m and m/s), any batch.
+        u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast.
+        dt: time step in s.
+        integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order) or "projected"
+            (second order; contacts hold exactly after every step, also in the first state, which is moved onto them).
+        baumgarte: stabilisation in this rollout, instead of the one in `system`; None for none.
+        samples: also integrate this many functions drawn from the posterior, by pathwise conditioning; `seed` draws
+            them.
+        progress: called as progress(step, steps).
+
+        A motion that diverges is NaN from then on, `Rollout.diverged_at` tells where, and a NumericalWarning says so.
+        Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be projected.
+        """
+        model = self.accelerations(baumgarte)
+        return roll_out(model, q0, v0, u, dt, integrator=integrator, samples=samples, seed=seed, progress=progress)
+
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""
         changed = copy.copy(self)
@@ -128,6 +175,20 @@ class Model(ABC):
         Equal seeds give equal posteriors; no global random state is read or written. `progress(start, iteration,
         objective)` is called now and then. Raises InvalidInput for data of another robot and numbers out of range.
         """
+
+    @abstractmethod
+    def condition(
+        self,
+        training: TrainingData,
+        parameters: Mapping[str, Tensor],
+        result: OptimizationResult,
+        settings: Mapping[str, Any],
+    ) -> Posterior:
+        """The posterior at given parameters, without a search: what a stored model is loaded with."""
+
+    @abstractmethod
+    def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the parameters that a posterior on these points needs."""
 
 
 def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:

@@ -107,8 +107,8 @@ class StructuredGP(Model):
         ContactError: a contact cannot hold at some row.
         FitError: no restart could be evaluated; the message names the cause.
         """
-        noise = resolved_noise(self.noise, dataset)
         rows = training_rows(self.system.robot.joint_names, dataset, points)
+        noise = resolved_noise(self.noise, dataset)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, jobs, seed)
         device = self.system.robot.device
