@@ -116,7 +116,7 @@ INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
 def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
     """The integrator of that name for motions of `system`. Raises InvalidInput for any other name."""
     if not isinstance(name, str) or name not in INTEGRATORS:
-        close = difflib.get_close_matches(str(name), INTEGRATORS, n=1)
+        close = difflib.get_close_matches(str(name), INTEGRATORS, n=1, cutoff=0.4)
         hint = f" did you mean {close[0]!r}?" if close else ""
         raise InvalidInput(f"integrator is {name!r};{hint} allowed: {', '.join(INTEGRATORS)}.")
     return INTEGRATORS[name](system)

@@ -147,7 +147,7 @@ class _Runs:
             constraint=c,
             velocity_constraint=rate,
             initial_correction=torch.stack(change, dim=-1).reshape(*batch, 2),
-            diverged_at=motion.diverged_at.reshape(*batch),
+            diverged_at=motion.diverged_at.reshape(tuple(batch)),
             integrator=self.integrator,
             baumgarte=self.model.baumgarte,
             samples=samples,

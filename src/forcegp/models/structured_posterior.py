@@ -13,7 +13,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
-from forcegp.mechanics import AffineMap, ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
+from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
 from forcegp.models.noise import ACCELERATION, Noise
@@ -99,6 +100,10 @@ class StructuredPosterior(Posterior):
             unknown_force=through(_identity_map(dynamics)),
             noise_covariance=_noise_covariance(self.parameters, dynamics),
         )
+
+    @override
+    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
+        return StructuredAccelerations(self, baumgarte)
 
     @cached_property
     def negative_log_likelihood(self) -> float:

@@ -1,0 +1,106 @@
+"""Drawn functions against the exact posterior, and the fast mean against the plain one."""
+
+import pytest
+import torch
+from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
+
+from forcegp.errors import InvalidInput
+from forcegp.inference import LatentKernels, LatentPosterior
+from forcegp.inference.pathwise import FunctionSamples, StackedFunctions
+
+POINTS, OUTPUTS = 9, 3
+
+
+def conditioned(kernels: list, dimensions: tuple[int, ...]) -> LatentPosterior:
+    """A posterior from random numbers; W has rank 2 of 3 at every point, as with one contact."""
+    generator = torch.Generator().manual_seed(0)
+    features = [torch.randn(POINTS, d, dtype=torch.float64, generator=generator) for d in dimensions]
+    W = torch.randn(POINTS, OUTPUTS, len(dimensions), dtype=torch.float64, generator=generator)
+    normal = torch.nn.functional.normalize(
+        torch.randn(POINTS, OUTPUTS, 1, dtype=torch.float64, generator=generator), dim=1
+    )
+    W = W - normal @ normal.mT @ W
+    residual = torch.randn(POINTS, OUTPUTS, dtype=torch.float64, generator=generator)
+    noise = torch.full((1, OUTPUTS), 0.09, dtype=torch.float64)
+    latent = LatentKernels([kernel.double() for kernel in kernels])
+    return LatentPosterior.condition(latent.at(latent.initial_parameters()), features, W, residual, noise)
+
+
+def scaled_rbf(dimension: int, lengthscale: float, variance: float) -> ScaleKernel:
+    kernel = ScaleKernel(RBFKernel(ard_num_dims=dimension))
+    kernel.base_kernel.lengthscale = lengthscale * torch.linspace(0.8, 1.3, dimension)
+    kernel.outputscale = variance
+    return kernel
+
+
+@pytest.fixture(scope="module")
+def latent() -> LatentPosterior:
+    """Latents with one and with three features."""
+    return conditioned([scaled_rbf(3, 1.5, 0.7), scaled_rbf(1, 0.9, 1.4), scaled_rbf(3, 0.8, 0.3)], (3, 1, 3))
+
+
+@pytest.fixture(scope="module")
+def points(latent) -> list[torch.Tensor]:
+    """Five new points, among them one far away and one training point."""
+    generator = torch.Generator().manual_seed(1)
+    new = [torch.randn(5, z.shape[-1], dtype=torch.float64, generator=generator) for z in latent.features]
+    for z, training in zip(new, latent.features, strict=True):
+        z[3], z[4] = 30.0, training[2]
+    return new
+
+
+def test_the_stacked_mean_is_the_mean(latent, points):
+    torch.testing.assert_close(StackedFunctions.mean_of(latent)(points), latent.mean(points), rtol=1e-10, atol=1e-12)
+
+
+def test_kernels_that_cannot_be_stacked_have_the_same_mean_and_no_samples(points):
+    latent = conditioned([ScaleKernel(MaternKernel(nu=2.5)), scaled_rbf(1, 0.9, 1.4)], (3, 1))
+    torch.testing.assert_close(StackedFunctions.mean_of(latent)(points[:2]), latent.mean(points[:2]))
+    with pytest.raises(InvalidInput, match=r"drawn for ScaleKernel\(RBFKernel\(\)\) .* not for ScaleKernel"):
+        FunctionSamples.draw(latent, 2, seed=0)
+
+
+def test_many_functions_have_mean_and_covariance_of_the_posterior(latent, points):
+    count = 6000
+    functions = FunctionSamples.draw(latent, count, seed=0, frequencies=32)
+    values = functions([z.expand(count, -1, -1) for z in points])  # S n C
+    mean, covariance = latent.mean(points), latent.covariance(points)
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((values.mean(0) - mean).abs() <= 4.5 * std / count**0.5).all()
+    for n in range(5):
+        found = torch.cov(values[:, n].mT)
+        scale = std[n][:, None] * std[n][None, :]
+        assert ((found - covariance[n]).abs() <= 6.0 * scale / count**0.5).all()
+
+
+def test_functions_agree_with_the_posterior_across_points_too(latent, points):
+    """Cov(f(z_1), f(z_2)) from a posterior over both points at once: the samples are functions, not noise."""
+    count = 6000
+    functions = FunctionSamples.draw(latent, count, seed=1, frequencies=32)
+    near = [torch.stack([z[0], z[0] + 0.3]) for z in points]
+    values = functions([z.expand(count, -1, -1) for z in near])[..., 0]
+    system = latent.system
+    C = system.deflation.C[..., 0]
+    kernel = next(iter(latent.kernels))
+    cross = kernel(near[0], latent.features[0]).to_dense()
+    V = (cross[:, :, None] * C[None]).reshape(2, -1)
+    exact = kernel(near[0]).to_dense() - V @ system.factor.solve(V.mT.contiguous())
+    std = exact.diagonal().sqrt()
+    found = torch.cov(values.mT)
+    assert ((found - exact).abs() <= 6.0 * std[:, None] * std[None, :] / count**0.5).all()
+
+
+def test_a_function_answers_alike_whenever_and_with_whatever_else_it_is_asked(latent, points):
+    functions = FunctionSamples.draw(latent, 4, seed=2)
+    together = functions([z.expand(4, -1, -1) for z in points])
+    alone = functions([z[2:3].expand(4, -1, -1) for z in points])
+    torch.testing.assert_close(together[:, 2:3], alone, rtol=0, atol=1e-12)
+    same = FunctionSamples.draw(latent, 4, seed=2)([z.expand(4, -1, -1) for z in points])
+    torch.testing.assert_close(same, together, rtol=0, atol=0)
+    assert (together[0] - together[1]).abs().max() > 1e-3
+
+
+def test_drawing_leaves_the_global_random_state_alone(latent):
+    before = torch.get_rng_state()
+    FunctionSamples.draw(latent, 2, seed=0)
+    assert torch.equal(torch.get_rng_state(), before)

@@ -1,0 +1,129 @@
+"""Integrators against closed forms and fine references; the constraint holds after every projected step."""
+
+import math
+
+import pytest
+import torch
+from tests.integration.motions import CONTACTS, free_system, physics, start
+from tests.models.arm import arm_system
+
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.integration import (
+    ConstraintManifold,
+    Projected,
+    RungeKutta4,
+    SymplecticEuler,
+    integrate,
+    integrator_named,
+)
+from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.robots import Robot
+
+POINT = """<robot name="point"><link name="base"/>
+<link name="mass"><inertial><mass value="2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="rail" type="prismatic"><parent link="base"/><child link="mass"/><axis xyz="1 0 0"/>
+<limit lower="-9" upper="9" effort="9" velocity="9"/></joint></robot>"""
+
+
+def observed_order(errors: list[float]) -> float:
+    """Slope of log error over log dt, where each dt is half of the one before."""
+    return math.log2(errors[0] / errors[-1]) / (len(errors) - 1)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "order"),
+    [
+        (SymplecticEuler(), 1),
+        (RungeKutta4(), 4),
+        (Projected(ConstraintManifold(MechanicalSystem(Robot.from_urdf_text(POINT)))), 2),
+    ],
+    ids=["symplectic-euler", "rk4", "projected without contacts"],
+)
+def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
+    damping, q0, v0, end = 0.4, 0.7, -0.3, 2.0
+    rate, omega = damping / 2, math.sqrt(1.0 - damping**2 / 4)
+    exact = math.exp(-rate * end) * (
+        q0 * math.cos(omega * end) + (v0 + rate * q0) / omega * math.sin(omega * end)
+    )  # of q'' = -q - damping q'
+    errors = []
+    for steps in (20, 40, 80):
+        begin = [torch.tensor([[x]], dtype=torch.float64) for x in (q0, v0)]
+        force = torch.zeros(steps, 1, 1, dtype=torch.float64)
+        motion = integrate(integrator, lambda q, v, u: -q - damping * v + u, *begin, force, end / steps)
+        errors.append(abs(float(motion.q[-1]) - exact))
+    assert observed_order(errors) == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize("contacts", ["plane twice", "sphere", "cylinder"])
+def test_the_projected_scheme_is_of_second_order_on_every_surface(contacts):
+    system = free_system(contacts)
+    q0, v0 = start(system)
+    acceleration, end = physics(system), 0.2
+
+    def last(integrator, steps):
+        force = torch.zeros(steps, 2, 3, dtype=torch.float64)
+        motion = integrate(integrator, acceleration, q0, v0, force, end / steps)
+        return torch.cat([motion.q[-1], motion.v[-1]], dim=-1)
+
+    reference = last(RungeKutta4(), 80)  # its drift off the surface is far below the errors measured here
+    errors = [
+        float((last(Projected(ConstraintManifold(system)), steps) - reference).abs().max()) for steps in (10, 20, 40)
+    ]
+    assert observed_order(errors) == pytest.approx(2.0, abs=0.25)
+
+
+@pytest.mark.parametrize("contacts", ["sphere", "cylinder"])
+def test_the_projected_scheme_stays_on_the_surface_for_5_s(contacts):
+    # Steps of 1/60 s are coarser, so harder, than the 1/240 s of recordings, and four times as fast.
+    system = free_system(contacts)
+    q0, v0 = start(system)
+    force = 0.3 * torch.randn(300, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    motion = integrate(Projected(ConstraintManifold(system)), physics(system), q0, v0, force, 1 / 60)
+    c, rate = ConstraintManifold(system).violation(motion.q, motion.v)
+    assert (motion.diverged_at == -1).all()
+    assert (motion.q[-1] - motion.q[0]).abs().max() > 0.1  # it did move
+    assert c.abs().max() <= 1e-11
+    assert rate.abs().max() <= 1e-12
+
+
+def test_the_velocity_projection_solves_the_dense_equations():
+    system = free_system("sphere").with_contacts((*CONTACTS["sphere"], *CONTACTS["plane"]))
+    q = torch.tensor([[0.3, 0.7, 0.8]], dtype=torch.float64)
+    v = torch.tensor([[0.8, -0.5, 0.9]], dtype=torch.float64)
+    manifold = ConstraintManifold(system)
+    at = manifold.project_position(q)
+    projected = manifold.project_velocity(at, v)
+    M = system.robot.mass_matrix(q)[0]  # the metric is that of the given position
+    A = system.dynamics(at.q, v, v).A[0]
+    zero = torch.zeros(2, 2, dtype=torch.float64)
+    dense = torch.cat([torch.cat([M, A.mT], dim=1), torch.cat([A, zero], dim=1)])
+    right = torch.cat([M @ v[0], torch.zeros(2, dtype=torch.float64)])
+    torch.testing.assert_close(projected[0], torch.linalg.solve(dense, right)[:3], rtol=1e-10, atol=1e-12)
+
+
+def test_the_position_projection_acts_along_the_contact_forces_and_changes_nothing_on_the_surface():
+    system = free_system("cylinder")
+    manifold = ConstraintManifold(system)
+    q0, _ = start(system)
+    torch.testing.assert_close(manifold.project_position(q0).q, q0, rtol=0, atol=1e-15)
+    off = q0 + 1e-5
+    at = manifold.project_position(off)
+    assert at.converged.all()
+    assert manifold.violation(at.q, at.q)[0].abs().max() <= 1e-12
+    push = (system.robot.mass_matrix(off) @ (at.q - off)[..., None])[..., 0]
+    normal = at.A[:, 0]
+    along = (push * normal).sum(-1, keepdim=True) / normal.square().sum(-1, keepdim=True) * normal
+    assert (push - along).abs().max() <= 1e-3 * push.abs().max()
+
+
+def test_a_start_out_of_reach_is_refused_with_a_remedy():
+    system = arm_system(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 5.0))])
+    q, v = start(free_system("plane"))
+    with pytest.raises(NumericalError, match=r"state 0 cannot be moved onto .* Start nearer to the surfaces"):
+        ConstraintManifold(system).project(q, v)
+
+
+def test_unknown_integrators_are_named_with_those_that_exist():
+    with pytest.raises(InvalidInput, match=r"'rk5'; did you mean 'rk4'\? allowed: symplectic-euler, rk4, projected"):
+        integrator_named("rk5", arm_system())

@@ -1,0 +1,90 @@
+"""Motions end where they diverge, say so, and leave the others alone."""
+
+import math
+
+import pytest
+import torch
+from tests.integration.motions import free_system, physics, start
+
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.integration import SPEED_LIMIT, ConstraintManifold, Projected, RungeKutta4, SymplecticEuler, integrate
+
+
+def column(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)[:, None]
+
+
+def explosive(q, v, u):
+    """Grows without bound from v > 0, and is not finite beyond q = 1; decays for v <= 0."""
+    assert bool(torch.isfinite(q).all() and torch.isfinite(v).all())
+    return torch.where(v > 0, 40.0 * v, -v) / (q < 1.0)
+
+
+@pytest.mark.parametrize("integrator", [SymplecticEuler(), RungeKutta4()], ids=["euler", "rk4"])
+def test_a_diverging_motion_is_nan_from_where_it_says_and_the_others_go_on(integrator):
+    q0, v0, force = column(0.0, 0.0, 0.5), column(1.0, -1.0, -2.0), torch.zeros(100, 3, 1, dtype=torch.float64)
+    with pytest.warns(NumericalWarning, match=r"1 of 3 motions diverged, the first at step \d+ \(.* s\): a joint fast"):
+        motion = integrate(integrator, explosive, q0, v0, force, 0.01)
+    row = int(motion.diverged_at[0])
+    assert 0 < row < 100
+    assert motion.diverged_at[1:].tolist() == [-1, -1]
+    for rows in (motion.q, motion.v):
+        assert torch.isfinite(rows[:row, 0]).all()
+        assert torch.isnan(rows[row:, 0]).all()
+    assert torch.isnan(motion.a[row:, 0]).all()
+    assert (motion.v[:row, 0].abs() <= SPEED_LIMIT).all()
+    alone = integrate(integrator, explosive, q0[1:], v0[1:], force[:, 1:], 0.01)
+    torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=0, atol=0)
+    torch.testing.assert_close(motion.a[:, 1:], alone.a, rtol=0, atol=0)
+
+
+def test_a_motion_that_leaves_its_constraint_ends_alone():
+    system = free_system("sphere")
+    q0, v0 = start(system)
+
+    def thrown(q, v, u):
+        return torch.cat([torch.full_like(q[:1], 2e5), physics(system)(q, v, u)[1:]])
+
+    def calm(q, v, u):
+        return physics(system)(q, v, u)
+
+    force = torch.zeros(20, 2, 3, dtype=torch.float64)
+    method = Projected(ConstraintManifold(system))
+    with pytest.warns(NumericalWarning, match="1 of 2 motions diverged, the first at step 1"):
+        motion = integrate(method, thrown, q0, v0, force, 1 / 240)
+    assert motion.diverged_at.tolist() == [1, -1]
+    alone = integrate(method, calm, q0[1:], v0[1:], force[:, 1:], 1 / 240)
+    torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=0, atol=1e-12)
+
+
+def test_all_motions_diverging_still_give_a_trajectory():
+    ones = column(1.0, 2.0)
+    with pytest.warns(NumericalWarning, match="2 of 2 motions"):
+        motion = integrate(
+            SymplecticEuler(), lambda q, v, u: v * math.inf, ones, ones, torch.zeros(5, 2, 1).double(), 0.1
+        )
+    assert motion.diverged_at.tolist() == [1, 1]
+    assert torch.isnan(motion.q[1:]).all()
+    torch.testing.assert_close(motion.q[0], ones)
+
+
+def test_progress_counts_every_step():
+    seen = []
+    force = torch.zeros(4, 1, 1, dtype=torch.float64)
+    integrate(
+        SymplecticEuler(), lambda q, v, u: -q, column(1.0), column(0.0), force, 0.1, progress=lambda *x: seen.append(x)
+    )
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf, "fast"])
+def test_a_time_step_must_be_positive(dt):
+    force = torch.zeros(4, 1, 1, dtype=torch.float64)
+    with pytest.raises((InvalidInput, TypeError)):
+        integrate(SymplecticEuler(), lambda q, v, u: -q, column(1.0), column(0.0), force, dt)
+
+
+def test_a_start_in_other_units_is_refused():
+    force = torch.zeros(4, 1, 1, dtype=torch.float64)
+    with pytest.raises(InvalidInput, match=r"v0 has a joint velocity of 150; .* check its units"):
+        integrate(SymplecticEuler(), lambda q, v, u: -q, column(1.0), column(150.0), force, 0.1)

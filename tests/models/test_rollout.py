@@ -1,0 +1,192 @@
+"""Rollouts of a fitted model: against a loop over `predict`, on the surface, and as functions drawn from the model."""
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.errors import InvalidInput
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Baumgarte
+from forcegp.models import StructuredGP
+from forcegp.models.accelerations import PredictedAccelerations
+from forcegp.models.rollout import roll_out
+from forcegp.priors import NoForces
+
+DT, STEPS = 1 / 240, 12
+QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=15)}
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(40, seed=0)
+
+
+@pytest.fixture(scope="module")
+def posterior(data):
+    return StructuredGP(data.system).fit(data, points=20, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def start(data):
+    """Two states on the plane and gravity-compensating torques (2, T, nv)."""
+    q, v = torch.tensor(data.q[:2]), 0.3 * torch.tensor(data.v[:2])
+    return q, v, data.system.robot.gravity_forces(q)[:, None].repeat(1, STEPS, 1)
+
+
+def test_symplectic_euler_is_a_loop_over_predict(data, start):
+    system = arm_system(baumgarte=None)  # so `predict` and `rollout` speak of the same stabilisation: none
+    posterior = StructuredGP(system).fit(data, points=20, **QUICK)
+    q, v, u = start
+    rollout = posterior.rollout(q, v, u, DT)
+    for k in range(STEPS):
+        a = posterior.predict(q, v, u[:, k], covariance=False).mean
+        torch.testing.assert_close(rollout.a[:, k], a, rtol=1e-9, atol=1e-9)
+        v = v + DT * a
+        q = q + DT * v
+    torch.testing.assert_close(rollout.q[:, -1], q, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(rollout.v[:, -1], v, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(rollout.time, DT * torch.arange(STEPS + 1, dtype=torch.float64))
+    assert rollout.baumgarte is None
+    assert rollout.samples is None
+    assert (rollout.diverged_at == -1).all()
+    assert (rollout.initial_correction == 0).all()
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "projected"])
+def test_the_black_box_way_through_predict_gives_the_same_motion(data, start, integrator):
+    posterior = StructuredGP(arm_system(baumgarte=None), mean="zero").fit(data, points=15, **QUICK)
+    q, v, u = start
+    direct = posterior.rollout(q, v, u[:, :4], DT, integrator=integrator)
+    through = roll_out(PredictedAccelerations(posterior, None), q, v, u[:, :4], DT, integrator=integrator)
+    torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
+    torch.testing.assert_close(direct.a, through.a, rtol=1e-9, atol=1e-9)
+
+
+def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posterior, start):
+    q, v, u = start
+    q = q + 1e-3  # off the plane
+    assert posterior.system.baumgarte == Baumgarte(5.0)
+    for baumgarte in (None, Baumgarte(20.0, 0.7)):
+        rollout = posterior.rollout(q, v, u[:, :1], DT, baumgarte=baumgarte)
+        dynamics = arm_system(baumgarte=baumgarte).dynamics(q, v, u[:, 0])
+        torch.testing.assert_close((dynamics.A @ rollout.a[:, 0, :, None])[..., 0], dynamics.b, rtol=1e-9, atol=1e-10)
+        assert rollout.baumgarte == baumgarte
+
+
+def test_batches_lead_and_broadcast(posterior, start):
+    q, v, u = start
+    many = posterior.rollout(q[:, None], v[:, None], u[0].expand(3, -1, -1), DT)
+    assert many.q.shape == many.v.shape == (2, 3, STEPS + 1, 3)
+    assert many.a.shape == (2, 3, STEPS, 3)
+    assert many.constraint.shape == many.velocity_constraint.shape == (2, 3, STEPS + 1, 1)
+    assert many.diverged_at.shape == (2, 3)
+    alone = posterior.rollout(q[1].tolist(), v[1].numpy(), u[0], DT)
+    assert alone.q.shape == (STEPS + 1, 3)
+    torch.testing.assert_close(many.q[1, 2], alone.q, rtol=0, atol=1e-12)
+
+
+def test_the_constraint_is_that_of_the_contacts_and_projection_keeps_it(posterior, start):
+    q, v, u = start
+    contact, robot = posterior.system.contacts[0], posterior.system.robot
+    loose = posterior.rollout(q + 1e-3, v, u, DT, integrator="rk4")
+    torch.testing.assert_close(loose.constraint[..., 0], contact.distance(robot.kinematics(loose.q)))
+    kept = posterior.rollout(q + 1e-3, v, u, DT, integrator="projected")
+    assert loose.constraint.abs().max() > 1e-4
+    assert kept.constraint.abs().max() <= 1e-11
+    assert kept.velocity_constraint.abs().max() <= 1e-12
+    correction = kept.initial_correction
+    torch.testing.assert_close(correction[:, 0], (kept.q[:, 0] - q - 1e-3).abs().amax(-1), rtol=1e-9, atol=0)
+    torch.testing.assert_close(correction[:, 1], (kept.v[:, 0] - v).abs().amax(-1), rtol=1e-9, atol=0)
+    assert (correction > 1e-4).all()
+
+
+def test_a_rollout_goes_on_from_any_of_its_own_states(posterior, start):
+    q, v, u = start
+    whole = posterior.rollout(q, v, u, DT, integrator="rk4")
+    rest = posterior.rollout(whole.q[:, 5], whole.v[:, 5], u[:, 5:], DT, integrator="rk4")
+    torch.testing.assert_close(rest.q, whole.q[:, 5:], rtol=0, atol=1e-12)
+
+
+def test_samples_are_functions_that_obey_the_constraint(posterior, start):
+    q, v, u = start
+    rollout = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=3)
+    drawn = rollout.samples
+    assert drawn.q.shape == (5, 2, STEPS + 1, 3)
+    assert drawn.a.shape == (5, 2, STEPS, 3)
+    dynamics = arm_system(baumgarte=Baumgarte(10.0)).dynamics(drawn.q[..., :-1, :], drawn.v[..., :-1, :], u)
+    violation = (dynamics.A @ drawn.a[..., None])[..., 0] - dynamics.b
+    assert violation.abs().max() <= 1e-10
+    assert drawn.a[:, :, 0].std(0).max() > 1e-4  # they differ
+    again = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=3)
+    torch.testing.assert_close(again.samples.q, drawn.q, rtol=0, atol=0)
+    other = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=4)
+    assert (other.samples.q - drawn.q).abs().max() > 1e-9
+    torch.testing.assert_close(rollout.std("v"), drawn.v.std(0))
+    low, high = rollout.quantiles((0.0, 1.0), "q")
+    assert (low <= drawn.q.mean(0)).all()
+    assert (drawn.q.mean(0) <= high).all()
+
+
+def test_first_sampled_accelerations_have_the_predicted_distribution(posterior, start):
+    q, v, u = (x[0] for x in start)
+    rollout = posterior.rollout(q, v, u[:1], DT, baumgarte=Baumgarte(5.0), samples=3000, seed=0)
+    first = rollout.samples.a[:, 0]
+    expected = posterior.predict(q, v, u[0])
+    assert ((first.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
+    scale = expected.covariance.diagonal().max()
+    torch.testing.assert_close(torch.cov(first.mT), expected.covariance, rtol=0.1, atol=0.1 * float(scale))
+
+
+def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):
+    q, v, u = start
+    rollout = StructuredGP(data.system, prior=NoForces()).fit(data, points=10, **QUICK).rollout(q, v, u, DT, samples=2)
+    torch.testing.assert_close(rollout.samples.q, rollout.q.expand(2, -1, -1, -1), rtol=0, atol=0)
+
+
+def test_progress_counts_mean_and_samples(posterior, start):
+    q, v, u = start
+    seen = []
+    posterior.rollout(q, v, u[:, :3], DT, samples=2, progress=lambda *now: seen.append(now))
+    assert seen == [(k, 6) for k in range(1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"q0": torch.zeros(2, 4)}, r"q0 has shape \(2, 4\); it must be \(\.\.\., 3\)"),
+        ({"u": torch.zeros(3)}, r"u has shape \(3,\); it must be \(\.\.\., T, 3\)"),
+        ({"u": torch.zeros(0, 3)}, "u has no rows"),
+        ({"v0": torch.full((3,), float("nan"))}, "v0 has values that are not finite"),
+        ({"v0": torch.zeros(3, 3)}, "the shapes do not broadcast"),
+        ({"q0": "here"}, "q0 cannot be read as numbers"),
+        ({"q0": torch.zeros(0, 1, 3)}, "no motion at all"),
+        ({"samples": -1}, "samples is -1"),
+        ({"seed": -1}, "seed is -1"),
+        ({"integrator": "euler"}, r"integrator is 'euler'; did you mean .* allowed: symplectic-euler, rk4, projected"),
+        ({"dt": 0.0}, r"dt is 0\.0"),
+    ],
+)
+def test_wrong_arguments_are_named(posterior, start, changed, message):
+    q, v, u = start
+    arguments = {"q0": q, "v0": v, "u": u, "dt": DT} | changed
+    with pytest.raises(InvalidInput, match=message):
+        posterior.rollout(**arguments)
+
+
+def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, start):
+    q, v, u = start
+    rollout = posterior.rollout(q, v, u[:, :1], DT)
+    for ask in (rollout.std, rollout.quantiles):
+        with pytest.raises(InvalidInput, match="this rollout has 0 samples"):
+            ask()
+    with pytest.raises(InvalidInput, match="quantile levels"):
+        rollout.quantiles((1.5,))
+    with pytest.raises(InvalidInput, match=r"does not know the constraint.*integrator='projected'"):
+        PredictedAccelerations(posterior, Baumgarte(1.0))
+    with pytest.raises(InvalidInput, match="no functions can be drawn from a StructuredPosterior"):
+        roll_out(PredictedAccelerations(posterior, None), q, v, u, DT, samples=1)
+    free = StructuredGP(arm_system(0)).fit(arm_data(20, 1, arm_system(0)), points=10, **QUICK)
+    with pytest.raises(InvalidInput, match="has no contacts; give baumgarte=None"):
+        free.rollout(q, v, u, DT, baumgarte=Baumgarte(1.0))
+    assert free.rollout(q, v, u, DT, integrator="projected").constraint.shape == (2, STEPS + 1, 0)
