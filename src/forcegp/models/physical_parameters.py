@@ -89,6 +89,15 @@ class _Link:
         }
         return [(f"{self.link}.{name}", unit) for part in self.parts for name, unit in named[part]]
 
+    @property
+    def scaled_names(self) -> list[str]:
+        named = {
+            "mass": ["log {}.mass"],
+            "com": ["{}.com.x/r", "{}.com.y/r", "{}.com.z/r"],
+            "inertia": [f"log {{}}.extent.{x}" for x in "xyz"] + [f"{{}}.shear.{xy}" for xy in ("xy", "yz", "xz")],
+        }
+        return [name.format(self.link) for part in self.parts for name in named[part]]
+
     def tensors(self, s: Float[Tensor, "k"]) -> dict[str, Tensor]:
         """`inertials.<link>` (10,)."""
         pieces = dict(zip(self.parts, s.split([SIZES[part] for part in self.parts]), strict=True))
@@ -123,6 +132,10 @@ class _Coefficients:
     @property
     def names(self) -> list[tuple[str, str]]:
         return [(f"{self.force}.{joint}", unit) for joint, unit in zip(self.joints, self.units, strict=True)]
+
+    @property
+    def scaled_names(self) -> list[str]:
+        return [f"log {self.force}.{joint}" for joint in self.joints]
 
     def tensors(self, s: Float[Tensor, "k"]) -> dict[str, Tensor]:
         """`coefficients.<force>` (nv,)."""
@@ -177,6 +190,11 @@ class PhysicalParameters:
     def units(self) -> tuple[str, ...]:
         """SI units in the order of `names`."""
         return tuple(unit for group in self.groups for _, unit in group.names)
+
+    @property
+    def scaled_names(self) -> tuple[str, ...]:
+        """What each number of s is: 'log tool.mass', 'tool.com.x/r' (r: radius of gyration), 'log tool.extent.x'."""
+        return tuple(name for group in self.groups for name in group.scaled_names)
 
     @property
     def zero(self) -> Float[Tensor, "k"]:

@@ -4,15 +4,16 @@ Masses, centres of mass and friction coefficients change the objective by many o
 logarithms of kernel parameters do; and as long as they are wrong, the variances from moments of the residual are so
 large that the processes explain the error away. So before the search, a few Gauss-Newton steps lower
 
-    1/2 |s|^2 + 1/2 sum_i e_i^T S_i^-1 e_i,    e = P M (a - m) = P (M a - Q_K),    P = I - A^+ A,
+    1/2 s^T G s + 1/2 sum_i e_i^T S_i^-1 e_i,    e = P M (a - m) = P (M a - Q_K),    P = I - A^+ A,
 
 the weighted least squares of inverse dynamics where the contacts do not act. Other than a - m, e is linear in mass,
 first moments and inertias (Atkeson, An & Hollerbach 1986). S_i = P (M R M + B diag(k_c(x_i, x_i)) B^T) P takes rows as
-independent, with variances k_c from the moments of the residual, which are taken again before every step.
+independent, with variances k_c from the moments of the residual, which are taken again before every step. G is 1, and
+the curvature of the prior on inertias where there is one.
 
 The units come from the information at the last step, of rows with covariances S_i = R_i + W_i diag(k_c(x_i, x_i)) W_i^T
 
-    F = 1 + sum_i J_i^T S_i^-1 J_i + 1/2 tr(S_i^-1 dS_i S_i^-1 dS_i),    J = d(a - m)/ds
+    F = G + sum_i J_i^T S_i^-1 J_i + 1/2 tr(S_i^-1 dS_i S_i^-1 dS_i),    J = d(a - m)/ds
 
 (Fisher information of normal distributions whose mean and covariance depend on s; Kay 1993, eq. 3.31). With F = L L^T
 the search moves z, s = L^-T z. None of this changes what the objective is.
@@ -31,8 +32,9 @@ from torch import Tensor
 from forcegp.errors import FitError, NumericalError
 from forcegp.inference import LatentKernels
 from forcegp.inference.kernels import kernel_diagonal
-from forcegp.models.marginal_likelihood import MarginalLikelihood
+from forcegp.models.marginal_likelihood import MarginalLikelihood, inertials_of
 from forcegp.models.physical_parameters import PHYSICAL, Learned, PhysicalParameters
+from forcegp.robots import pseudo_inertia_from_parameters
 
 STEP = 1e-4
 """Of the central differences in s; second derivatives in s are of the size of the first."""
@@ -56,7 +58,11 @@ class PhysicalStart:
 
     @classmethod
     def of(
-        cls, learn: Learned | Iterable[Learned], likelihood: MarginalLikelihood, noise: Mapping[str, Tensor]
+        cls,
+        learn: Learned | Iterable[Learned],
+        likelihood: MarginalLikelihood,
+        noise: Mapping[str, Tensor],
+        prior_strength: float = 0.0,
     ) -> PhysicalStart:
         """From the values that the system of `likelihood` has; its known forces are trusted even with mean "zero".
 
@@ -64,7 +70,7 @@ class PhysicalStart:
         Raises as `PhysicalParameters.of`, and FitError where the likelihood cannot be evaluated at the start values.
         """
         physical = PhysicalParameters.of(likelihood.system, learn)
-        rows = _Rows(physical, likelihood, noise)
+        rows = _Rows(physical, likelihood, noise, _ridge(physical, prior_strength))
         try:
             with torch.no_grad():
                 scaled = _gauss_newton(replace(rows, likelihood=replace(likelihood, mean="analytical")))
@@ -85,6 +91,7 @@ class _Rows:
     physical: PhysicalParameters
     likelihood: MarginalLikelihood
     noise: Mapping[str, Tensor]
+    ridge: Float[Tensor, "k k"]  # G
 
     def kernels(self, s: Float[Tensor, "k"]) -> LatentKernels:
         """With variances from the moments of the residual at s."""
@@ -110,6 +117,26 @@ class _Rows:
         return (to_force @ residual[..., None])[..., 0], full + size * across
 
 
+def _ridge(physical: PhysicalParameters, prior_strength: float) -> Float[Tensor, "k k"]:
+    """G: 1, and w times the metric tr(P^-1 dP P^-1 dP) of the pseudo-inertias at the start."""
+    factors = {
+        link: torch.linalg.cholesky(pseudo_inertia_from_parameters(value))
+        for link, value in inertials_of(physical.tensors(physical.zero)).items()
+    }
+
+    def whitened(s: Tensor) -> Tensor:
+        inertias = inertials_of(physical.tensors(s))
+        halves = {
+            link: torch.linalg.solve_triangular(factors[link], pseudo_inertia_from_parameters(value), upper=False)
+            for link, value in inertias.items()
+        }
+        each = [torch.linalg.solve_triangular(factors[link], half.mT, upper=False) for link, half in halves.items()]
+        return torch.stack(each).flatten() if each else s[:0]
+
+    J = torch.as_tensor(torch.autograd.functional.jacobian(whitened, physical.zero))
+    return torch.eye(J.shape[1], dtype=J.dtype, device=J.device) + prior_strength * J.mT @ J
+
+
 def _slopes(function: Callable[[Tensor], tuple[Tensor, Tensor]], s: Float[Tensor, "k"]) -> tuple[Tensor, Tensor]:
     """Derivatives (k, ...) of a residual and its covariance with respect to s."""
     pairs = [
@@ -126,7 +153,7 @@ def _information(rows: _Rows, s: Float[Tensor, "k"]) -> Float[Tensor, "k k"]:
     d_mean, d_covariance = _slopes(function, s)
     J = whiten(d_mean[..., None]).flatten(1)
     S = whiten(whiten(d_covariance).mT).flatten(1)
-    return torch.eye(len(s), dtype=s.dtype, device=s.device) + J @ J.mT + 0.5 * S @ S.mT
+    return rows.ridge + J @ J.mT + 0.5 * S @ S.mT
 
 
 def _gauss_newton(rows: _Rows) -> list[Tensor]:
@@ -138,13 +165,13 @@ def _gauss_newton(rows: _Rows) -> list[Tensor]:
         residual, covariance = function(s)
         whiten = partial(torch.linalg.solve_triangular, torch.linalg.cholesky(covariance), upper=False)
         J = whiten(_slopes(function, s)[0][..., None]).flatten(1)
-        lower = torch.linalg.cholesky(torch.eye(len(s), dtype=s.dtype, device=s.device) + J @ J.mT)
-        gradient = J @ whiten(residual[..., None]).flatten() + s
+        lower = torch.linalg.cholesky(rows.ridge + J @ J.mT)
+        gradient = J @ whiten(residual[..., None]).flatten() + rows.ridge @ s
         step = -torch.cholesky_solve(gradient[:, None], lower)[:, 0]
 
         def squares(at: Tensor, function=function, whiten=whiten) -> float:
             try:
-                return float(whiten(function(at)[0][..., None]).square().sum() + at.square().sum())
+                return float(whiten(function(at)[0][..., None]).square().sum() + at @ rows.ridge @ at)
             except NumericalError:
                 return float("inf")
 

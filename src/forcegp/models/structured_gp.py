@@ -24,7 +24,8 @@ from forcegp.models.fit_arguments import check_search_numbers, first_start, reso
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import Noise
-from forcegp.models.physical_parameters import PHYSICAL, Learned, PhysicalParameters, learn_to_list
+from forcegp.models.objective import FitObjective
+from forcegp.models.physical_parameters import PHYSICAL, Learned, learn_to_list
 from forcegp.models.physical_start import PhysicalStart
 from forcegp.models.protocol import Model
 from forcegp.models.search import FitProgress, blas_threads, default_restarts, perturbed, run_restarts
@@ -78,6 +79,7 @@ class StructuredGP(Model):
         options: OptimizerOptions | None = None,
         start: Mapping[str, Tensor] | None = None,
         learn: Learned | Sequence[Learned] | None = None,
+        prior_strength: float = 0.0,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
         """Find all kernel and learned noise parameters by marginal likelihood, then condition on the same points.
@@ -99,6 +101,9 @@ class StructuredGP(Model):
         learn: physical parameters to estimate along with all others, from the values that the system has:
             `robot.link("tool").inertial("mass", "com")`, `Coefficients("viscous-joint-friction")`, or several of them.
             Then `posterior.system` has the estimates, and `posterior.identification` tells all about them.
+        prior_strength: weight w of the prior on learned inertias, w/2 times the squared distance of pseudo-inertias
+            (`models.objective.squared_distance`) from the given ones: a body with all masses (1 + x) times as large
+            costs 2 w x^2. 0 is no prior.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
 
         Raises
@@ -111,6 +116,8 @@ class StructuredGP(Model):
         noise = resolved_noise(self.noise, dataset)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, jobs, seed)
+        if not 0.0 <= prior_strength < float("inf"):
+            raise InvalidInput(f"prior_strength is {prior_strength}; it must be finite and at least 0")
         device = self.system.robot.device
         training = TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
         likelihood = self._likelihood(training)
@@ -118,12 +125,13 @@ class StructuredGP(Model):
         _warn_of_distance(self.system, training)
         noise_parameters = noise.parameters(self.system.robot.nv)
         learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
-        begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters)
+        begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters, prior_strength)
         kernels = likelihood.kernels() if begin is None else begin.kernels
         moments = (kernels.initial_parameters() if begin is None else begin.path[-1]) | learned_noise
         options = options or OptimizerOptions()
         first = first_start(moments, start or {}, fixed)
-        objective = _Objective(likelihood, kernels, noise, fixed, hyperprior, begin.physical if begin else None)
+        physical = None if begin is None else begin.physical
+        objective = FitObjective(likelihood, kernels, noise, fixed, hyperprior, physical, prior_strength)
         kept = options if begin is None else replace(options, keep_iterates=True)
         search = _Search(objective, moments, first, seed, kept)
         with blas_threads(training.q.numel()):
@@ -160,7 +168,7 @@ class StructuredGP(Model):
         fitted = StructuredGP(self.system, self.prior, self.mean, noise)
         if begin is None:
             return fitted._posterior(likelihood, kernels, result.parameters | fixed, result, settings)
-        settings["learned"] = learn_to_list(begin.physical)
+        settings |= {"learned": learn_to_list(begin.physical), "prior_strength": prior_strength}
         identification = Identification.of(begin.physical, objective, result)
         parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
         posterior = replace(fitted, system=identification.system).condition(
@@ -202,32 +210,10 @@ class StructuredGP(Model):
 
 
 @dataclass(frozen=True, eq=False)
-class _Objective:
-    """The marginal likelihood as a function of the free parameters alone; a class so that processes can receive it."""
-
-    likelihood: MarginalLikelihood
-    kernels: LatentKernels
-    noise: Noise
-    fixed: Mapping[str, Tensor]
-    hyperprior: bool
-    physical: PhysicalParameters | None = None
-
-    def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        named = {**self.fixed, **parameters}
-        if self.physical is not None:
-            named |= self.physical.tensors(named.pop(PHYSICAL))
-        value = self.likelihood(self.kernels, named)
-        if not self.hyperprior:
-            return value
-        nv = self.likelihood.system.robot.nv
-        return value - self.kernels.log_prior(parameters) - self.noise.log_prior(parameters, nv)
-
-
-@dataclass(frozen=True, eq=False)
 class _Search:
     """One optimisation from start number `index`: 0 begins at `first`, the others around the moments."""
 
-    objective: _Objective
+    objective: FitObjective
     moments: Mapping[str, Tensor]
     first: Mapping[str, Tensor]
     seed: int

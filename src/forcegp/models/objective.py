@@ -1,0 +1,62 @@
+"""What a fit lowers: the negative log marginal likelihood, less the log densities of the priors on its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.inference import LatentKernels
+from forcegp.models.marginal_likelihood import MarginalLikelihood, inertials_of
+from forcegp.models.noise import Noise
+from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.robots import pseudo_inertia_from_parameters
+
+
+@dataclass(frozen=True, eq=False)
+class FitObjective:
+    """The objective as a function of the free parameters alone; a class so that processes can receive it.
+
+    With `hyperprior` kernels and learned noise have their priors; `prior_strength` is the weight of the learned
+    inertias' distance from where they start.
+    """
+
+    likelihood: MarginalLikelihood
+    kernels: LatentKernels
+    noise: Noise
+    fixed: Mapping[str, Tensor]
+    hyperprior: bool
+    physical: PhysicalParameters | None = None
+    prior_strength: float = 0.0
+
+    def __call__(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """In nats; differentiable once in every parameter."""
+        named = {**self.fixed, **parameters}
+        penalty = torch.zeros((), dtype=torch.float64)
+        if self.physical is not None:
+            named |= self.physical.tensors(named.pop(PHYSICAL))
+            if self.prior_strength:
+                start = inertials_of(self.physical.tensors(self.physical.zero))
+                distances = [squared_distance(value, start[link]) for link, value in inertials_of(named).items()]
+                penalty = 0.5 * self.prior_strength * sum(distances, penalty)
+        value = self.likelihood(self.kernels, named) + penalty
+        if not self.hyperprior:
+            return value
+        nv = self.likelihood.system.robot.nv
+        return value - self.kernels.log_prior(parameters) - self.noise.log_prior(parameters, nv)
+
+
+def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "10"]) -> Float[Tensor, ""]:
+    """Squared affine-invariant distance of two pseudo-inertias P and P0, given as log-Cholesky parameters.
+
+    d^2 = |log(P0^-1/2 P P0^-1/2)|_F^2 = sum_i log^2 lambda_i with the eigenvalues of P0^-1 P (Lee, Wensing & Park,
+    "Geometric robot dynamic identification: a convex programming approach", T-RO 2020). It is the same in every frame
+    and unit: a body of twice the mass and inertia is 2 log 2 away, wherever it is.
+    """
+    lower = torch.linalg.cholesky(pseudo_inertia_from_parameters(reference))
+    half = torch.linalg.solve_triangular(lower, pseudo_inertia_from_parameters(parameters), upper=False)
+    whitened = torch.linalg.solve_triangular(lower, half.mT, upper=False)
+    return torch.linalg.eigvalsh(0.5 * (whitened + whitened.mT)).log().square().sum()

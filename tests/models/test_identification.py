@@ -1,0 +1,197 @@
+"""Standard errors against closed forms, what cannot be identified, the prior, and what comes back from a fit."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import NOISE, arm_data, arm_system
+
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
+from forcegp.models import Coefficients, Noise, StructuredGP, load_posterior, save_posterior
+from forcegp.models.curvature import information_about
+from forcegp.models.objective import squared_distance
+from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.priors import NoForces
+from forcegp.robots import LinkInertia, pseudo_inertia_from_parameters
+
+LEARN = (LinkInertia("hand", ("mass", "com")), Coefficients("viscous-joint-friction"))
+
+
+def damped(contacts=1, damping=(0.3, 0.2, 0.1)):
+    return arm_system(contacts, known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(list(damping))))
+
+
+def measured(system, rows, seed):
+    """Data without unknown force: the exact acceleration and noise."""
+    data = arm_data(rows, seed, system)
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    exact = system.dynamics(*states).acceleration(torch.zeros(rows, 3).double()).numpy()
+    noise = NOISE * np.random.default_rng([seed, 1]).standard_normal(exact.shape)
+    return replace(data, a=exact + noise, truth={})
+
+
+def dense_information(system, physical, z, data):
+    """J^T R^-1 J of the acceleration in SI units, by central differences of the whole model in each SI value."""
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+
+    def acceleration(point):
+        return physical.system_at(point).dynamics(*states).acceleration(torch.zeros(len(data), 3).double()).flatten()
+
+    to_z = torch.linalg.inv(torch.as_tensor(torch.autograd.functional.jacobian(physical.values, z)))
+    columns = [
+        (acceleration(z + 1e-4 * step) - acceleration(z - 1e-4 * step)) / 2e-4
+        for step in torch.eye(len(z), dtype=torch.float64)
+    ]
+    J = torch.stack(columns, -1) @ to_z
+    return J.mT @ J / NOISE**2
+
+
+@pytest.fixture(scope="module")
+def analytical():
+    """The analytical model fitted to data of its own kind, from wrong values."""
+    data = measured(damped(), 150, seed=4)
+    wrong = PhysicalParameters.of(damped(), LEARN)
+    z = 0.3 * torch.as_tensor(np.random.default_rng(1).standard_normal(len(wrong.zero)))
+    return StructuredGP(wrong.system_at(z), prior=NoForces()).fit(data, learn=LEARN), data
+
+
+def test_standard_errors_of_the_analytical_model_are_those_of_least_squares(analytical):
+    posterior, data = analytical
+    found = posterior.identification
+    expected = torch.linalg.inv(
+        dense_information(found.physical.system, found.physical, found.parameters[PHYSICAL], data)
+    )
+    deviations = expected.diagonal().sqrt()
+    # the Hessian has the second derivatives of the residual too, of the order of the noise
+    assert list(found.standard_errors.values()) == pytest.approx(deviations.tolist(), rel=0.05)
+    scale = deviations[:, None] * deviations
+    assert torch.allclose(found.covariance / scale, expected / scale, atol=0.1)
+
+
+def test_estimates_lie_within_their_errors(analytical):
+    posterior, _ = analytical
+    found = posterior.identification
+    truth = PhysicalParameters.of(damped(), LEARN)
+    true = truth.named(truth.zero)
+    off = [(found.values[name] - true[name]) / found.standard_errors[name] for name in true]
+    assert max(map(abs, off)) < 4.0
+    low, high = found.intervals["hand.mass"]
+    assert high - low == pytest.approx(2 * 1.96 * found.standard_errors["hand.mass"], rel=1e-4)
+    assert abs(found.start["hand.mass"] - true["hand.mass"]) > 10 * found.standard_errors["hand.mass"]
+    assert found.history[0] == pytest.approx(found.start)
+    assert len(found.history) == len(posterior.result.history)
+    assert posterior.result.history[-1] == pytest.approx(posterior.result.value)
+
+
+def test_the_posterior_needs_nothing_but_its_system(analytical, tmp_path):
+    posterior, data = analytical
+    assert set(posterior.parameters) == {"noise.log_acceleration"}
+    assert posterior.system.robot.link("hand").mass == pytest.approx(posterior.identification.values["hand.mass"])
+    save_posterior(posterior, tmp_path / "model")
+    again = load_posterior(tmp_path / "model")
+    assert again.identification is None
+    q, v, u = data.q[:5], data.v[:5], data.u[:5]
+    assert torch.equal(again.predict(q, v, u).mean, posterior.predict(q, v, u).mean)
+    stored = json.loads(json.dumps(posterior.identification.to_dict(), allow_nan=False))
+    assert stored["parameters"]["hand.com.z"]["unit"] == "m"
+
+
+def test_noise_is_learned_with_the_physical_parameters():
+    data = measured(damped(), 60, seed=8)
+    model = StructuredGP(damped(damping=(0.1, 0.1, 0.3)), prior=NoForces(), noise=Noise(0.2, learn=True))
+    posterior = model.fit(data, learn=LEARN)
+    assert posterior.noise_std.tolist() == pytest.approx([NOISE] * 3, rel=0.35)
+    assert posterior.identification.values["viscous-joint-friction.bend"] == pytest.approx(0.1, abs=0.05)
+
+
+def test_what_no_motion_shows_is_named():
+    # nothing turns about the x axis of the hand's centre of mass but through pan, and the links above it are as unknown
+    data = measured(damped(0), 40, seed=2)
+    learn = (LinkInertia("upper", ("mass", "com")), LinkInertia("hand", ("mass",)))
+    found = StructuredGP(damped(0), prior=NoForces()).fit(data, learn=learn).identification
+    # pan turns upper about a vertical axis: gravity and the angle it starts from show nothing of com.z
+    named = {
+        max(direction.weights, key=lambda name: abs(direction.weights[name])) for direction in found.weak_directions
+    }
+    assert "upper.com.z/r" in named
+    assert found.standard_errors["upper.com.z"] == math.inf
+    assert math.isfinite(found.standard_errors["hand.mass"])
+    assert "do not identify" in found.verdict
+    assert "upper.com.z/r" in found.verdict
+    assert found.to_dict()["parameters"]["upper.com.z"]["standard_error"] is None
+
+
+def test_schur_complement_of_a_known_quadratic_form():
+    generator = np.random.default_rng(0)
+    root = torch.as_tensor(generator.standard_normal((7, 7)))
+    H = root @ root.mT + torch.eye(7)
+
+    def objective(parameters):
+        x = torch.cat([parameters["a"].reshape(-1), parameters["p"], parameters["b"]])
+        return 0.5 * x @ H @ x
+
+    point = {"a": torch.zeros(2, 1).double(), "p": torch.zeros(3).double(), "b": torch.zeros(2).double()}
+    seen = []
+    found = information_about("p", objective, point, lambda done, of: seen.append((done, of)))
+    expected = torch.linalg.inv(torch.linalg.inv(H)[2:5, 2:5])
+    assert torch.allclose(found, expected, rtol=1e-8)
+    assert seen[-1] == (11, 11)
+    assert torch.allclose(
+        information_about("p", lambda x: (x["p"] ** 2).sum(), {"p": point["p"]}), 2 * torch.eye(3).double()
+    )
+
+
+def test_a_saddle_is_told():
+    point = {"p": torch.zeros(1).double(), "b": torch.zeros(1).double()}
+    with pytest.warns(NumericalWarning, match="not ended at a minimum"):
+        information_about("p", lambda x: (x["p"] ** 2 - x["b"] ** 2).sum(), point)
+
+
+def test_the_prior_is_the_affine_invariant_distance_and_pulls_to_the_start():
+    robot = arm_system().robot
+    start = robot.inertial_parameters("hand")["hand"]
+    moved = start + 0.2 * torch.as_tensor(np.random.default_rng(3).standard_normal(10))
+    P, P0 = (pseudo_inertia_from_parameters(x).numpy() for x in (moved, start))
+    eigenvalues = np.linalg.eigvals(np.linalg.solve(P0, P)).real
+    assert float(squared_distance(moved, start)) == pytest.approx(np.square(np.log(eigenvalues)).sum(), rel=1e-9)
+    heavier = start + torch.tensor([0.5 * math.log(2.0)] + [0.0] * 9, dtype=torch.float64)
+    assert float(squared_distance(heavier, start)) == pytest.approx((2 * math.log(2.0)) ** 2)
+    torch.autograd.gradcheck(squared_distance, (moved.requires_grad_(), start))
+    assert torch.equal(
+        torch.autograd.grad(squared_distance(start.requires_grad_(), start.detach()), start)[0].round(decimals=6),
+        torch.zeros(10).double(),
+    )
+
+    data = measured(damped(), 20, seed=6)
+    system = PhysicalParameters.of(damped(), LEARN[0]).system_at(torch.tensor([0.5, 0.1, 0.1, 0.1]).double())
+    model = StructuredGP(system, prior=NoForces())
+    free, held = (model.fit(data, learn=LEARN[0], prior_strength=w).identification for w in (0.0, 1e12))
+    assert held.values == pytest.approx(held.start, rel=1e-3)
+    assert free.values["hand.mass"] != pytest.approx(free.start["hand.mass"], rel=0.05)
+    assert held.standard_errors["hand.mass"] < 0.01 * free.standard_errors["hand.mass"]
+
+
+def test_every_iterate_of_a_structured_fit_is_kept():
+    data = arm_data(25, seed=9, system=damped())
+    learn = LinkInertia("hand", ("mass",))
+    posterior = StructuredGP(damped()).fit(data, learn=learn, restarts=2, options=OptimizerOptions(iterations=4))
+    result, found = posterior.result, posterior.identification
+    assert len(result.iterates) == len(result.history) == len(found.history)
+    for point, value in zip(result.iterates, result.history, strict=True):
+        assert float(found.objective(point)) == pytest.approx(value, abs=1e-9)
+    assert posterior.settings["learned"] == [{"link": "hand", "parts": ["mass"]}]
+    seen = []
+    with pytest.warns(NumericalWarning, match="not ended at a minimum"):  # after 4 iterations
+        _ = replace(found, progress=lambda done, of: seen.append((done, of))).information
+    assert seen[-1] == (33, 33)  # 2 for the mass, 1 at the optimum, 30 for kernels
+
+
+def test_a_negative_strength_is_refused():
+    data = arm_data(5, seed=0, system=damped())
+    with pytest.raises(InvalidInput, match="prior_strength is -1"):
+        StructuredGP(damped()).fit(data, learn=LEARN, prior_strength=-1.0)
