@@ -10,6 +10,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
 from forcegp.models import StructuredGP
 from forcegp.models.accelerations import PredictedAccelerations
+from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.rollout import roll_out
 from forcegp.priors import NoForces
 
@@ -136,6 +137,23 @@ def test_first_sampled_accelerations_have_the_predicted_distribution(posterior, 
     assert ((first.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
     scale = expected.covariance.diagonal().max()
     torch.testing.assert_close(torch.cov(first.mT), expected.covariance, rtol=0.1, atol=0.1 * float(scale))
+
+
+def test_the_independent_model_rolls_out_its_mean_and_functions_of_its_own(data, start):
+    posterior = IndependentGP(arm_system()).fit(data, points=20, options=OptimizerOptions(iterations=15))
+    q, v, u = start
+    direct = posterior.rollout(q, v, u[:, :4], DT, integrator="rk4")
+    through = roll_out(PredictedAccelerations(posterior, None), q, v, u[:, :4], DT, integrator="rk4")
+    torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
+    drawn = posterior.rollout(q[0], v[0], u[0, :1], DT, samples=3000, seed=0).samples.a[:, 0]
+    expected = posterior.predict(q[0], v[0], u[0, 0])
+    assert ((drawn.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
+    torch.testing.assert_close(drawn.std(0), expected.std, rtol=0.08, atol=0)
+    assert torch.corrcoef(drawn.mT).tril(-1).abs().max() <= 5.0 / np.sqrt(3000)
+    with pytest.raises(InvalidInput, match=r"IndependentPosterior does not know the constraint"):
+        posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0))
+    on_surface = posterior.rollout(q, v, u[:, :4], DT, integrator="projected")
+    assert on_surface.constraint.abs().max() <= 1e-11
 
 
 def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):

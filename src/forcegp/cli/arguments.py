@@ -14,6 +14,7 @@ from forcegp.cli.command import Command
 from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
 from forcegp.cli.fit import Fit
+from forcegp.cli.rollout import Rollout
 from forcegp.cli.simulate import Simulate
 from forcegp.errors import InvalidInput
 
@@ -35,6 +36,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "simulate": (Simulate, "make a dataset with ground truth"),
     "fit": (Fit, "learn the unknown forces from a dataset"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
+    "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
 }
 """A new command is a file with a subclass of Command, and an entry here."""
 

@@ -5,6 +5,9 @@ from forcegp.evaluation.figure_style import save_figure
 from forcegp.evaluation.likelihood_plot import likelihood_figure
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.evaluation.prediction_plot import prediction_figure
+from forcegp.evaluation.recorded_motions import RecordedMotions, recorded_motions
+from forcegp.evaluation.rollout_errors import RolloutErrors, rollout_errors
+from forcegp.evaluation.rollout_plot import rollout_figure
 from forcegp.evaluation.scoring import evaluate
 from forcegp.evaluation.summary_plot import summary_figure
 from forcegp.evaluation.tool_path_plot import tool_path_figure
@@ -12,10 +15,15 @@ from forcegp.evaluation.tool_path_plot import tool_path_figure
 __all__ = [
     "Evaluation",
     "PredictedRows",
+    "RecordedMotions",
+    "RolloutErrors",
     "evaluate",
     "likelihood_figure",
     "predict_rows",
     "prediction_figure",
+    "recorded_motions",
+    "rollout_errors",
+    "rollout_figure",
     "save_figure",
     "summary_figure",
     "tool_path_figure",

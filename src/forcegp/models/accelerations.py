@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
 from torch import Tensor
 from typing_extensions import override
 
@@ -17,6 +19,7 @@ from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.marginal_likelihood import inertials_of
 
 if TYPE_CHECKING:
+    from forcegp.models.independent_posterior import IndependentPosterior
     from forcegp.models.protocol import Posterior
     from forcegp.models.structured_posterior import StructuredPosterior
 
@@ -103,3 +106,30 @@ class PredictedAccelerations(AccelerationModel):
         raise InvalidInput(
             f"no functions can be drawn from a {type(self.posterior).__name__}; give samples=0, or use a StructuredGP."
         )
+
+
+class IndependentAccelerations(PredictedAccelerations):
+    """One Gaussian process per joint acceleration, each of which functions can be drawn from."""
+
+    def __init__(self, posterior: IndependentPosterior, baumgarte: Baumgarte | None) -> None:
+        super().__init__(posterior, baumgarte)
+        self.latents, self.features = posterior.latents, posterior.likelihood.features
+
+    @override
+    def mean(self) -> AccelerationFunction:
+        return self._through([StackedFunctions.mean_of(latent) for latent in self.latents])
+
+    @override
+    def sampled(self, samples: int, seed: int) -> AccelerationFunction:
+        seeds = np.random.SeedSequence(seed).generate_state(len(self.latents))  # joints are independent
+        return self._through(
+            [FunctionSamples.draw(latent, samples, int(own)) for latent, own in zip(self.latents, seeds, strict=True)]
+        )
+
+    def _through(self, functions: Sequence[Callable[[list[Tensor]], Tensor]]) -> AccelerationFunction:
+        def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+            z = self.features(*(x.reshape(-1, x.shape[-1]) for x in (q, v, u)))
+            points = [z.reshape(*q.shape[:-1], -1)]
+            return torch.cat([function(points) for function in functions], dim=-1)
+
+        return acceleration

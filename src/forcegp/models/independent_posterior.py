@@ -14,7 +14,8 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult, negative_log_likelihood
-from forcegp.mechanics import MechanicalSystem
+from forcegp.mechanics import Baumgarte, MechanicalSystem
+from forcegp.models.accelerations import AccelerationModel, IndependentAccelerations
 from forcegp.models.marginal_likelihood import RESIDUAL_FLOOR, Standardization, TrainingData
 from forcegp.models.noise import ACCELERATION
 from forcegp.models.prediction import Prediction
@@ -132,6 +133,10 @@ class IndependentPosterior(Posterior):
     @override
     def description(self) -> str:
         return "independent GP"
+
+    @override
+    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
+        return IndependentAccelerations(self, baumgarte)
 
     @property
     @override

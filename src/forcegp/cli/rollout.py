@@ -1,0 +1,245 @@
+"""`forcegp rollout`: let a fitted model predict whole motions, and compare them with the recorded ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from forcegp.data import Dataset
+    from forcegp.evaluation import RecordedMotions, RolloutErrors
+    from forcegp.mechanics import Baumgarte
+    from forcegp.models.rollout import Rollout as Motion
+
+KIND = "forcegp rollout"
+DEFAULT_STARTS = 10
+MOMENTS = (0.1, 0.25, 0.5, 1.0)
+"""Parts of the duration at which the table tells the errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollout(Command):
+    """Let a fitted model predict whole motions under recorded torques, and compare them with the recording.
+
+    The motions begin at rows of the dataset. For instance:
+      forcegp rollout run test.h5 --starts 10 --seconds 1 --baumgarte 10,1 --out rollout
+      forcegp rollout run test.h5 --start 0,240 --integrator projected --samples 20 --out rollout
+    """
+
+    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder that `forcegp fit --out` wrote."""
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """A recording with equal time steps that the model has not seen (HDF5)."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """The folder to write: rollout.json, rollout.h5 and rollout.png."""
+    start: Annotated[str | None, arg(metavar="ROW[,ROW...]", help_behavior_hint="(default: --starts)")] = None
+    """Begin at these rows of the dataset."""
+    starts: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 10)")] = None
+    """Begin at so many rows, spread evenly over the recording."""
+    seconds: Annotated[float, arg(metavar="S")] = 1.0
+    """How long each motion lasts."""
+    integrator: Annotated[str, arg(metavar="NAME")] = "symplectic-euler"
+    """symplectic-euler (as in PyBullet), rk4, or projected (contacts hold exactly)."""
+    baumgarte: Annotated[str, arg(metavar="OMEGA[,ZETA]|none")] = "none"
+    """Stabilisation of the contacts in the rollout, rad/s and damping ratio (default 1)."""
+    samples: Annotated[int, arg(metavar="N")] = 0
+    """Also roll out so many functions drawn from the model, for intervals. Time grows with it."""
+    seed: Annotated[int, arg(metavar="K")] = 0
+    """Draws the functions."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Roll out, compare, draw and show."""
+        rows = self._starts()
+        baumgarte = parse_baumgarte(self.baumgarte)
+        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        from forcegp.data import Dataset
+        from forcegp.evaluation import recorded_motions, rollout_errors
+        from forcegp.models import load_posterior
+
+        posterior = load_posterior(self.run_folder)
+        dataset = Dataset.load(self.data)
+        if tuple(posterior.joint_names) != dataset.joint_names:
+            raise InvalidInput(
+                f"{self.data} has joints {', '.join(dataset.joint_names)}; the model was trained on "
+                f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
+            )
+        recorded = recorded_motions(dataset, rows, self.seconds)
+        begun = time.process_time()
+        with terminal.progress(f"rolling out: {len(recorded.rows)} motions of {recorded.time[-1]:.3g} s") as report:
+            rollout = posterior.rollout(
+                recorded.q[:, 0],
+                recorded.v[:, 0],
+                recorded.u,
+                recorded.dt,
+                integrator=self.integrator,
+                baumgarte=baumgarte,
+                samples=self.samples,
+                seed=self.seed,
+                progress=report,
+            )
+        cpu_seconds = time.process_time() - begun
+        errors = rollout_errors(rollout, recorded, posterior.system)
+        summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
+        with folder_written_whole(self.out) as folder:
+            folder.mkdir()
+            self._write(folder, rollout, recorded, errors, dataset, summary)
+        terminal.note(f"figure: {self.out / 'rollout.png'}")
+        terminal.say(*_report(summary))
+        return summary
+
+    def _starts(self) -> int | list[int]:
+        if self.start is not None and self.starts is not None:
+            raise InvalidInput("--start and --starts were both given; give the rows or their number.")
+        if self.start is None:
+            return DEFAULT_STARTS if self.starts is None else self.starts
+        try:
+            return [int(row) for row in self.start.split(",")]
+        except ValueError:
+            raise InvalidInput(f"--start is {self.start!r}; give row numbers such as 0 or 0,240,480.") from None
+
+    def _summary(
+        self,
+        rollout: Motion,
+        recorded: RecordedMotions,
+        errors: RolloutErrors,
+        dataset: Dataset,
+        cpu_seconds: float,
+    ) -> dict[str, Any]:
+        steps, baumgarte = len(errors.time) - 1, rollout.baumgarte
+        at = sorted({max(1, round(part * steps)) for part in MOMENTS})
+        return {
+            "run": str(self.run_folder),
+            "data": str(self.data),
+            "rows": list(recorded.rows),
+            "dt": recorded.dt,
+            "seconds": float(errors.time[-1]),
+            "steps": steps,
+            "unit": dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m",
+            "integrator": self.integrator,
+            "baumgarte": None if baumgarte is None else {"omega": baumgarte.omega, "zeta": baumgarte.zeta},
+            "samples": self.samples,
+            "seed": self.seed,
+            "diverged_at": errors.diverged_at.tolist(),
+            "initial_correction": rollout.initial_correction.amax(0).tolist(),
+            "cpu_seconds": cpu_seconds,
+            "constraint_max": _number(errors.constraint, "max"),
+            "constraint_median": _number(errors.constraint, "median"),
+            "moments": [_moment(errors, row) for row in at],
+        }
+
+    def _write(
+        self,
+        folder: Path,
+        rollout: Motion,
+        recorded: RecordedMotions,
+        errors: RolloutErrors,
+        dataset: Dataset,
+        summary: Mapping[str, Any],
+    ) -> None:
+        import h5py
+
+        from forcegp.evaluation import rollout_figure, save_figure
+
+        write_json(folder / "rollout.json", summary)
+        arrays = {"time": rollout.time, "q": rollout.q, "v": rollout.v, "a": rollout.a}
+        arrays |= {"constraint": rollout.constraint, "diverged_at": rollout.diverged_at}
+        if rollout.samples is not None:
+            arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
+        with h5py.File(folder / "rollout.h5", "w") as file:
+            for name, values in arrays.items():
+                file[name] = values.cpu().numpy()
+            for name in ("q", "v", "u"):
+                file[f"recorded/{name}"] = getattr(recorded, name)
+            file["recorded/row"] = list(recorded.rows)
+            file.attrs["joint_names"] = list(dataset.joint_names)
+        stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
+        title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
+        save_figure(rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png")
+        options = ("run", "data", "rows", "seconds", "integrator", "baumgarte", "samples", "seed")
+        write_config(folder, KIND, {"options": {name: summary[name] for name in options}})
+
+
+def parse_baumgarte(given: str) -> Baumgarte | None:
+    """`none`, `OMEGA` or `OMEGA,ZETA`. Raises InvalidInput for anything else."""
+    if given == "none":
+        return None
+    try:
+        numbers = [float(part) for part in given.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2):
+        raise InvalidInput(f"--baumgarte is {given!r}; give none, OMEGA or OMEGA,ZETA, for example 10,1.")
+    from forcegp.mechanics import Baumgarte
+
+    return Baumgarte(*numbers)
+
+
+def _moment(errors: RolloutErrors, row: int) -> dict[str, Any]:
+    """Errors over all motions that have not diverged, at one moment; the joint error is that of the worst joint."""
+    worst = errors.joint[:, row].max(-1)
+    return {
+        "time": float(errors.time[row]),
+        "lasting": int((worst == worst).sum()),  # NaN is not equal to itself
+        "joint_error_median": _number(worst, "median"),
+        "joint_error_max": _number(worst, "max"),
+        "tool_error_median": _number(None if errors.tool is None else errors.tool[:, row], "median"),
+        "constraint_max": _number(None if errors.constraint is None else errors.constraint[:, : row + 1], "max"),
+        "inside_95": _number(None if errors.inside is None else errors.inside[:, 1 : row + 1], "mean"),
+    }
+
+
+def _number(values: np.ndarray | None, statistic: str) -> float | None:
+    """A statistic of the finite values; None if there are none."""
+    import numpy as np
+
+    if values is None:
+        return None
+    finite = values[np.isfinite(values)]
+    return float(getattr(np, statistic)(finite)) if finite.size else None
+
+
+def _report(summary: Mapping[str, Any]) -> list[Any]:
+    from forcegp.cli.tables import columns, facts, number, percent
+
+    contacts, samples = summary["constraint_max"] is not None, summary["samples"] > 0
+    header = ["after", "motions", "joint error,\nmedian", "\nlargest"]
+    header += ["tool error,\nmedian", "largest |c|\nso far"] if contacts else []
+    header += ["in 95 % of\nsamples"] if samples else []
+    rows = []
+    for moment in summary["moments"]:
+        cells = [f"{moment['time']:.3g} s", str(moment["lasting"])]
+        cells += [number(moment["joint_error_median"]), number(moment["joint_error_max"])]
+        if contacts:
+            cells += [_millimetres(moment["tool_error_median"]), _millimetres(moment["constraint_max"])]
+        rows.append([*cells, percent(moment["inside_95"])] if samples else cells)
+    count = len(summary["rows"])
+    title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
+    ended = sum(row >= 0 for row in summary["diverged_at"])
+    told = {"integrator": summary["integrator"], "diverged": f"{ended} of {count}"}
+    if summary["integrator"] == "projected" and contacts:
+        moved = summary["initial_correction"]
+        told["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
+    told["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
+    return [columns(title, header, rows), facts("", told)]
+
+
+def _millimetres(metres: float | None) -> str:
+    from forcegp.cli.tables import NONE
+
+    return NONE if metres is None else f"{1e3 * metres:.3g} mm"
