@@ -23,7 +23,15 @@ if TYPE_CHECKING:
         Sphere,
         ViscousJointFriction,
     )
-    from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
+    from forcegp.models import (
+        IndependentGP,
+        NetworkEnsemble,
+        NeuralNetwork,
+        Noise,
+        StructuredGP,
+        load_posterior,
+        save_posterior,
+    )
     from forcegp.priors import JointAccelerations, JointForces, NoForces
     from forcegp.robots import Robot
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
@@ -56,6 +64,9 @@ __all__ = [
     "NoForces",
     "Noise",
     "StructuredGP",
+    "IndependentGP",
+    "NeuralNetwork",
+    "NetworkEnsemble",
     "save_posterior",
     "load_posterior",
     # how good it is
@@ -69,7 +80,8 @@ _ROOMS = {
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"},
     "data": {"Dataset"},
     "priors": {"JointForces", "JointAccelerations", "NoForces"},
-    "models": {"StructuredGP", "Noise", "save_posterior", "load_posterior"},
+    "models": {"IndependentGP", "NeuralNetwork", "NetworkEnsemble"}
+    | {"StructuredGP", "Noise", "save_posterior", "load_posterior"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
     "evaluation": {"Evaluation", "evaluate"},
 }

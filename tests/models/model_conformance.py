@@ -1,6 +1,7 @@
 """What every model has to pass, whatever it is: inherit `ModelConformance` and say how the model is made."""
 
 import dataclasses
+import pickle
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from tests.models.arm import arm_data
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import evaluate, likelihood_figure, prediction_figure, summary_figure, tool_path_figure
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models import load_posterior, save_posterior
 from forcegp.models.protocol import Model, Posterior
 
 BATCHES = [(), (1,), (4,), (2, 3), (2, 0, 3)]
@@ -118,6 +120,19 @@ class ModelConformance:
         assert all(np.isfinite(value) for _, _, value in calls)
         places = [(start, iteration) for start, iteration, _ in calls]
         assert places == sorted(places)
+
+    def test_it_comes_back_from_a_folder_and_from_another_process(self, fitted, test, tmp_path):
+        save_posterior(fitted, tmp_path / "run")
+        states = test.q, test.v, test.u
+        for again in (load_posterior(tmp_path / "run"), pickle.loads(pickle.dumps(fitted))):
+            assert type(again) is type(fitted)
+            mine, theirs = fitted.predict(*states), again.predict(*states)
+            assert torch.equal(mine.mean, theirs.mean)
+            assert torch.equal(mine.covariance, theirs.covariance)
+            assert torch.equal(mine.noise_covariance, theirs.noise_covariance)
+            assert again.description == fitted.description
+            assert again.result.history == fitted.result.history
+            assert again.settings["points"] == self.points
 
     def test_it_can_be_scored_and_drawn(self, fitted, test):
         evaluation = evaluate(fitted, test)

@@ -37,7 +37,7 @@ class Posterior(ABC):
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
     (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
     training data); `result` is the history of the search and why it ended. A subclass is a frozen dataclass with these
-    four and the abstract members; an entry in `forcegp.models.storage.KINDS` lets it be stored.
+    four and the abstract members; an entry in `forcegp.models.stored_models.KINDS` lets it be stored.
     """
 
     model: Any  # the Model, of which every subclass names its own

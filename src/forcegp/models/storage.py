@@ -25,17 +25,14 @@ from forcegp.errors import FileFormatError, ForceGPError
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.marginal_likelihood import TrainingData
-from forcegp.models.noise import Noise
-from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_posterior import StructuredPosterior
-from forcegp.priors import prior_from_dict, prior_to_dict
+from forcegp.models.protocol import Model, Posterior
+from forcegp.models.stored_models import KINDS, kind_of
 
-KIND = "forcegp structured posterior"
 FORMAT_VERSION = 1
 STATES = ("q", "v", "u", "a")
 
 
-def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrite: bool = False) -> None:
+def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = False) -> None:
     """Write `posterior` as the folder `path`, under a temporary name that is renamed at the end.
 
     Raises
@@ -49,11 +46,12 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
             raise FileFormatError(f"{path} exists already; choose another name or pass overwrite=True")
         if not _is_model_folder(path):
             raise FileFormatError(f"{path} exists and is not a folder written by forcegp, so it is not overwritten")
+    kind = kind_of(posterior.model)
     system = posterior.system.to_dict()
     urdf = system.pop("urdf")
     result = posterior.result
     document = {
-        "kind": KIND,
+        "kind": kind,
         "format_version": FORMAT_VERSION,
         "forcegp_version": __version__,
         "torch_version": torch.__version__,
@@ -61,11 +59,7 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
         "units": _plain(units_for(posterior.system.robot)),
         "urdf_sha256": _sha256(urdf),
         "system": system,
-        "model": {
-            "mean": posterior.model.mean,
-            "prior": prior_to_dict(posterior.model.prior),
-            "noise": None if posterior.model.noise is None else posterior.model.noise.to_dict(),
-        },
+        "model": KINDS[kind].to_dict(posterior.model),
         "result": {
             "value": result.value,
             "history": list(result.history),
@@ -76,7 +70,7 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
         },
         "settings": dict(posterior.settings),
     }
-    training = posterior.likelihood.training
+    training = posterior.training
     tensors = {f"training.{name}": getattr(training, name).detach().cpu().contiguous() for name in STATES}
     tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
 
@@ -95,7 +89,7 @@ def save_posterior(posterior: StructuredPosterior, path: str | Path, *, overwrit
         raise
 
 
-def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> StructuredPosterior:
+def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
     """Read a folder that `save_posterior` wrote; it predicts without the training file.
 
     `contacts` replaces the stored ones.
@@ -117,9 +111,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         )
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
-        stored = document["model"]
-        noise = None if stored["noise"] is None else Noise.from_dict(stored["noise"])
-        model = StructuredGP(system, prior_from_dict(stored["prior"]), stored["mean"], noise)
+        model = KINDS[document["kind"]].from_dict(system, document["model"])
         training = TrainingData(*(tensors[f"training.{name}"] for name in STATES))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
@@ -147,9 +139,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     return model.condition(training, parameters, optimization, settings)
 
 
-def _check_tensors(
-    file: Path, model: StructuredGP, training: TrainingData, parameters: Mapping[str, torch.Tensor]
-) -> None:
+def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
     states = {name: getattr(training, name) for name in STATES}
     shape = (training.q.shape[0], model.system.robot.nv) if training.q.dim() == 2 else None
     for name, value in {**states, **parameters}.items():
@@ -173,8 +163,8 @@ def _document(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path} holds no model.json; give the folder that `forcegp fit --out` wrote") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{file} is damaged: {error}") from None
-    if not isinstance(document, dict) or document.get("kind") != KIND:
-        raise FileFormatError(f"{file} is not a stored {KIND}")
+    if not isinstance(document, dict) or document.get("kind") not in KINDS:
+        raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
     if version != FORMAT_VERSION:
         raise FileFormatError(
