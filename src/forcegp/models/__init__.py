@@ -11,6 +11,7 @@ from forcegp.models.noise import Noise
 from forcegp.models.physical_parameters import Coefficients
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Model, Posterior
+from forcegp.models.rollout import Rollout
 from forcegp.models.storage import load_posterior, save_posterior
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_posterior import StructuredPosterior
@@ -29,6 +30,7 @@ __all__ = [
     "Noise",
     "Posterior",
     "Prediction",
+    "Rollout",
     "StructuredGP",
     "StructuredPosterior",
     "TrainingData",
