@@ -141,6 +141,7 @@ class ModelConformance:
         assert np.isfinite(evaluation.nlpd)
         assert evaluation.warnings == ()
         speaks = fitted.predict(test.q[:1], test.v[:1], test.u[:1]).unknown_force is not None
+        assert fitted.speaks_of_forces == speaks
         assert (evaluation.unknown_force_mae is not None) == speaks
         assert (evaluation.multiplier_mae is not None) == speaks
         bare = dataclasses.replace(test, truth={}, noise_std=None, system=None)
@@ -148,7 +149,8 @@ class ModelConformance:
         panels = {prediction_figure: 6, summary_figure: 8, tool_path_figure: 3}
         for draw, count in panels.items():
             assert len(draw(fitted, test).axes) == count
-        assert len(likelihood_figure({fitted.description: fitted.result.history}).axes) == 1
+        (axes,) = likelihood_figure({fitted.description: fitted.result.history}, objective=fitted.objective).axes
+        assert f"{axes.get_title(loc='left')} [{axes.get_ylabel()}]".endswith(fitted.objective)
 
     def test_training_rows_among_the_test_rows_are_noticed(self, fitted, data):
         assert any("training rows" in warning for warning in evaluate(fitted, data).warnings)

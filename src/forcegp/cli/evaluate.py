@@ -17,7 +17,7 @@ from forcegp.errors import InvalidInput
 if TYPE_CHECKING:
     from forcegp.data import Dataset
     from forcegp.evaluation import Evaluation
-    from forcegp.models import StructuredPosterior
+    from forcegp.models import Posterior
 
 KIND = "forcegp evaluate"
 
@@ -60,8 +60,8 @@ class Evaluate(Command):
             "run": str(self.run_folder),
             "data": str(self.data),
             "every": self.every,
-            "points": len(posterior.likelihood.training.q),
-            "mean": posterior.model.mean,
+            "model": posterior.description,
+            "points": len(posterior.training.q),
             **evaluation.to_dict(),
         }
         if self.plots is not None:
@@ -75,7 +75,7 @@ class Evaluate(Command):
         return scores
 
 
-def score(terminal: Terminal, posterior: StructuredPosterior, dataset: Dataset, name: str = "predicting") -> Evaluation:
+def score(terminal: Terminal, posterior: Posterior, dataset: Dataset, name: str = "predicting") -> Evaluation:
     """`forcegp.evaluation.evaluate` with a progress bar; warnings go to stderr."""
     from forcegp.evaluation import evaluate
 
@@ -86,7 +86,7 @@ def score(terminal: Terminal, posterior: StructuredPosterior, dataset: Dataset, 
     return evaluation
 
 
-def draw(terminal: Terminal, folder: Path, posterior: StructuredPosterior, dataset: Dataset) -> list[str]:
+def draw(terminal: Terminal, folder: Path, posterior: Posterior, dataset: Dataset) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
     from forcegp.evaluation import (
         likelihood_figure,
@@ -98,7 +98,9 @@ def draw(terminal: Terminal, folder: Path, posterior: StructuredPosterior, datas
 
     figures = {
         "prediction.png": lambda: prediction_figure(posterior, dataset),
-        "likelihood.png": lambda: likelihood_figure({f"{posterior.model.mean} mean": posterior.result.history}),
+        "likelihood.png": lambda: likelihood_figure(
+            {posterior.description: posterior.result.history}, objective=posterior.objective
+        ),
     }
     if posterior.system.contacts:
         figures["tool_path.png"] = lambda: tool_path_figure(posterior, dataset)
@@ -110,13 +112,13 @@ def draw(terminal: Terminal, folder: Path, posterior: StructuredPosterior, datas
     return list(figures)
 
 
-def _report(posterior: StructuredPosterior, evaluation: Evaluation, dataset: Dataset, data: Path) -> list[Any]:
+def _report(posterior: Posterior, evaluation: Evaluation, dataset: Dataset, data: Path) -> list[Any]:
     from forcegp.cli.tables import NORMAL_FORCES, evaluation_table, facts, multiplier_scores, number
 
-    points = len(posterior.likelihood.training.q)
+    points = len(posterior.training.q)
     units = dataset.units["a"]
     unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
-    title = f"{points} training points, {posterior.model.mean} mean; {evaluation.rows} rows of {data}; errors in {unit}"
+    title = f"{points} training points, {posterior.description}; {evaluation.rows} rows of {data}; errors in {unit}"
     floor = "" if evaluation.noise_floor is None else f" (a perfect model has {number(evaluation.noise_floor)})"
     values = {
         "MAE": f"{number(evaluation.mae)}{floor}",

@@ -12,9 +12,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def likelihood_figure(histories: Mapping[str, Sequence[float]]) -> Figure:
+def likelihood_figure(
+    histories: Mapping[str, Sequence[float]], *, objective: str = "negative log likelihood with hyperpriors [nats]"
+) -> Figure:
     """One curve per model, `{name: posterior.result.history}`; the last value of each is written beside it.
 
+    `objective` says what the values are, with their unit in brackets: `posterior.objective`.
     Raises InvalidInput without any history.
     """
     if not histories or not all(len(history) for history in histories.values()):
@@ -26,7 +29,7 @@ def likelihood_figure(histories: Mapping[str, Sequence[float]]) -> Figure:
         axes.plot(history, color=color, linewidth=1.6, label=name)
         axes.plot(last, history[-1], "o", color=color, markersize=4)
         axes.annotate(
-            f"{history[-1]:.1f}",
+            f"{history[-1]:.1f}" if abs(history[-1]) >= 10.0 else f"{history[-1]:.3g}",
             (last, history[-1]),
             xytext=(6, 0),
             textcoords="offset points",
@@ -35,6 +38,7 @@ def likelihood_figure(histories: Mapping[str, Sequence[float]]) -> Figure:
             va="center",
         )
     axes.margins(x=0.08)
-    quiet(axes, title="What the search lowers: negative log likelihood with hyperpriors", x="iteration", y="nats")
+    what, _, unit = objective.partition(" [")
+    quiet(axes, title=f"What the search lowers: {what}", x="iteration", y=unit.removesuffix("]"))
     axes.legend(fontsize=NORMAL, frameon=False)
     return figure

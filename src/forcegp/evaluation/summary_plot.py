@@ -79,7 +79,7 @@ def summary_figure(
         handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False, markerscale=4
     )
     figure.suptitle(
-        f"{len(posterior.training.q)} points teach the force that nobody modelled"
+        f"{len(posterior.training.q)} points teach {_what(posterior)}"
         + excerpt(rows, dataset, before=" (time panels: ", after=")"),
         fontsize=LARGE + 1,
         fontweight="bold",
@@ -87,6 +87,12 @@ def summary_figure(
         ha="left",
     )
     return figure
+
+
+def _what(posterior: Posterior) -> str:
+    return (
+        "the force that nobody modelled" if posterior.speaks_of_forces else f"the {posterior.description} all it knows"
+    )
 
 
 def _draw_acceleration(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) -> None:

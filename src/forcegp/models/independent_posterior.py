@@ -140,6 +140,11 @@ class IndependentPosterior(Posterior):
 
     @property
     @override
+    def speaks_of_forces(self) -> bool:
+        return False
+
+    @property
+    @override
     def noise_std(self) -> Float[Tensor, "nv"]:
         return self.parameters[ACCELERATION].exp()
 

@@ -52,6 +52,7 @@ class NetworkEnsemble(NetworkModel):
     """
 
     name: ClassVar[str] = "network ensemble"
+    objective: ClassVar[str] = "held-out negative log likelihood of standardised data [nats]"
 
     system: MechanicalSystem
     noise: Noise | None = None

@@ -33,6 +33,7 @@ class NetworkModel(Model):
 
     noise: Noise | None
     name: ClassVar[str]
+    objective: ClassVar[str]
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, MechanicalSystem):
@@ -105,6 +106,11 @@ class NetworkPosterior(Posterior):
     def description(self) -> str:
         return self.model.name
 
+    @property
+    @override
+    def objective(self) -> str:
+        return self.model.objective
+
     @cached_property
     def standardization(self) -> Standardization:
         """Of the inputs and of the accelerations, from the training points."""
@@ -122,6 +128,11 @@ class NetworkPosterior(Posterior):
         with torch.no_grad():
             _, _, scatter = self._moments(self.data.q, self.data.v, self.data.u)
         return scatter.mean(0).sqrt()
+
+    @property
+    @override
+    def speaks_of_forces(self) -> bool:
+        return False
 
     @property
     @override

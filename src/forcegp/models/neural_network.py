@@ -47,6 +47,7 @@ class NeuralNetwork(NetworkModel):
     """
 
     name: ClassVar[str] = "neural network"
+    objective: ClassVar[str] = "mean squared error in training [(rad/s²)² or (m/s²)²]"
 
     system: MechanicalSystem
     noise: Noise | None = None

@@ -82,6 +82,16 @@ class Posterior(ABC):
         return self.system.robot.joint_names
 
     @property
+    def objective(self) -> str:
+        """What `result.history` holds, with its unit in brackets."""
+        return "negative log likelihood with hyperpriors [nats]"
+
+    @property
+    def speaks_of_forces(self) -> bool:
+        """Whether predictions hold the forces behind the acceleration."""
+        return True
+
+    @property
     def carries_known_forces(self) -> bool:
         """Whether the predicted `unknown_force` holds the known forces, too."""
         return False

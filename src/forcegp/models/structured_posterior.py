@@ -20,6 +20,7 @@ from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData,
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Posterior
+from forcegp.priors import JointAccelerations, NoForces
 
 if TYPE_CHECKING:
     from forcegp.models.structured_gp import StructuredGP
@@ -59,7 +60,10 @@ class StructuredPosterior(Posterior):
     @property
     @override
     def description(self) -> str:
-        return f"{self.model.mean} mean"
+        if isinstance(self.model.prior, NoForces):
+            return "analytical model"
+        unconstrained = isinstance(self.model.prior, JointAccelerations)
+        return f"{'unconstrained accelerations, ' if unconstrained else ''}{self.model.mean} mean"
 
     @property
     @override
