@@ -30,3 +30,25 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
     links = re.findall(r"\]\(([^)#]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
     missing = [link for link in links if not link.startswith("http") and not (repository / link).exists()]
     assert not missing
+
+
+def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    mass, verdict, _ = done.stdout.splitlines()[-3:]
+    found, error = (float(number) for number in re.fullmatch(r"(\S+) \+- (\S+) kg", mass).groups())
+    assert abs(found - 2.0) < 0.1
+    assert 0.0 < error < 0.05
+    assert verdict == "The data identify every parameter that was learned."
+    assert 'xyz="' in (tmp_path / "identified.urdf").read_text()
+
+
+def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
+    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    scripts = Path(sys.executable).parent
+    for command in commands.splitlines():
+        program, *words = command.split()
+        subprocess.run([scripts / program, *words], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert (tmp_path / "identified" / "identified.urdf").exists()

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         ViscousJointFriction,
     )
     from forcegp.models import (
+        Coefficients,
         IndependentGP,
         NetworkEnsemble,
         NeuralNetwork,
@@ -63,6 +64,7 @@ __all__ = [
     "JointAccelerations",
     "NoForces",
     "Noise",
+    "Coefficients",
     "StructuredGP",
     "IndependentGP",
     "NeuralNetwork",
@@ -81,7 +83,7 @@ _ROOMS = {
     "data": {"Dataset"},
     "priors": {"JointForces", "JointAccelerations", "NoForces"},
     "models": {"IndependentGP", "NeuralNetwork", "NetworkEnsemble"}
-    | {"StructuredGP", "Noise", "save_posterior", "load_posterior"},
+    | {"StructuredGP", "Noise", "Coefficients", "save_posterior", "load_posterior"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
     "evaluation": {"Evaluation", "evaluate"},
 }

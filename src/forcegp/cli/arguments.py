@@ -14,6 +14,7 @@ from forcegp.cli.command import Command
 from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
 from forcegp.cli.fit import Fit
+from forcegp.cli.identify import Identify
 from forcegp.cli.rollout import Rollout
 from forcegp.cli.simulate import Simulate
 from forcegp.errors import InvalidInput
@@ -35,6 +36,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
     "simulate": (Simulate, "make a dataset with ground truth"),
     "fit": (Fit, "learn the unknown forces from a dataset"),
+    "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
 }

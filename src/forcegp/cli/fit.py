@@ -32,16 +32,8 @@ KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(Command):
-    """Learn the unknown forces from a dataset, and write the model to a folder.
-
-    The dataset carries its robot and contacts, so nothing else is needed; --robot, --contact and --known-force
-    override it.
-
-    For instance:
-      forcegp fit train.h5 --points 100 --out run
-      forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
-    """
+class FitOptions(Command):
+    """What every command asks that fits a structured model."""
 
     data: Annotated[Positional[Path], arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
@@ -51,8 +43,6 @@ class Fit(Command):
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
     mean: Literal["analytical", "zero"] = "analytical"
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
-    prior: Literal["joint"] = "joint"
-    """joint: one Gaussian process per joint force, on (q, v, u)."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
     restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
@@ -84,6 +74,64 @@ class Fit(Command):
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
+
+    def _system(self, dataset: Dataset) -> MechanicalSystem:
+        """What is known: the dataset's own system, with what the options replace."""
+        from forcegp.mechanics import MechanicalSystem
+        from forcegp.robots import Robot
+
+        contacts = parse_contacts(self.contact)
+        system = dataset.system
+        if self.robot is not None:
+            robot = Robot.from_urdf(self.robot) if system is None else _robot_like(system.robot, self.robot)
+            if robot.joint_names != tuple(dataset.joint_names):
+                raise InvalidInput(
+                    f"{self.robot} has joints {', '.join(robot.joint_names)}; {self.data} has "
+                    f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
+                )
+            system = MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        if system is None:
+            raise InvalidInput(
+                f"{self.data} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
+            )
+        if self.contact:
+            system = system.with_contacts(contacts)
+        if self.known_force:
+            system = _with_known_forces(system, self.known_force)
+        return system
+
+    def _write(
+        self, folder: Path, posterior: StructuredPosterior, kind: str, more: Mapping[str, str] | None = None
+    ) -> None:
+        """The model, `more` files by name with their text, and how it was made."""
+        from forcegp.models import save_posterior
+
+        save_posterior(posterior, folder)
+        for name, text in (more or {}).items():
+            (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
+        options = {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+            if name not in ("json", "debug", "overwrite")
+        }
+        data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
+        write_config(folder, kind, {"options": options, "data": data, "resolved": dict(posterior.settings)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(FitOptions):
+    """Learn the unknown forces from a dataset, and write the model to a folder.
+
+    The dataset carries its robot and contacts, so nothing else is needed; --robot, --contact and --known-force
+    override it.
+
+    For instance:
+      forcegp fit train.h5 --points 100 --out run
+      forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
+    """
+
+    prior: Literal["joint"] = "joint"
+    """joint: one Gaussian process per joint force, on (q, v, u)."""
     json: Json = False
     debug: Debug = False
 
@@ -115,46 +163,9 @@ class Fit(Command):
         )
         summary = fit_summary(posterior, time.monotonic() - start)
         with folder_written_whole(self.out) as folder:
-            self._write(folder, posterior)
+            self._write(folder, posterior, KIND)
         terminal.say(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
-
-    def _system(self, dataset: Dataset) -> MechanicalSystem:
-        """What is known: the dataset's own system, with what the options replace."""
-        from forcegp.mechanics import MechanicalSystem
-        from forcegp.robots import Robot
-
-        contacts = parse_contacts(self.contact)
-        system = dataset.system
-        if self.robot is not None:
-            robot = Robot.from_urdf(self.robot) if system is None else _robot_like(system.robot, self.robot)
-            if robot.joint_names != tuple(dataset.joint_names):
-                raise InvalidInput(
-                    f"{self.robot} has joints {', '.join(robot.joint_names)}; {self.data} has "
-                    f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
-                )
-            system = MechanicalSystem(robot) if system is None else system.with_robot(robot)
-        if system is None:
-            raise InvalidInput(
-                f"{self.data} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
-            )
-        if self.contact:
-            system = system.with_contacts(contacts)
-        if self.known_force:
-            system = _with_known_forces(system, self.known_force)
-        return system
-
-    def _write(self, folder: Path, posterior: StructuredPosterior) -> None:
-        from forcegp.models import save_posterior
-
-        save_posterior(posterior, folder)
-        options = {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
-            if name not in ("json", "debug", "overwrite")
-        }
-        data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
-        write_config(folder, KIND, {"options": options, "data": data, "resolved": dict(posterior.settings)})
 
 
 def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> StructuredPosterior:

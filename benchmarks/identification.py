@@ -1,0 +1,70 @@
+"""How well are mass and centre of mass of the tool found, and do the standard errors tell the truth?
+
+One line per seed: errors of the mass (g) and of the centre of mass (mm), each also in standard errors.
+
+    python benchmarks/identification.py --points 100 --seeds 11 12 13
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+
+import torch
+
+from forcegp import KukaSurfaceConfig, StructuredGP, simulate_kuka_surface
+from forcegp.errors import NumericalWarning
+from forcegp.inference import OptimizerOptions
+from forcegp.robots import parameters_from_physical
+from forcegp.simulation.kuka_description import TOOL_LINK
+
+TOO_HEAVY = 0.5
+"""kg"""
+TOO_FAR = (0.05, 0.05, -0.03)
+"""m"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", type=int, default=300)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[11])
+    parser.add_argument("--iterations", type=int, default=60)
+    parser.add_argument("--mean", choices=["analytical", "zero"], default="analytical")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("always", NumericalWarning)
+    covered, count = torch.zeros(4), 0
+    for seed in given.seeds:
+        data = simulate_kuka_surface(KukaSurfaceConfig(seconds=100, seed=seed))
+        assert data.system is not None
+        link = data.system.robot.link(TOOL_LINK)
+        mass, center, inertia = (torch.tensor(x).double() for x in (link.mass, link.center_of_mass, link.inertia))
+        wrong = parameters_from_physical(mass + TOO_HEAVY, center + torch.tensor(TOO_FAR).double(), inertia)
+        robot = data.system.robot.with_inertials({TOOL_LINK: wrong})
+        begin = time.process_time()
+        posterior = StructuredGP(data.system.with_robot(robot), mean=given.mean).fit(
+            data,
+            points=given.points,
+            restarts=1,
+            learn=robot.link(TOOL_LINK).inertial("mass", "com"),
+            options=OptimizerOptions(iterations=given.iterations),
+        )
+        fitted = time.process_time()
+        found = posterior.identification
+        assert found is not None
+        standard = torch.tensor(list(found.standard_errors.values()))
+        known = time.process_time()
+        error = torch.tensor(list(found.values.values())).double() - torch.cat([mass[None], center])
+        covered, count = covered + ((error / standard).abs() <= 1.96), count + 1
+        shown = " ".join(f"{1e3 * e:+.4f} ({e / s:+.2f})" for e, s in zip(error, standard, strict=True))
+        print(
+            f"seed {seed}: {shown}; {len(found.history) - 1} iterations, {fitted - begin:.1f} s CPU, "
+            f"standard errors {known - fitted:.1f} s",
+            flush=True,
+        )
+    print("in the 95 % interval:", ", ".join(f"{int(c)} of {count}" for c in covered))
+
+
+if __name__ == "__main__":
+    main()

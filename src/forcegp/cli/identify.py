@@ -1,0 +1,138 @@
+"""`forcegp identify`: estimate masses, inertias and friction coefficients along with the unknown forces."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+from forcegp.cli.command import Debug, Json
+from forcegp.cli.fit import FitOptions, fit, fit_summary, resolved_noise
+from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.models import Identification
+
+KIND = "forcegp identify"
+COEFFICIENT_NAMES = ("viscous-joint-friction.", "coulomb-joint-friction.", "armature.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identify(FitOptions):
+    """Estimate physical parameters of the robot along with the unknown forces, and say how sure they are.
+
+    The estimates start from the URDF and always belong to a body that can exist. The folder holds the model as
+    `forcegp fit` writes it, identified.urdf and identification.json.
+
+    For instance:
+      forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
+      forcegp identify log.h5 --robot arm.urdf --learn tool:mass,com,inertia --learn viscous-joint-friction=0.1
+        --noise learned --out identified
+    """
+
+    learn: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LINK:PARTS|FORCE", help_behavior_hint="")]
+    """What to estimate (repeatable): LINK:PARTS with parts out of mass, com (centre of mass) and inertia, or
+    viscous-joint-friction, coulomb-joint-friction, armature: of all joints, or of FORCE:JOINT,JOINT; from the URDF's
+    coefficients, or from FORCE=START."""
+    model: Literal["structured", "analytical"] = "structured"
+    """structured: Gaussian processes carry the forces that nobody knows. analytical: there are none but noise."""
+    prior_strength: Annotated[float, arg(metavar="W", help_behavior_hint="(default: 0, no prior)")] = 0.0
+    """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
+    restarts: Annotated[int, arg(metavar="R")] = 1
+    """Starts of the search; the best is kept."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Identify and save."""
+        if self.seed < 0:
+            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
+        if self.model == "analytical" and self.mean == "zero":
+            raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
+        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        learn = parse_learn(self.learn)
+        from forcegp.data import Dataset
+        from forcegp.inference import OptimizerOptions
+        from forcegp.models import StructuredGP
+        from forcegp.priors import JointForces, NoForces
+
+        begin = time.monotonic()
+        dataset = Dataset.load(self.data)
+        system, added = with_learned_forces(self._system(dataset), learn)
+        prior = NoForces() if self.model == "analytical" else JointForces()
+        model = StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset))
+        posterior = fit(
+            terminal,
+            model,
+            dataset,
+            name="identifying",
+            points=min(self.points, len(dataset)),
+            restarts=self.restarts if self.model == "structured" else 1,  # without processes all starts are the same
+            seed=self.seed,
+            jobs=self.jobs,
+            hyperprior=self.hyperprior,
+            options=OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
+            learn=learn,
+            prior_strength=self.prior_strength,
+        )
+        assert posterior.identification is not None
+        with terminal.progress("standard errors") as report:
+            found = replace(posterior.identification, progress=report)
+            content = found.to_dict()
+        summary = fit_summary(posterior, time.monotonic() - begin)
+        with folder_written_whole(self.out) as folder:
+            told = json.dumps(content, indent=1, allow_nan=False) + "\n"
+            urdf = posterior.system.robot.to_urdf()
+            self._write(folder, posterior, KIND, {"identification.json": told, "identified.urdf": urdf})
+        for name in added:
+            terminal.note(f"{name} was not among the known forces, and is now.")
+        terminal.say(*_report(self, found, summary))
+        del content["history"]
+        return {"run": str(self.out), "data": str(self.data), **summary, **content}
+
+
+def _report(command: Identify, found: Identification, summary: Mapping[str, Any]) -> list[Any]:
+    from rich.text import Text
+
+    from forcegp.cli.tables import NONE, columns
+
+    rows, owner = [], None
+    for name, unit in found.units.items():
+        unit, factor = ("mm", 1e3) if unit == "m" else (unit, 1.0)
+        start, value, error = (factor * each[name] for each in (found.start, found.values, found.standard_errors))
+        digits = _digits(error, value)
+        low, high = (factor * end for end in found.intervals[name])
+        interval = f"{low:.{digits}f} … {high:.{digits}f}" if math.isfinite(error) else NONE
+        of, part = _owner_and_part(name)
+        rows += [[of]] if of != owner else []
+        owner = of
+        rows.append([f"  {part}", f"{start:.{digits}f}", f"{value:.{digits}f}", f"{error:.2g}", interval, unit])
+    title = f"{command.out}: identified from {summary['points']} points, with kernels and noise free to follow"
+    table = columns(title, ["parameter", "start", "identified", "std.\nerror", "95 % interval", "unit"], rows)
+    state = summary["status"] if summary["converged"] else f"not converged: {summary['status']}"
+    search = f"{summary['iterations']} iterations, {summary['cpu_seconds']:.1f} s CPU, {state}."
+    last = f"Wrote {command.out / 'identified.urdf'}. Next: forcegp evaluate {command.out} TEST.h5"
+    return [table, Text(found.verdict), Text(search), Text(last)]
+
+
+def _owner_and_part(name: str) -> tuple[str, str]:
+    """Link or force, and part or joint."""
+    if name.startswith(COEFFICIENT_NAMES):
+        owner, _, part = name.partition(".")
+        return owner, part
+    pieces = name.rsplit(".", 1 if name.endswith(".mass") else 2)
+    return pieces[0], ".".join(pieces[1:])
+
+
+def _digits(error: float, value: float) -> int:
+    """Decimals that show two digits of the standard error, and four of the value where there is none."""
+    size = error if 0.0 < error < math.inf else 1e-3 * abs(value)
+    return min(9, max(0, 1 - math.floor(math.log10(size)))) if size > 0.0 else 4
