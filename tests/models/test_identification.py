@@ -184,6 +184,12 @@ def test_every_iterate_of_a_structured_fit_is_kept():
     assert len(result.iterates) == len(result.history) == len(found.history)
     for point, value in zip(result.iterates, result.history, strict=True):
         assert float(found.objective(point)) == pytest.approx(value, abs=1e-9)
+    assert posterior.at_iteration(1).system.robot.link("hand").mass == pytest.approx(found.history[1]["hand.mass"])
+    last = posterior.at_iteration(len(result.history) - 1)
+    state = (data.q[:3], data.v[:3], data.u[:3])
+    assert torch.allclose(last.predict(*state).mean, posterior.predict(*state).mean, atol=1e-8)
+    with pytest.raises(InvalidInput, match=r"keep_iterates=True"):
+        posterior.at_iteration(len(result.history))
     assert posterior.settings["learned"] == [{"link": "hand", "parts": ["mass"]}]
     seen = []
     with pytest.warns(NumericalWarning, match="not ended at a minimum"):  # after 4 iterations

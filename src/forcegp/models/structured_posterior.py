@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
 from forcegp.models.noise import ACCELERATION, Noise
+from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Posterior
 from forcegp.priors import JointAccelerations, NoForces
@@ -108,6 +110,24 @@ class StructuredPosterior(Posterior):
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
         return StructuredAccelerations(self, baumgarte)
+
+    def at_iteration(self, iteration: int) -> StructuredPosterior:
+        """The posterior as it was after that iteration of the search (0: the start), its system included.
+
+        Raises InvalidInput unless the fit kept its iterates: with `learn`, or `OptimizerOptions(keep_iterates=True)`.
+        """
+        kept = self.result.iterates
+        if not 0 <= iteration < len(kept):
+            raise InvalidInput(
+                f"iteration {iteration} was not kept; there are {len(kept)}, from 0. Fit with learn=..., or with "
+                "options=OptimizerOptions(keep_iterates=True)"
+            )
+        point = {**self.parameters, **kept[iteration]}
+        z = point.pop(PHYSICAL, None)
+        model = self.model
+        if z is not None and self.identification is not None:
+            model = replace(model, system=self.identification.physical.system_at(z))
+        return model.condition(self.likelihood.training, point, self.result, self.settings)
 
     @cached_property
     def negative_log_likelihood(self) -> float:
