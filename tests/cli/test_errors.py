@@ -67,6 +67,17 @@ WRONG = [
     ("fit arm.h5", "--out"),
     ("fit arm.h5 --pionts 5 --out run", "--pionts, 5. Perhaps you meant: --points N."),
     ("fit arm.h5 --points five --out run", "--points: invalid literal for int() with base 10: 'five'"),
+    ("fit arm.h5 --model magic --out run", "'magic'"),
+    ("fit arm.h5 --model independent-gp --mean zero --out run", "--mean means nothing to --model independent-gp"),
+    ("fit arm.h5 --model analytical --prior joint --out run", "--prior means nothing to --model analytical"),
+    ("fit arm.h5 --model unconstrained --mean analytical --out run", "or choose structured."),
+    ("fit arm.h5 --model ensemble --restarts 2 --out run", "--restarts means nothing to --model ensemble"),
+    ("fit arm.h5 --model neural-network --no-hyperprior --out run", "--no-hyperprior means nothing"),
+    ("fit arm.h5 --model neural-network --noise learned --out run", "it estimates the noise where the dataset does"),
+    ("fit arm.h5 --model ensemble --noise loud --out run", "--noise is 'loud'"),
+    ("fit arm.h5 --model ensemble --points 9 --out run", "needs 10 rows; there are 9"),
+    ("fit arm.h5 --model ensemble --iterations 0 --out run", "steps=0 must be a whole number above 0"),
+    ("fit no_noise.h5 --model independent-gp --out run", "does not state its noise; add --noise"),
     ("fit arm.h5 --mean big --out run", "'big' for argument '--mean'"),
     ("evaluate missing arm.h5", "missing does not exist; give the folder that `forcegp fit --out` wrote"),
     ("evaluate mine arm.h5", "mine holds no model.json"),
@@ -78,8 +89,8 @@ WRONG = [
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
     ("simulate mars --out a.h5", "'mars'"),
     ("demo --out mine --overwrite", "was not written by `forcegp demo`"),
-    ("learn arm.h5", "Available subcommands: demo, simulate, fit, evaluate"),
-    ("", "demo, simulate, fit, evaluate"),
+    ("learn arm.h5", "Available subcommands: demo, simulate, fit, "),
+    ("", "demo, simulate, fit, "),
 ]
 
 
@@ -191,6 +202,7 @@ def test_a_program_that_calls_main_goes_on_as_it_was(folder, capfd, words):
 def test_the_report_of_a_fit_tells_how_the_search_ended(capsys, converged, status, shown):
     summary = {
         **{name: 1.0 for name in ("objective_start", "objective", "nll", "cpu_seconds", "wall_seconds")},
+        **{"model": "analytical mean", "objective_is": "nothing [nats]"},
         **{"points": 5, "iterations": 1, "evaluations": 9, "restarts": 1, "noise_std": [0.1]},
         "converged": converged,
         "status": status,

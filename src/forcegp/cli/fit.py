@@ -13,6 +13,14 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.model_choice import (
+    ITERATIONS_HINT,
+    POINTS_HINT,
+    ModelName,
+    make_model,
+    resolved,
+    search_arguments,
+)
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
 from forcegp.errors import InvalidInput
@@ -21,28 +29,22 @@ if TYPE_CHECKING:
     from forcegp.data import Dataset
     from forcegp.inference import OptimizerOptions
     from forcegp.mechanics import MechanicalSystem
-    from forcegp.models import Noise, StructuredPosterior
+    from forcegp.models import Posterior
     from forcegp.robots import Robot
 
 KIND = "forcegp fit"
-START_NOISE = 0.1
-"""Where learning the noise starts if the dataset does not state it, in rad/s^2 or m/s^2."""
 
 KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(Command):
-    """What every command asks that fits a structured model."""
+    """What every command asks that fits a model."""
 
     data: Annotated[Positional[Path], arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path, arg(metavar="RUN")]
     """The folder to write."""
-    points: Annotated[int, arg(metavar="N")] = 200
-    """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
-    mean: Literal["analytical", "zero"] = "analytical"
-    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
     restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
@@ -51,8 +53,6 @@ class FitOptions(Command):
     """Draws the starts of the search after the first."""
     jobs: Annotated[int, arg(metavar="J")] = 1
     """Processes for the restarts."""
-    iterations: Annotated[int, arg(metavar="N")] = 200
-    """Most L-BFGS iterations of each start."""
     adam_steps: Annotated[int, arg(metavar="N")] = 0
     """Adam steps before them."""
     hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
@@ -100,9 +100,7 @@ class FitOptions(Command):
             system = _with_known_forces(system, self.known_force)
         return system
 
-    def _write(
-        self, folder: Path, posterior: StructuredPosterior, kind: str, more: Mapping[str, str] | None = None
-    ) -> None:
+    def _write(self, folder: Path, posterior: Posterior, kind: str, more: Mapping[str, str] | None = None) -> None:
         """The model, `more` files by name with their text, and how it was made."""
         from forcegp.models import save_posterior
 
@@ -127,11 +125,32 @@ class Fit(FitOptions):
 
     For instance:
       forcegp fit train.h5 --points 100 --out run
+      forcegp fit train.h5 --model independent-gp --points 100 --out baseline
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
     """
 
-    prior: Literal["joint"] = "joint"
+    model: ModelName = "structured"
+    """structured: Gaussian processes on the unknown forces, inside the dynamics and contacts that are known.
+    unconstrained: on the acceleration that the robot would have without contacts. analytical: known physics alone.
+    independent-gp: one Gaussian process per joint, without physics. neural-network: one small network.
+    ensemble: several networks with variances."""
+    points: Annotated[
+        int | None,
+        arg(metavar="N", constructor=int, help_behavior_hint=POINTS_HINT),
+    ] = None
+    """Train on N rows that lie farthest apart (all rows if there are fewer). Time of a Gaussian process grows with the
+    cube of N."""
+    mean: Annotated[
+        Literal["analytical", "zero"] | None, arg(metavar="analytical|zero", help_behavior_hint="(default: analytical)")
+    ] = None
+    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
+    prior: Annotated[Literal["joint"] | None, arg(metavar="joint", help_behavior_hint="(default: joint)")] = None
     """joint: one Gaussian process per joint force, on (q, v, u)."""
+    iterations: Annotated[
+        int | None,
+        arg(metavar="N", constructor=int, help_behavior_hint=ITERATIONS_HINT),
+    ] = None
+    """Most L-BFGS iterations of each start, or training steps of a network."""
     json: Json = False
     debug: Debug = False
 
@@ -140,82 +159,52 @@ class Fit(FitOptions):
         if self.seed < 0:
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        command = resolved(self)
+        assert command.points is not None, "a resolved command has points"
         from forcegp.data import Dataset
-        from forcegp.inference import OptimizerOptions
-        from forcegp.models import StructuredGP
 
         start = time.monotonic()
         dataset = Dataset.load(self.data)
-        system = self._system(dataset)
-        model = StructuredGP(system, mean=self.mean, noise=resolved_noise(self.noise, dataset))
-        options = OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps)
-        points = min(self.points, len(dataset))
-        posterior = fit(
-            terminal,
-            model,
-            dataset,
-            points=points,
-            restarts=self.restarts,
-            seed=self.seed,
-            jobs=self.jobs,
-            hyperprior=self.hyperprior,
-            options=options,
-        )
+        model = make_model(command, self._system(dataset), dataset)
+        points = min(command.points, len(dataset))
+        posterior = fit(terminal, model, dataset, points=points, **search_arguments(command))
         summary = fit_summary(posterior, time.monotonic() - start)
         with folder_written_whole(self.out) as folder:
-            self._write(folder, posterior, KIND)
+            command._write(folder, posterior, KIND)
         terminal.say(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 
 
-def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> StructuredPosterior:
+def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> Any:
     """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
     from forcegp.models.search import default_restarts
 
-    options: OptimizerOptions = how["options"]
-    restarts = default_restarts(how["points"]) if how["restarts"] is None else how["restarts"]
-    steps = options.iterations + options.adam_steps
+    options: OptimizerOptions | None = how.get("options")  # networks have none, but steps of their own
+    steps = model.steps if options is None else options.iterations + options.adam_steps
+    wanted = how.get("restarts", 1)
+    restarts = default_restarts(how["points"]) if wanted is None else wanted
     with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
 
         def progress(restart: int, iteration: int, value: float) -> None:
             start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
-            note = f"{start}iteration {iteration}, objective {value:.1f}"
+            note = f"{start}iteration {iteration}, objective {_short(value)}"
             report(restart * steps + min(iteration, steps), restarts * steps, note)
 
-        return model.fit(dataset, **how, progress=progress if how["jobs"] == 1 else None)
+        return model.fit(dataset, **how, progress=progress if how.get("jobs", 1) == 1 else None)
 
 
-def resolved_noise(given: str, dataset: Dataset) -> Noise | None:
-    """The model's noise for `learned`, `dataset` or a number. Raises InvalidInput for anything else."""
-    from forcegp.models import Noise
-
-    stated = None if dataset.noise_std is None else tuple(float(std) for std in dataset.noise_std)
-    if given == "learned":
-        return Noise(stated or START_NOISE, learn=True)
-    if given == "dataset":
-        if stated is None:
-            raise InvalidInput(
-                "the dataset does not state its noise; add --noise learned, or --noise SIGMA if it is known."
-            )
-        return None
-    try:
-        sigma = float(given)
-    except ValueError:
-        raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
-    return Noise(sigma)
-
-
-def fit_summary(posterior: StructuredPosterior, wall_seconds: float) -> dict[str, Any]:
+def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
     result = posterior.result
     return {
-        "points": len(posterior.likelihood.training.q),
-        "mean": posterior.model.mean,
+        "model": posterior.description,
+        "objective_is": posterior.objective,
+        "points": len(posterior.training.q),
         "objective_start": result.history[0],
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
-        "restarts": posterior.settings["restarts"],
-        "iterations": len(result.history) - 1,
+        "restarts": posterior.settings.get("restarts", 1),
+        "iterations": len(result.history) - 1 if "optimizer" in posterior.settings else result.evaluations,
         "evaluations": result.evaluations,
         "converged": result.converged,
         "status": result.status,
@@ -254,10 +243,11 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     noise = summary["noise_std"]
     shown = f"{noise[0]:.4g}" if len(set(noise)) == 1 else " ".join(f"{std:.3g}" for std in noise)
     status = summary["status"]  # names failed evaluations, too, and the number of starts
+    unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
-        f"{run}: learned from {summary['points']} points",
+        f"{run}: {summary['model']}, learned from {summary['points']} points",
         {
-            "objective": f"{summary['objective_start']:.1f} → {summary['objective']:.1f} nats",
+            "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",
             "negative log likelihood": f"{summary['nll']:.1f} nats",
             "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
             "search": status if summary["converged"] else f"not converged: {status}",
@@ -266,3 +256,8 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
         },
     )
     return [table, f"Next: forcegp evaluate {run} TEST.h5"]
+
+
+def _short(value: float) -> str:
+    """One decimal for nats of a likelihood, three digits for small losses."""
+    return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.fit import FitOptions, fit, fit_summary, resolved_noise
+from forcegp.cli.fit import FitOptions, fit, fit_summary
 from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
+from forcegp.cli.model_choice import resolved_noise
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder
 from forcegp.errors import InvalidInput
@@ -46,6 +47,12 @@ class Identify(FitOptions):
     """structured: Gaussian processes carry the forces that nobody knows. analytical: there are none but noise."""
     prior_strength: Annotated[float, arg(metavar="W", help_behavior_hint="(default: 0, no prior)")] = 0.0
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
+    points: Annotated[int, arg(metavar="N")] = 200
+    """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
+    mean: Literal["analytical", "zero"] = "analytical"
+    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
+    iterations: Annotated[int, arg(metavar="N")] = 200
+    """Most L-BFGS iterations of each start."""
     restarts: Annotated[int, arg(metavar="R")] = 1
     """Starts of the search; the best is kept."""
     json: Json = False

@@ -1,0 +1,124 @@
+"""`--model`: which model a name stands for, which options mean something to it, and what they are by default."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.cli.fit import Fit
+    from forcegp.data import Dataset
+    from forcegp.mechanics import MechanicalSystem
+    from forcegp.models import Model, Noise
+
+ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
+
+NETWORKS = ("neural-network", "ensemble")
+SEARCHED = ("structured", "unconstrained", "independent-gp")
+"""Models with kernels, whose parameters are searched for from several starts."""
+
+MEANT_FOR: Mapping[str, tuple[str, ...]] = {
+    "mean": ("structured",),
+    "prior": ("structured",),
+    "restarts": SEARCHED,
+    "jobs": SEARCHED,
+    "adam_steps": (*SEARCHED, "analytical"),
+    "hyperprior": (*SEARCHED, "analytical"),
+}
+"""Options that mean nothing to some models -> those to which they do."""
+
+POINTS, NETWORK_POINTS = 200, 10_000
+POINTS_HINT = f"(default: {POINTS}; networks {NETWORK_POINTS})"
+ITERATIONS = 200
+ITERATIONS_HINT = f"(default: {ITERATIONS}; networks 5000, ensembles 3000)"
+START_NOISE = 0.1
+"""Where learning the noise starts if the dataset does not state it, in rad/s^2 or m/s^2."""
+
+
+def resolved(command: Fit) -> Fit:
+    """The command with the defaults of its model. Raises InvalidInput for options that mean nothing to it."""
+    defaults = {field.name: field.default for field in fields(command)}
+    for name, models in MEANT_FOR.items():
+        if command.model not in models and getattr(command, name) != defaults[name]:
+            flag = name.replace("_", "-") if name != "hyperprior" else "no-hyperprior"
+            raise InvalidInput(
+                f"--{flag} means nothing to --model {command.model}; leave it out, or choose {' or '.join(models)}."
+            )
+    if command.model in NETWORKS and command.noise == "learned":
+        raise InvalidInput(
+            f"--noise learned means nothing to --model {command.model}: it estimates the noise where the dataset does "
+            "not state it; leave --noise out, or give SIGMA."
+        )
+    network = command.model in NETWORKS
+    changes: dict[str, Any] = {}
+    if command.points is None:
+        changes["points"] = NETWORK_POINTS if network else POINTS
+    if command.iterations is None and not network:
+        changes["iterations"] = ITERATIONS
+    if command.model == "structured":
+        changes |= {"mean": command.mean or "analytical", "prior": command.prior or "joint"}
+    return replace(command, **changes)
+
+
+def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Model:
+    """The model of a resolved command."""
+    from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, StructuredGP
+    from forcegp.priors import JointAccelerations, NoForces
+
+    if command.model in NETWORKS:
+        noise = _known_noise(command.noise, dataset)
+        steps = {} if command.iterations is None else {"steps": command.iterations}
+        return (NeuralNetwork if command.model == "neural-network" else NetworkEnsemble)(system, noise, **steps)
+    noise = resolved_noise(command.noise, dataset)
+    if command.model == "independent-gp":
+        return IndependentGP(system, noise=noise)
+    if command.model == "unconstrained":
+        return StructuredGP(system, JointAccelerations(), "zero", noise)
+    if command.model == "analytical":
+        return StructuredGP(system, NoForces(), "analytical", noise)
+    assert command.mean is not None, "a resolved command has a mean"
+    return StructuredGP(system, mean=command.mean, noise=noise)
+
+
+def search_arguments(command: Fit) -> dict[str, Any]:
+    """What `fit` of the model of a resolved command takes besides the data and the points."""
+    from forcegp.inference import OptimizerOptions
+
+    if command.model in NETWORKS:
+        return {"seed": command.seed}
+    assert command.iterations is not None, "a resolved command has iterations"
+    return {
+        "seed": command.seed,
+        "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
+        "jobs": command.jobs,
+        "hyperprior": command.hyperprior,
+        "options": OptimizerOptions(iterations=command.iterations, adam_steps=command.adam_steps),
+    }
+
+
+def resolved_noise(given: str, dataset: Dataset) -> Noise | None:
+    """The model's noise for `learned`, `dataset` or a number. Raises InvalidInput for anything else."""
+    from forcegp.models import Noise
+
+    stated = None if dataset.noise_std is None else tuple(float(std) for std in dataset.noise_std)
+    if given == "learned":
+        return Noise(stated or START_NOISE, learn=True)
+    if given == "dataset":
+        if stated is None:
+            raise InvalidInput(
+                "the dataset does not state its noise; add --noise learned, or --noise SIGMA if it is known."
+            )
+        return None
+    try:
+        sigma = float(given)
+    except ValueError:
+        raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
+    return Noise(sigma)
+
+
+def _known_noise(given: str, dataset: Dataset) -> Noise | None:
+    """A network's noise: None where neither SIGMA nor the dataset tells, for then it estimates it."""
+    return None if given == "dataset" and dataset.noise_std is None else resolved_noise(given, dataset)
