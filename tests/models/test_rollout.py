@@ -208,3 +208,35 @@ def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, st
     with pytest.raises(InvalidInput, match="has no contacts; give baumgarte=None"):
         free.rollout(q, v, u, DT, baumgarte=Baumgarte(1.0))
     assert free.rollout(q, v, u, DT, integrator="projected").constraint.shape == (2, STEPS + 1, 0)
+
+
+def test_feedback_is_added_to_the_forces_of_its_step(posterior, start):
+    q, v, u = start
+    gains = torch.linspace(0.5, 2.0, STEPS, dtype=torch.float64)
+    rollout = posterior.rollout(q, v, 0.0 * u, DT, feedback=lambda k, q, v: u[:, k] - gains[k] * v)
+    applied = u - gains[:, None] * rollout.v[:, :-1]  # symplectic Euler asks once per step, at its beginning
+    same = posterior.rollout(q, v, applied, DT)
+    torch.testing.assert_close(rollout.q, same.q, rtol=1e-12, atol=1e-12)
+    without = posterior.rollout(q, v, u, DT)
+    assert not torch.allclose(rollout.v, without.v, atol=1e-6)
+
+
+def test_feedback_sees_the_batch_dimensions_of_the_motions(posterior, start):
+    q, v, u = start
+    seen = set()
+
+    def feedback(k, q, v):
+        seen.add((tuple(q.shape), tuple(v.shape)))
+        return torch.zeros_like(q)
+
+    with_feedback = posterior.rollout(q, v, u, DT, feedback=feedback, samples=3, seed=1)
+    assert seen == {((2, 3), (2, 3)), ((3, 2, 3), (3, 2, 3))}
+    plain = posterior.rollout(q, v, u, DT, samples=3, seed=1)
+    torch.testing.assert_close(with_feedback.q, plain.q)
+    torch.testing.assert_close(with_feedback.samples.q, plain.samples.q)
+
+
+def test_feedback_of_another_shape_is_refused(posterior, start):
+    q, v, u = start
+    with pytest.raises(InvalidInput, match=r"feedback gave \(3,\) at step 0; it must give a tensor \(2, 3\)"):
+        posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: torch.zeros(3).double())

@@ -11,13 +11,14 @@ from forcegp.integration.integrators import (
     SymplecticEuler,
     integrator_named,
 )
-from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, integrate
+from forcegp.integration.trajectory import SPEED_LIMIT, Feedback, Trajectory, integrate
 
 __all__ = [
     "INTEGRATORS",
     "SPEED_LIMIT",
     "Acceleration",
     "ConstraintManifold",
+    "Feedback",
     "Integrator",
     "Projected",
     "ProjectedPosition",

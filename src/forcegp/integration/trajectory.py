@@ -18,6 +18,10 @@ SPEED_LIMIT = 100.0
 """A motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast."""
 
 
+Feedback = Callable[[int, Tensor, Tensor], Tensor]
+"""(k, q, v) -> what a controller adds to u[k] there, of the shape of q; asked wherever the integrator asks for a."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """n motions of T steps: q, v (T+1, n, nv) and a (T, n, nv), the acceleration at the beginning of each step.
@@ -40,10 +44,11 @@ def integrate(
     u: Float[Tensor, "steps n nv"],
     dt: float,
     *,
+    feedback: Feedback | None = None,
     what: str = "motions",
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
-    """Carry n states through T steps of `dt` seconds; u[k] acts from row k to row k + 1.
+    """Carry n states through T steps of `dt` seconds; u[k] + feedback(k, q, v) acts from row k to row k + 1.
 
     A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that cannot be kept on its
     constraint, ends there: the rest of it is NaN, `diverged_at` tells the row, and a NumericalWarning says so. The
@@ -67,7 +72,7 @@ def integrate(
     off_constraint = torch.zeros(n, dtype=torch.bool, device=q.device)
     alive = torch.ones(n, dtype=torch.bool, device=q.device)
     for k in range(steps):
-        step = integrator.step(_at_finite_states(acceleration, q, v, u[k]), q, v, dt)
+        step = integrator.step(_at_finite_states(_under(acceleration, u[k], feedback, k), q, v), q, v, dt)
         rows_a[k] = torch.where(alive[:, None], step.a, math.nan)
         bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
         good = alive & bounded & step.on_constraint
@@ -90,16 +95,23 @@ def integrate(
     return Trajectory(rows_q, rows_v, rows_a, diverged_at)
 
 
-def _at_finite_states(
-    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], q0: Tensor, v0: Tensor, u: Tensor
+def _under(
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], u: Tensor, feedback: Feedback | None, k: int
 ) -> Acceleration:
-    """a(q, v) under u, which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
+    """a(q, v) under the forces of step k."""
+    if feedback is None:
+        return lambda q, v: acceleration(q, v, u)
+    return lambda q, v: acceleration(q, v, u + feedback(k, q, v))
+
+
+def _at_finite_states(acceleration: Acceleration, q0: Tensor, v0: Tensor) -> Acceleration:
+    """a(q, v), which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
 
     def guarded(q: Tensor, v: Tensor) -> Tensor:
         finite = (torch.isfinite(q) & torch.isfinite(v)).all(-1, keepdim=True)
         if bool(finite.all()):
-            return acceleration(q, v, u)
-        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)
+            return acceleration(q, v)
+        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0)), math.nan)
 
     return guarded
 

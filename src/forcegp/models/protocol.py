@@ -16,6 +16,7 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizationResult
+from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
 from forcegp.models.marginal_likelihood import TrainingData
@@ -135,6 +136,7 @@ class Posterior(ABC):
         *,
         integrator: str = "symplectic-euler",
         baumgarte: Baumgarte | None = None,
+        feedback: Feedback | None = None,
         samples: int = 0,
         seed: int = 0,
         progress: Callable[[int, int], None] | None = None,
@@ -149,6 +151,9 @@ class Posterior(ABC):
         integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order) or "projected"
             (second order; contacts hold exactly after every step, also in the first state, which is moved onto them).
         baumgarte: stabilisation in this rollout, instead of the one in `system`; None for none.
+        feedback: a controller that adds to u: feedback(k, q, v) -> (..., nv) in Nm or N at step k, with the batch
+            dimensions of the motions (those of q0, for sampled motions after one for the samples). Without one the
+            motion is open loop, where small errors of a model grow as the robot lets them.
         samples: also integrate this many functions drawn from the posterior, by pathwise conditioning; `seed` draws
             them.
         progress: called as progress(step, steps).
@@ -157,7 +162,8 @@ class Posterior(ABC):
         Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be projected.
         """
         model = self.accelerations(baumgarte)
-        return roll_out(model, q0, v0, u, dt, integrator=integrator, samples=samples, seed=seed, progress=progress)
+        how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed}
+        return roll_out(model, q0, v0, u, dt, **how, progress=progress)
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.integration import ConstraintManifold, Trajectory, integrate, integrator_named
+from forcegp.integration import ConstraintManifold, Feedback, Trajectory, integrate, integrator_named
 from forcegp.mechanics import Baumgarte
 from forcegp.models.accelerations import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
@@ -90,6 +90,7 @@ def roll_out(
     dt: float,
     *,
     integrator: str = "symplectic-euler",
+    feedback: Feedback | None = None,
     samples: int = 0,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -106,15 +107,24 @@ def roll_out(
     total = steps * (1 + bool(samples))
     with torch.no_grad(), blas_threads(0):
         report = None if progress is None else lambda done, _: progress(done, total)
-        mean = integrate(method, model.mean(), q, v, forces, dt, what="rollouts", progress=report)
+        control = None if feedback is None else _flat_feedback(feedback, batch)
+        mean = integrate(method, model.mean(), q, v, forces, dt, feedback=control, what="rollouts", progress=report)
         drawn = None
         if samples:
             later = None if progress is None else lambda done, _: progress(steps + done, total)
             function = _by_sample(model.sampled(samples, seed), samples)
             many = q.repeat(samples, 1), v.repeat(samples, 1)
             repeated = forces.repeat(1, samples, 1)
+            control = None if feedback is None else _flat_feedback(feedback, (samples, *batch))
             sampled = integrate(
-                method, function, many[0], many[1], repeated, dt, what="sampled rollouts", progress=later
+                method,
+                function,
+                *many,
+                repeated,
+                dt,
+                feedback=control,
+                what="sampled rollouts",
+                progress=later,
             )
             drawn = runs.rollout(sampled, many[0], many[1], (samples, *batch), None)
         return runs.rollout(mean, q, v, batch, drawn)
@@ -159,6 +169,20 @@ class _Runs:
         parts = [manifold.violation(*block) for block in zip(*flat, strict=True)]
         c, rate = (torch.cat(part).reshape(*q.shape[:-1], -1) for part in zip(*parts, strict=True))
         return c, rate
+
+
+def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
+    """Feedback that sees the caller's batch dimensions as one of (n, nv). Raises InvalidInput for other shapes."""
+
+    def flat(k: int, q: Tensor, v: Tensor) -> Tensor:
+        shape = (*batch, q.shape[-1])
+        added = feedback(k, q.reshape(shape), v.reshape(shape))
+        if not isinstance(added, Tensor) or added.shape != shape:
+            given = tuple(added.shape) if isinstance(added, Tensor) else type(added).__name__
+            raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as its q and v.")
+        return added.reshape(q.shape)
+
+    return flat
 
 
 def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
