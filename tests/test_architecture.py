@@ -26,6 +26,18 @@ ROOMS = {
     "models": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration"},
     "simulation": {"errors", "robots", "mechanics", "data"},
     "evaluation": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration", "models"},
+    "experiments": {
+        "errors",
+        "robots",
+        "mechanics",
+        "data",
+        "priors",
+        "inference",
+        "integration",
+        "models",
+        "simulation",
+        "evaluation",
+    },
     "cli": {
         "errors",
         "robots",
@@ -37,6 +49,7 @@ ROOMS = {
         "models",
         "simulation",
         "evaluation",
+        "experiments",
     },
 }
 

@@ -15,6 +15,7 @@ from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
+from forcegp.cli.reproduce import Reproduce
 from forcegp.cli.rollout import Rollout
 from forcegp.cli.simulate import Simulate
 from forcegp.errors import InvalidInput
@@ -39,6 +40,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
+    "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
 }
 """A new command is a file with a subclass of Command, and an entry here."""
 

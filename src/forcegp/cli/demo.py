@@ -25,6 +25,7 @@ from forcegp.cli.whole_folders import (
     write_json,
 )
 from forcegp.errors import InvalidInput
+from forcegp.experiments import published
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
@@ -39,10 +40,10 @@ MODELS = {"S-GP": ("s-gp", "zero"), "S-GP + analytical mean": ("s-gp-analytical-
 """Name in the paper -> (folder, mean)."""
 
 PUBLISHED_MAE = {
-    "S-GP": {100: 0.5856, 200: 0.2092, 400: 0.1193, 600: 0.1049, 800: 0.1006, 1000: 0.0977},
-    "S-GP + analytical mean": {100: 0.1051, 200: 0.0936, 400: 0.0868, 600: 0.0855, 800: 0.0847, 1000: 0.0844},
+    name: dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[place], strict=True))
+    for name, place in (("S-GP", "s-gp"), ("S-GP + analytical mean", "s-gp-mean"))
 }
-"""Mean absolute error against noisy accelerations by number of points (Rath, Geist, Trimpe 2021, figure 2b)."""
+"""Mean absolute error against noisy accelerations by number of points."""
 
 
 @dataclass(frozen=True, kw_only=True)

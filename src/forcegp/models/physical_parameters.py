@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.errors import InvalidInput, NumericalError, UnknownJoint, unknown_name_message
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.marginal_likelihood import COEFFICIENTS, INERTIALS
 from forcegp.robots import LinkInertia, physical_from_parameters
@@ -32,6 +32,9 @@ PHYSICAL = "physical"
 
 ALPHA, DIAGONAL, OFF_DIAGONAL, CENTER = 0, slice(1, 4), slice(4, 7), slice(7, 10)
 ROW_OF_OFF_DIAGONAL = (0, 1, 0)  # s12, s23, s13
+FARTHEST = 25.0
+"""Largest scaled parameter: a factor of 7e10 on a mass or coefficient, 25 radii of gyration for a centre of mass."""
+
 SIZES = {"mass": 1, "com": 3, "inertia": 6}
 MOMENTS = {"xx": (0, 0), "xy": (0, 1), "xz": (0, 2), "yy": (1, 1), "yz": (1, 2), "zz": (2, 2)}
 COEFFICIENT_UNITS = {
@@ -208,7 +211,14 @@ class PhysicalParameters:
         """The parameters that `MarginalLikelihood` understands, differentiable in z.
 
         Coefficients of one force that are learned in several groups are joined.
+        Raises NumericalError for values beyond `FARTHEST`, so that a search turns back: data that say nothing about a
+        parameter let it run away.
         """
+        farthest = float((self.transform @ z).detach().abs().amax()) if len(z) else 0.0
+        if not farthest <= FARTHEST:
+            raise NumericalError(
+                f"a physical parameter is a factor of e^{farthest:.3g} (or radii of gyration) from its start"
+            )
         out: dict[str, Tensor] = {}
         for group, s in self._split(z):
             for name, value in group.tensors(s).items():

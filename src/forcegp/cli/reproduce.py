@@ -1,0 +1,70 @@
+"""`forcegp reproduce`: every figure and number of the paper, from one command."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.terminal import Terminal
+from forcegp.errors import InvalidInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce(Command):
+    """Compute figures of Rath, Geist, Trimpe (2021), with error bars, beside the published values.
+
+    FIGURE is fig2b, fig2c, fig3, fig4, extrapolation, ablation or all. Every finished piece of work is kept in the
+    folder; after an interruption the same command goes on from there.
+
+    For instance:
+      forcegp reproduce all --preset smoke
+      forcegp reproduce fig2b --preset paper --jobs 2
+      forcegp reproduce fig2b --points 50 100 --seeds 7 8 --out my-curves
+    """
+
+    figure: Annotated[Positional[str], arg(metavar="FIGURE")]
+    """Which figure, or all."""
+    preset: Annotated[str, arg(metavar="smoke|paper")] = "smoke"
+    """smoke: small, in a few minutes, to see that everything works. paper: the full experiments, CPU-hours."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reproduction-PRESET)")] = None
+    """The folder of results; an unfinished one is gone on with."""
+    docs: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: only into --out)")] = None
+    """Write the page reproduction.md, its figures, JSON and CSV into this folder, too."""
+    points: Annotated[tuple[int, ...], arg(metavar="N", help_behavior_hint="(default: the preset's)")] = ()
+    """Other numbers of training points."""
+    seeds: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: the preset's)")] = ()
+    """Other trajectories."""
+    jobs: Annotated[int, arg(metavar="J", help_behavior_hint="(default: as many as cores)")] = 0
+    """Pieces of work at once, each on one core."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Compute what is missing and write all summaries."""
+        if self.jobs < 0:
+            raise InvalidInput(f"--jobs is {self.jobs}; give at least 1.")
+        if any(seed < 0 for seed in self.seeds):
+            raise InvalidInput(f"--seeds are {self.seeds}; give numbers of at least 0.")
+        from forcegp.experiments.presets import experiments_of
+        from forcegp.experiments.reproduction import BESIDE, PAGE, reproduce
+
+        start = time.monotonic()
+        experiments = experiments_of(self.preset, self.figure)
+        if self.points:
+            experiments = tuple(experiment.with_points(self.points) for experiment in experiments)
+        if self.seeds:
+            experiments = tuple(experiment.with_seeds(self.seeds) for experiment in experiments)
+        out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
+        jobs = self.jobs or os.cpu_count() or 1
+        with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
+            summaries = reproduce(experiments, self.preset, out, docs=self.docs, jobs=jobs, progress=report)
+        terminal.say(f"{out / PAGE} tells what was found; figures, JSON and CSV lie in {out / BESIDE}.")
+        terminal.note(f"{time.monotonic() - start:.0f} s")
+        return {"out": str(out), "preset": self.preset, "figures": summaries}

@@ -1,0 +1,123 @@
+"""What every experiment is: a typed configuration that knows its cells, its summary, its figures and its words."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from forcegp.errors import InvalidInput
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.data import data_cell
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Row = dict[str, str | int | float | None]
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """Trajectories of `kuka-surface`: `rows` training rows by farthest-point sampling, every `every`-th test row."""
+
+    train_seconds: float
+    rows: int
+    test_seconds: float
+    every: int
+
+    def cell(self, seed: int) -> Cell:
+        """The cell with the trajectories of this seed."""
+        return data_cell(seed, **dataclasses.asdict(self))
+
+
+class Experiment(ABC):
+    """A frozen dataclass whose fields are the configuration; among them `data` and `points`, one number or several."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+
+    data: Any
+    points: Any
+
+    def with_points(self, points: Sequence[int]) -> Experiment:
+        """The same with other numbers of training points; an experiment at one number takes the largest."""
+        given = tuple(sorted(set(points)))
+        return dataclasses.replace(self, points=given[-1] if isinstance(self.points, int) else given)  # type: ignore[type-var]
+
+    def with_seeds(self, seeds: Sequence[int]) -> Experiment:
+        """The same on other trajectories."""
+        given = tuple(dict.fromkeys(seeds))
+        changed = {"seed": given[0], "seeds": given, "seeds_many_points": given}
+        names = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return dataclasses.replace(self, **{name: value for name, value in changed.items() if name in names})  # type: ignore[type-var]
+
+    def require_possible(self) -> None:
+        """Raise InvalidInput for numbers of points that the data do not have."""
+        points = (self.points,) if isinstance(self.points, int) else self.points
+        for count in points:
+            if not 2 <= count <= self.data.rows:
+                raise InvalidInput(
+                    f"{self.name} is asked for {count} training points; its data have {self.data.rows} rows, so give "
+                    f"2 to {self.data.rows}."
+                )
+
+    @abstractmethod
+    def cells(self) -> list[Cell]:
+        """Everything that has to be computed, with the cells that several experiments share."""
+
+    @abstractmethod
+    def summary(self, results: Results) -> dict[str, Any]:
+        """What the finished cells say, as plain JSON values."""
+
+    @abstractmethod
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        """The summary as a flat table, for CSV."""
+
+    @abstractmethod
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        """File name without ending -> figure."""
+
+    @abstractmethod
+    def section(self, summary: Mapping[str, Any]) -> str:
+        """Markdown for docs/reproduction.md, without title and pictures; every number comes from the summary."""
+
+    def config(self) -> dict[str, Any]:
+        """The configuration as plain JSON values."""
+        return dataclasses.asdict(self)  # type: ignore[call-overload]  # every experiment is a dataclass
+
+
+def spread(values: Iterable[float | None]) -> dict[str, Any] | None:
+    """Median and range over seeds, with the values; None where there are none (or not for every seed)."""
+    given = list(values)
+    if not given or any(value is None for value in given):
+        return None
+    numbers = [float(value) for value in given if value is not None]
+    return {"median": statistics.median(numbers), "min": min(numbers), "max": max(numbers), "values": numbers}
+
+
+def shown(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
+    """`.0831 (.0825–.0847)` of a spread, `.0831` of a number, a dash of nothing."""
+    if value is None:
+        return "–"
+    if isinstance(value, Mapping):
+        if len(value["values"]) == 1:
+            return number(value["median"], digits)
+        return f"{number(value['median'], digits)} ({number(value['min'], digits)}–{number(value['max'], digits)})"
+    return number(value, digits)
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number of ordinary size with that many decimals, others as a power of ten."""
+    if value == 0 or 10.0**-digits * 5 <= abs(value) < 1e4:
+        return f"{value:.{digits}f}"
+    return f"{value:.1e}"
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """First column left, the others right."""
+    lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])

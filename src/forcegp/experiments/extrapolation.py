@@ -1,0 +1,141 @@
+"""Extrapolation: trained in one half of the workspace (and slowly), tested in the other (and faster)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from typing_extensions import override
+
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
+from forcegp.experiments.extrapolation_cells import REGIONS, SIDES, TEST_X, TRAIN_X
+from forcegp.experiments.fits import FitSettings, fit_cost
+from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
+TARGETS = {
+    "acceleration": "the acceleration a, which the GP learns [rad/s²]",
+    "unconstrained_acceleration": "the acceleration without constraint, which S-GP [38] learns [rad/s²]",
+    "all_forces": "all joint forces Q_K + Q_U, which S-GP without mean learns [Nm]",
+    "unknown_force": "the unknown joint force Q_U, which is left with the analytical mean [Nm]",
+}
+
+
+@dataclass(frozen=True)
+class Extrapolation(Experiment):
+    """Every Gaussian process on `points` rows, networks on all training rows of the region, five seeds."""
+
+    name: ClassVar[str] = "extrapolation"
+    title: ClassVar[str] = "Extrapolation: where structure pays"
+
+    data: DataSettings
+    points: int
+    seeds: tuple[int, ...]
+    settings: FitSettings
+    models: tuple[str, ...] = (*NETWORKS, *GAUSSIAN_PROCESSES, *ANALYTICAL)
+
+    @override
+    def cells(self) -> list[Cell]:
+        out: list[Cell] = []
+        for seed in self.seeds:
+            data = self.data.cell(seed)
+            out.append(data)
+            out.append(
+                Cell(
+                    _scale_name(seed),
+                    "forcegp.experiments.extrapolation_cells:scale",
+                    {"data": data.name},
+                    (data.name,),
+                    3.0,
+                )
+            )
+            for region in REGIONS:
+                for model in self.models:
+                    points = None if model in NETWORKS else self.points
+                    settings = {} if model in NETWORKS else self.settings.of(self.points)
+                    spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
+                    cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
+                    cell = Cell(
+                        _fit_name(model, region, seed),
+                        "forcegp.experiments.extrapolation_cells:fit",
+                        spec | settings,
+                        (data.name,),
+                        cost,
+                    )
+                    out.append(cell)
+        return out
+
+    @override
+    def summary(self, results: Results) -> dict[str, Any]:
+        regions: dict[str, Any] = {}
+        for region in REGIONS:
+            regions[region] = {}
+            for model in self.models:
+                found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
+                regions[region][model] = {
+                    side: {score: spread(cell[side][score] for cell in found) for score in SCORES} for side in SIDES
+                } | {"points": spread(cell["points"] for cell in found)}
+        scales = [results.result(_scale_name(seed)) for seed in self.seeds]
+        scale = {name: spread(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
+        return {"points": self.points, "regions": regions, "scale": scale}
+
+    @override
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        return [
+            {"region": region, "model": MODELS[model].label, "points": scores["points"]["median"], "tested": side}
+            | {
+                f"{score}_{part}": None if value is None else value[part]
+                for score, value in scores[side].items()
+                for part in ("median", "min", "max")
+            }
+            for region, models in summary["regions"].items()
+            for model, scores in models.items()
+            for side in SIDES
+        ]
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        from forcegp.experiments.extrapolation_plot import extrapolation_figure
+
+        return {"extrapolation": extrapolation_figure(summary)}
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        parts = [
+            f"Trained on {self.points} farthest points with the tool at x < {TRAIN_X} m (networks on all such rows of "
+            f"the training set), tested on other trajectories: inside (x < {TRAIN_X} m) and outside (x > {TEST_X} m). "
+            "For “faster”, training and inside rows have a tool speed below the median of the training trajectory, "
+            f"outside rows one above it. {len(self.seeds)} seeds; errors against the noise-free acceleration."
+        ]
+        header = ["model", "points", "MAE inside", "MAE outside", "NLPD outside", "coverage outside", "\\|A a − b\\|"]
+        for region, label in REGIONS.items():
+            rows = []
+            for model, scores in summary["regions"][region].items():
+                outside = scores["outside"]
+                shares = [shown(outside["nlpd"], 1), shown(outside["coverage_95"], 3)]
+                errors = [shown(scores[side]["mae_noise_free"]) for side in SIDES]
+                points = f"{scores['points']['median']:.0f}"
+                rows.append([MODELS[model].label, points, *errors, *shares, shown(outside["constraint_error"])])
+            parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table(header, rows)]
+        scale = summary["scale"]
+        parts.append(
+            "Why: what a Gaussian process does not know about it takes to be zero, so away from its data it errs by "
+            "about the size of what it was left to learn, and a force error reaches the acceleration through H, whose "
+            f"largest entry on these data is {shown(scale['largest_H'], 0)} /(kg m²). Root mean squares:"
+        )
+        parts.append(markdown_table(["what", "size"], [[text, shown(scale[key], 2)] for key, text in TARGETS.items()]))
+        return "\n\n".join(parts)
+
+
+def _fit_name(model: str, region: str, seed: int) -> str:
+    return f"extrapolation/{region}/{model}/seed{seed}"
+
+
+def _scale_name(seed: int) -> str:
+    return f"extrapolation/scale/seed{seed}"

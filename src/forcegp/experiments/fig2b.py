@@ -1,0 +1,144 @@
+"""Figure 2b: prediction and constraint error against the number of training points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from typing_extensions import override
+
+from forcegp.experiments import published
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
+from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
+from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
+HEADINGS = {
+    "mae": "MAE against noisy accelerations [rad/s²]",
+    "mae_noise_free": "MAE against noise-free accelerations [rad/s²]",
+    "constraint_error": "mean constraint error \\|A a − b\\| [m/s²]",
+    "nlpd": "negative log predictive density of a measurement [nats per row]",
+    "coverage_95": "share of measurements inside the 95 % interval",
+    "cpu_seconds": "CPU seconds of one fit, search only",
+}
+
+
+@dataclass(frozen=True)
+class Fig2b(Experiment):
+    """Every model on the first N farthest points of `seeds` trajectories; beyond `few_points`, on fewer seeds."""
+
+    name: ClassVar[str] = "fig2b"
+    title: ClassVar[str] = "Figure 2b: error against training points"
+
+    data: DataSettings
+    points: tuple[int, ...]
+    seeds: tuple[int, ...]
+    seeds_many_points: tuple[int, ...]
+    few_points: int
+    settings: FitSettings
+    models: tuple[str, ...] = GAUSSIAN_PROCESSES
+    on_all_rows: tuple[str, ...] = (*ANALYTICAL, *NETWORKS)
+
+    def seeds_of(self, points: int) -> tuple[int, ...]:
+        """The seeds of one point of the curve."""
+        return self.seeds if points <= self.few_points else self.seeds_many_points
+
+    @override
+    def cells(self) -> list[Cell]:
+        data = {seed: self.data.cell(seed) for seed in sorted({*self.seeds, *self.seeds_many_points})}
+        out = list(data.values())
+        for model in self.models:
+            for seed, cell in data.items():
+                points = [count for count in self.points if seed in self.seeds_of(count)]
+                out += fit_series(model, cell.name, seed, points, self.settings)
+        for model in self.on_all_rows:
+            out += [fit_to_all(model, data[seed].name, seed) for seed in self.seeds_many_points]
+        return out
+
+    @override
+    def summary(self, results: Results) -> dict[str, Any]:
+        curves: dict[str, Any] = {}
+        for model in self.models:
+            curves[model] = {}
+            for count in self.points:
+                found = [results.result(fit_name(model, count, seed)) for seed in self.seeds_of(count)]
+                scores = [{**cell["evaluation"], "cpu_seconds": cell["search"]["cpu_seconds"]} for cell in found]
+                curves[model][str(count)] = {name: spread(score[name] for score in scores) for name in SCORES} | {
+                    "converged": sum(cell["search"]["converged"] for cell in found),
+                    "seeds": len(found),
+                }
+        many = {}
+        for model in self.on_all_rows:
+            found = [results.result(all_name(model, seed))["evaluation"] for seed in self.seeds_many_points]
+            many[model] = {name: spread(score[name] for score in found) for name in SCORES[:-1]}
+        floor = results.result(fit_name(self.models[0], self.points[0], self.seeds[0]))["evaluation"]["noise_floor"]
+        return {"curves": curves, "all_rows": {"rows": self.data.rows, "models": many}, "noise_floor": floor}
+
+    @override
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        out: list[Row] = []
+        for model, curve in summary["curves"].items():
+            for count, scores in curve.items():
+                paper = dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[model], strict=True)).get(int(count))
+                row: Row = {"model": MODELS[model].label, "points": int(count), "seeds": scores["seeds"]}
+                row |= {"paper_mae": paper, "converged": scores["converged"]}
+                for name in SCORES:
+                    for part in ("median", "min", "max"):
+                        row[f"{name}_{part}"] = scores[name][part]
+                out.append(row)
+        return out
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        from forcegp.experiments.learning_curves import learning_curves_figure
+
+        return {"fig2b": learning_curves_figure(summary)}
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        parts = [
+            f"Medians over seeds (least–largest), {len(self.seeds)} seeds up to N = {self.few_points}, "
+            f"{len(self.seeds_many_points)} above. Training and test rows come from different trajectories. The floor "
+            f"of the MAE against noisy accelerations is {summary['noise_floor']:.4f}."
+        ]
+        for score in SCORES:
+            rows = []
+            for model, curve in summary["curves"].items():
+                paper = dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[model], strict=True))
+                if score == "mae":
+                    cells = [f"{paper[int(count)]:.4f}" if int(count) in paper else "–" for count in curve]
+                    rows.append([f"{MODELS[model].label}, paper", *cells])
+                label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
+                digits = {"cpu_seconds": 0, "nlpd": 2, "coverage_95": 3}.get(score, 4)
+                rows.append([label, *(shown(scores[score], digits) for scores in curve.values())])
+            parts += [f"**{HEADINGS[score]}**", markdown_table(["N", *map(str, self.points)], rows)]
+        unconverged = [
+            f"{MODELS[model].label} N = {count}: {scores['converged']} of {scores['seeds']}"
+            for model, curve in summary["curves"].items()
+            for count, scores in curve.items()
+            if scores["converged"] < scores["seeds"]
+        ]
+        parts.append(
+            f"**Models of {summary['all_rows']['rows']} points** (the analytical model has the true parameters; "
+            "fitted, the tool's mass and centre of mass and a viscous friction of every joint are estimated by maximum "
+            "likelihood, but no friction of joints is a friction of the tool)"
+        )
+        rows = []
+        for model, scores in summary["all_rows"]["models"].items():
+            paper = published.MAE_10000.get(model)
+            digits = {"nlpd": 2, "coverage_95": 3}
+            cells = [shown(scores[name], digits.get(name, 4)) for name in SCORES[:-1]]
+            rows.append([MODELS[model].label, "–" if paper is None else f"{paper:.2f}", *cells])
+        header = ["model", "MAE, paper", "MAE", "noise-free", "\\|A a − b\\|", "NLPD", "coverage"]
+        parts.append(markdown_table(header, rows))
+        parts.append(
+            "Searches that met their tolerance before the limit of iterations: "
+            + (f"all but ({'; '.join(unconverged)})." if unconverged else "all.")
+        )
+        return "\n\n".join(parts)

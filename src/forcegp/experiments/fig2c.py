@@ -1,0 +1,164 @@
+"""Figure 2c: the tool's mass and centre of mass, learned along with everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from typing_extensions import override
+
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
+from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from forcegp.experiments.fits import fit_cost
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+AXES = ("com.x", "com.y", "com.z")
+
+
+@dataclass(frozen=True)
+class Fig2c(Experiment):
+    """Traces at `points` points from one seed; estimates with standard errors at `points_interval` points."""
+
+    name: ClassVar[str] = "fig2c"
+    title: ClassVar[str] = "Figure 2c: the tool's mass and centre of mass"
+
+    data: DataSettings
+    points: int
+    seed: int
+    points_interval: int
+    seeds: tuple[int, ...]
+    iterations: int
+    tolerance: float
+
+    @override
+    def cells(self) -> list[Cell]:
+        data = {seed: self.data.cell(seed) for seed in sorted({self.seed, *self.seeds})}
+        out = list(data.values())
+        search = {"iterations": self.iterations, "tolerance": self.tolerance}
+        for model in MODELS:
+            for mean in MEANS:
+                where = data[self.seed].name
+                spec = {"model": model, "mean": mean, "data": where, "points": self.points, **search}
+                cost = 10.0 + fit_cost("s-gp", self.points, {"restarts": 1, **search}) * (model == "s-gp")
+                name = _trace_name(model, mean)
+                out.append(Cell(name, "forcegp.experiments.fig2c_cells:trace", spec, (where,), cost))
+        for seed in self.seeds:
+            spec = {"data": data[seed].name, "points": self.points_interval, **search}
+            cost = 3.0 * fit_cost("s-gp", self.points_interval, {"restarts": 1, **search})
+            task = "forcegp.experiments.fig2c_cells:estimate"
+            out.append(Cell(_estimate_name(seed), task, spec, (data[seed].name,), cost))
+        return out
+
+    @override
+    def summary(self, results: Results) -> dict[str, Any]:
+        traces = {model: {mean: results.result(_trace_name(model, mean)) for mean in MEANS} for model in MODELS}
+        for model in traces.values():
+            for trace in model.values():
+                trace["found_at"] = _found_at(trace)
+        estimates = [results.result(_estimate_name(seed)) for seed in self.seeds]
+        names = list(estimates[0]["error"])
+        intervals = {
+            name: {
+                "inside": sum(_inside(each["error"][name], each["std"][name]) for each in estimates),
+                "error": spread(abs(each["error"][name]) for each in estimates),
+                "std": spread(each["std"][name] for each in estimates),
+            }
+            for name in names
+        }
+        return {"points": self.points, "traces": traces, "intervals": intervals, "seeds": len(estimates)}
+
+    @override
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        return [
+            {
+                "model": MODELS[model],
+                "mean": mean,
+                "iteration": iteration,
+                "mass_error": trace["mass_error"][iteration],
+                "center_error": trace["center_error"][iteration],
+                "mae": trace["mae"][iteration],
+            }
+            for model, means in summary["traces"].items()
+            for mean, trace in means.items()
+            for iteration in range(len(trace["mass_error"]))
+        ]
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        from forcegp.experiments.estimation_plot import estimation_figure
+
+        return {"fig2c": estimation_figure(summary)}
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        rows = []
+        for model, means in summary["traces"].items():
+            for mean, trace in means.items():
+                last = [number(trace[name][-1]) for name in ("mass_error", "center_error", "mae")]
+                found = "never" if trace["found_at"] is None else str(trace["found_at"])
+                std = [shown(trace["std"]["mass"]), " ".join(shown(trace["std"][axis]) for axis in AXES)]
+                iterations = str(len(trace["mass_error"]) - 1)
+                rows.append([f"{MODELS[model]}, {MEANS[mean]}", iterations, found, *last[:2], *std, last[2]])
+        header = [
+            "model",
+            "iterations",
+            f"within {MASS_BOUND} kg and {1000 * CENTER_BOUND:g} mm from",
+            "mass error at the end [kg]",
+            "centre error at the end [m]",
+            "standard error of the mass [kg]",
+            "of the centre, x y z [m]",
+            "MAE [rad/s²]",
+        ]
+        intervals = [
+            [name, shown(entry["error"]), shown(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
+            for name, entry in summary["intervals"].items()
+        ]
+        start = summary["traces"]["s-gp"]["analytical"]
+        first = ", ".join(f"{value:+.3f}" for value in start["start_center"])
+        parts = [
+            f"From a tool {start['start_mass']:+.2f} kg too heavy and a centre of mass off by ({first}) m, with all "
+            f"kernel hyper-parameters, N = {summary['points']}. The contact point is kinematic: no parameter moves it. "
+            "“With Q_K” the mean holds gravity, Coriolis forces and actuation; “without”, the Gaussian process carries "
+            "them, too, and the tool shows in M alone, through H and M⁻¹ Q_b. (The text of the paper says Q_K = 0, "
+            "the legend of its figure “S-GP + analytical mean”.) Standard errors are those of the curvature.",
+            markdown_table(header, rows),
+            *(
+                f"{MODELS[model]}, {MEANS[mean]}: {trace['verdict']}"
+                for model, means in summary["traces"].items()
+                for mean, trace in means.items()
+            ),
+            f"**Are the standard errors right?** S-GP with Q_K on {summary['seeds']} seeds, "
+            f"N = {self.points_interval}; how often the 95 % interval (1.96 standard errors) holds the truth:",
+            markdown_table(["parameter", "\\|error\\|", "standard error", "truth inside"], intervals),
+        ]
+        return "\n\n".join(parts)
+
+
+def _trace_name(model: str, mean: str) -> str:
+    return f"fig2c/trace/{model}/{mean}"
+
+
+def _estimate_name(seed: int) -> str:
+    return f"fig2c/estimate/seed{seed}"
+
+
+def _inside(error: float, std: float | None) -> bool:
+    """Is the truth in the 95 % interval? One of infinite width holds everything."""
+    return std is None or abs(error) <= 1.96 * std
+
+
+def _found_at(trace: Mapping[str, Any]) -> int | None:
+    """The iteration from which on both errors stay within their bounds."""
+    good = [
+        abs(mass) <= MASS_BOUND and center <= CENTER_BOUND
+        for mass, center in zip(trace["mass_error"], trace["center_error"], strict=True)
+    ]
+    if not good[-1]:
+        return None
+    wrong = [iteration for iteration, fine in enumerate(good) if not fine]
+    return wrong[-1] + 1 if wrong else 0

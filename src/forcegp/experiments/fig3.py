@@ -1,0 +1,121 @@
+"""Figure 3: what four models predict for the same three seconds, with their 95 % intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.data import test_trajectory
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number
+from forcegp.experiments.fits import MODEL, FitSettings, fit_name, fit_series
+from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ARRAYS = "prediction.npz"
+
+
+@dataclass(frozen=True)
+class Fig3(Experiment):
+    """The first `points` rows of one seed, and `seconds` of its test trajectory from `start` on."""
+
+    name: ClassVar[str] = "fig3"
+    title: ClassVar[str] = "Figure 3: four models on the same three seconds"
+
+    data: DataSettings
+    points: tuple[int, ...]
+    seed: int
+    start: float
+    seconds: float
+    settings: FitSettings
+    models: tuple[str, ...] = GAUSSIAN_PROCESSES
+
+    @override
+    def cells(self) -> list[Cell]:
+        data = self.data.cell(self.seed)
+        out = [data]
+        for model in self.models:
+            series = fit_series(model, data.name, self.seed, list(self.points), self.settings)
+            spec = {"fit": series[-1].name, "data": data.name, "start": self.start, "seconds": self.seconds}
+            out += [*series, Cell(self._name(model), "forcegp.experiments.fig3:predict", spec, (series[-1].name,), 3.0)]
+        return out
+
+    def _name(self, model: str) -> str:
+        return f"fig3/{fit_name(model, max(self.points), self.seed).removeprefix('fits/')}"
+
+    @override
+    def summary(self, results: Results) -> dict[str, Any]:
+        models = {model: results.result(self._name(model)) for model in self.models}
+        return {"points": max(self.points), "seed": self.seed, "models": models}
+
+    @override
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        return [
+            {"model": MODELS[model].label, "points": summary["points"], **scores}
+            for model, scores in summary["models"].items()
+        ]
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        from forcegp.experiments.prediction_window_plot import prediction_window_figure
+
+        arrays = {}
+        for model in self.models:
+            with np.load(results.cell_folder(self._name(model)) / ARRAYS) as stored:
+                arrays[model] = dict(stored)
+        return {"fig3": prediction_window_figure(arrays)}
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        header = ["model", "MAE, noise-free", "mean std of the prediction", "truth inside 95 %", "measured inside 95 %"]
+        rows = [
+            [
+                MODELS[model].label,
+                number(scores["mae_noise_free"]),
+                number(scores["mean_std"]),
+                number(scores["coverage_95_noise_free"], 3),
+                number(scores["coverage_95"], 3),
+            ]
+            for model, scores in summary["models"].items()
+        ]
+        text = (
+            f"{summary['points']} training points, seed {summary['seed']}, {self.seconds:g} s of its test trajectory "
+            "(all joints in the table, three in the figure); rad/s²."
+        )
+        return f"{text}\n\n{markdown_table(header, rows)}"
+
+
+def predict(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Predict every row of the window and keep mean, deviations, truth and measurement."""
+    from forcegp.evaluation.metrics import interval_coverage
+    from forcegp.models import load_posterior
+
+    posterior = load_posterior(results.cell_folder(spec["fit"]) / MODEL)
+    trajectory = test_trajectory(results, spec["data"])
+    elapsed = trajectory.time - trajectory.time[0]
+    chosen = (elapsed >= spec["start"]) & (elapsed <= spec["start"] + spec["seconds"])
+    if not chosen.any():
+        raise InvalidInput(f"the test trajectory lasts {elapsed[-1]:.3g} s; the window begins at {spec['start']} s.")
+    rows = trajectory.rows(chosen)
+    prediction = posterior.predict(rows.q, rows.v, rows.u)
+    mean, std, noisy = (x.numpy() for x in (prediction.mean, prediction.std, prediction.measurement.std))
+    truth = np.asarray(rows.truth["a"])
+    np.savez_compressed(
+        folder / ARRAYS, time=elapsed[chosen], mean=mean, std=std, measurement_std=noisy, truth=truth, measured=rows.a
+    )
+    return {
+        "rows": len(rows),
+        "mae_noise_free": float(np.abs(mean - truth).mean()),
+        "mean_std": float(std.mean()),
+        "coverage_95_noise_free": float(interval_coverage(mean, std**2, truth).mean()),
+        "coverage_95": float(interval_coverage(mean, noisy**2, rows.a).mean()),
+    }

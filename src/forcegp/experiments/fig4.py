@@ -1,0 +1,206 @@
+"""Figure 4: where the models say that the robot goes, from the same initial states, over seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from typing_extensions import override
+
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
+from forcegp.experiments.fig4_cells import ARRAYS, CONTROLS, DIVERGED, FREQUENCY, VARIANTS
+from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
+from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BLACK_BOXES = ("gp", "neural-network")
+WITHOUT_CONSTRAINT = ("none", "projected")
+"""Variants of models that know no constraint, and so cannot be stabilised by it."""
+
+
+@dataclass(frozen=True)
+class Fig4(Experiment):
+    """`starts` initial states from the test trajectory of each seed, with its recorded torques, for `seconds`."""
+
+    name: ClassVar[str] = "fig4"
+    title: ClassVar[str] = "Figure 4: roll-outs"
+
+    data: DataSettings
+    points: tuple[int, ...]
+    seeds: tuple[int, ...]
+    starts: int
+    seconds: tuple[float, ...]
+    settings: FitSettings
+    models: tuple[str, ...] = (*BLACK_BOXES, *GAUSSIAN_PROCESSES[1:])
+
+    @override
+    def cells(self) -> list[Cell]:
+        out: list[Cell] = []
+        for seed in self.seeds:
+            data = self.data.cell(seed)
+            rolled = {"data": data.name, "starts": self.starts, "seconds": list(self.seconds)}
+            task = "forcegp.experiments.fig4_cells"
+            out += [data, Cell(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
+            for model in self.models:
+                if model == "neural-network":
+                    series = [fit_to_all(model, data.name, seed)]
+                else:
+                    series = fit_series(model, data.name, seed, list(self.points), self.settings)
+                out += series
+                fit = series[-1].name
+                for control in CONTROLS:
+                    for variant in variants_of(model):
+                        spec = {**rolled, "fit": fit, "control": control, "variant": variant}
+                        out.append(Cell(_name(control, variant, model, seed), f"{task}:roll", spec, (fit,), 10.0))
+        return out
+
+    @override
+    def summary(self, results: Results) -> dict[str, Any]:
+        motions: dict[str, Any] = {
+            control: {
+                variant: {
+                    model: self._together([results.result(_name(control, variant, model, seed)) for seed in self.seeds])
+                    for model in self.models
+                    if variant in variants_of(model)
+                }
+                for variant in VARIANTS
+            }
+            for control in CONTROLS
+        }
+        true = [results.result(_truth_name(seed)) for seed in self.seeds]
+        twins = {
+            size: {second: spread(x for each in true for x in each["joint_error"][size][second]) for second in rows}
+            for size, rows in true[0]["joint_error"].items()
+        }
+        recorded = {
+            "largest": max(each["recorded_constraint"]["largest"] for each in true),
+            "median": float(np.median([each["recorded_constraint"]["median"] for each in true])),
+        }
+        return {"points": max(self.points), "motions": motions, "recorded_constraint": recorded, "truth": twins}
+
+    def _together(self, found: list[dict[str, Any]]) -> dict[str, Any]:
+        """Scores of all seeds' motions as one."""
+        out: dict[str, Any] = {"diverged": sum(cell["diverged"] for cell in found)}
+        for second in self.seconds:
+            parts = [cell["scores"][f"{second:g}"] for cell in found]
+            out[f"{second:g}"] = {
+                "joint_error": spread(error for part in parts for error in part["joint_error"]),
+                "constraint": spread(value for part in parts for value in part["constraint_median"]),
+                "constraint_largest": max(max(part["constraint_largest"]) for part in parts),
+            }
+        return out
+
+    @override
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        out: list[Row] = []
+        for control, variant, model, scores in _each(summary):
+            row: Row = {"control": control, "stabilisation": VARIANTS[variant], "model": MODELS[model].label}
+            for second in self.seconds:
+                score = scores[f"{second:g}"]
+                for name in ("joint_error", "constraint"):
+                    row |= {f"{name}_{second:g}s_{part}": score[name][part] for part in ("median", "min", "max")}
+                row[f"constraint_largest_{second:g}s"] = score["constraint_largest"]
+            out.append(row | {"diverged": scores["diverged"]})
+        return out
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        from forcegp.experiments.rollouts_plot import rollouts_figure
+
+        figures = {}
+        for control in CONTROLS:
+            arrays: dict[str, dict[str, dict[str, np.ndarray]]] = {variant: {} for variant in VARIANTS}
+            for _, variant, model, _ in _each({"motions": {control: summary["motions"][control]}}):
+                parts = []
+                for seed in self.seeds:
+                    with np.load(results.cell_folder(_name(control, variant, model, seed)) / ARRAYS) as stored:
+                        parts.append(dict(stored))
+                arrays[variant][model] = {
+                    name: parts[0][name] if name == "time" else np.concatenate([part[name] for part in parts])
+                    for name in parts[0]
+                }
+            figures[f"fig4-{control}"] = rollouts_figure(arrays, f"{CONTROLS[control]}, N = {summary['points']}")
+        return figures
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        recorded = summary["recorded_constraint"]
+        count = self.starts * len(self.seeds)
+        seconds = [f"{second:g}" for second in self.seconds]
+        parts = [
+            f"{count} initial states ({self.starts} from the test trajectory of each of {len(self.seeds)} seeds), the "
+            f"recorded torques, symplectic Euler with the recorded step (or the projecting integrator), mean of the "
+            f"posterior, N = {summary['points']}. Joint error: mean over the joints of |q − q recorded|, median over "
+            "the motions (least–largest). The recorded motion itself is off the surface by "
+            f"{number(recorded['median'])} m in the median and by {number(recorded['largest'])} m at most.",
+            "**How long can an open loop be compared?** The recording comes from a stiff controller; its torques alone "
+            "do not hold the arm. The true dynamics, friction included, under the recorded torques, from the recorded "
+            "states with a tiny random change of the positions:",
+            markdown_table(
+                ["change [rad]", *(f"joint error after {second} s [rad]" for second in seconds)],
+                [[size, *(_error(errors[second]) for second in seconds)] for size, errors in summary["truth"].items()],
+            ),
+            "So the open loop, which the paper shows for 1 s, tells about a model only while its own errors have not "
+            f"grown so. “With feedback” adds M(q recorded) (ω² (q recorded − q) + 2 ω (v recorded − v)) with ω = "
+            f"{FREQUENCY:g} rad/s to the recorded torques, the same for every model.",
+        ]
+        for control, label in CONTROLS.items():
+            rows = []
+            for _, variant, model, scores in _each({"motions": {control: summary["motions"][control]}}):
+                cells = [_error(scores[second]["joint_error"]) for second in seconds]
+                cells += [number(scores[second]["constraint"]["median"]) for second in seconds]
+                cells += [number(scores[second]["constraint_largest"]) for second in seconds]
+                cells.append(f"{scores['diverged']} of {count}")
+                rows.append([f"{MODELS[model].label}, {VARIANTS[variant]}", *cells])
+            header = ["model", *(f"joint error, {second} s [rad]" for second in seconds)]
+            header += [f"median \\|c(q)\\|, {second} s [m]" for second in seconds]
+            header += [f"largest, {second} s [m]" for second in seconds]
+            parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table([*header, "diverged"], rows)]
+        parts.append(
+            "A motion that diverges (a joint beyond 100 rad/s) counts as infinitely wrong from there on, and its |c| "
+            "up to there."
+        )
+        gp, mean = (summary["motions"]["open-loop"][variants_of(m)[0]].get(m) for m in ("gp", "s-gp-mean"))
+        if gp is not None and mean is not None:
+            share = mean[seconds[0]]["joint_error"]["median"] / gp[seconds[0]]["joint_error"]["median"]
+            parts.append(
+                f"After {seconds[0]} s of open loop the median joint error of S-GP + analytical mean (Baumgarte) is "
+                f"{share:.3f} of the GP's."
+            )
+        return "\n\n".join(parts)
+
+
+def variants_of(model: str) -> tuple[str, ...]:
+    """How this model's constraint is kept."""
+    return WITHOUT_CONSTRAINT if model in BLACK_BOXES else tuple(VARIANTS)
+
+
+def _name(control: str, variant: str, model: str, seed: int) -> str:
+    return f"fig4/{control}/{variant}/{model}/seed{seed}"
+
+
+def _truth_name(seed: int) -> str:
+    return f"fig4/truth/seed{seed}"
+
+
+def _each(summary: Mapping[str, Any]) -> list[tuple[str, str, str, Mapping[str, Any]]]:
+    return [
+        (control, variant, model, scores)
+        for control, variants in summary["motions"].items()
+        for variant, models in variants.items()
+        for model, scores in models.items()
+    ]
+
+
+def _error(error: Mapping[str, Any]) -> str:
+    """A spread of joint errors, in which motions that diverged are infinite."""
+    if error["median"] >= DIVERGED:
+        return f"diverged (best {number(error['min'])})"
+    text = shown(error)
+    return text.replace(number(DIVERGED), "∞")

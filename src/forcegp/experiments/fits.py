@@ -1,0 +1,127 @@
+"""Cells that fit one model to one training set and score it: what most figures are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.data import scored_rows, training_rows
+from forcegp.experiments.model_names import MODELS
+from forcegp.experiments.results import Results
+
+MODEL = "model"
+"""The folder of the fitted model inside its cell."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How hyper-parameters are searched for.
+
+    `restarts` and `tolerance` by number of points: the largest key that does not exceed the points counts. Every fit
+    but the first of a series begins where the one with fewer points ended, as restart 0; the others begin around
+    moments.
+    """
+
+    restarts: Mapping[str, int]
+    iterations: int
+    tolerance: Mapping[str, float]
+
+    def of(self, points: int) -> dict[str, Any]:
+        """The settings for this many points, as a cell's spec holds them."""
+        return {
+            "restarts": _at(self.restarts, points),
+            "iterations": self.iterations,
+            "tolerance": _at(self.tolerance, points),
+        }
+
+
+def _at(steps: Mapping[str, Any], points: int) -> Any:
+    """The value of the largest key that does not exceed the points; JSON turns the keys into text."""
+    return steps[str(max(int(key) for key in steps if int(key) <= points))]
+
+
+def fit_name(model: str, points: int, seed: int) -> str:
+    """Where the fit of this model to the first `points` rows of this seed's trajectory lies."""
+    return f"fits/{model}/seed{seed}/n{points}"
+
+
+def all_name(model: str, seed: int) -> str:
+    """Where the fit of this model to all training rows of this seed lies."""
+    return f"fits/{model}/seed{seed}/all"
+
+
+def fit_series(model: str, data: str, seed: int, points: list[int], settings: FitSettings) -> list[Cell]:
+    """One cell per number of points, each beginning from the hyper-parameters of the one before."""
+    cells: list[Cell] = []
+    for count in sorted(points):
+        before = cells[-1].name if cells else None
+        spec = {"model": model, "data": data, "points": count, "seed": seed, "start": before, **settings.of(count)}
+        after = (data,) if before is None else (data, before)
+        cells.append(
+            Cell(
+                fit_name(model, count, seed), "forcegp.experiments.fits:fit", spec, after, fit_cost(model, count, spec)
+            )
+        )
+    return cells
+
+
+def fit_to_all(model: str, data: str, seed: int) -> Cell:
+    """A network or an analytical model on all training rows of the data cell."""
+    spec = {"model": model, "data": data, "points": None, "seed": seed, "start": None}
+    return Cell(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
+
+
+def fit_cost(model: str, points: int, settings: Mapping[str, Any]) -> float:
+    """CPU seconds of a fit, about, from measurements on one core."""
+    per_evaluation = 0.7 * (points / 1000) ** 2.7 if model == "gp" else 5.6 * (points / 1000) ** 2.6
+    return 2.0 + settings["restarts"] * min(settings["iterations"], 120) * per_evaluation
+
+
+def fit(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Fit, keep the model, and score it on the test trajectory of the same data cell."""
+    from forcegp.evaluation import evaluate
+    from forcegp.models import load_posterior, save_posterior
+
+    train = training_rows(results, spec["data"], spec["points"])
+    start = None
+    if spec["start"] is not None:
+        start = load_posterior(results.cell_folder(spec["start"]) / MODEL).parameters
+    posterior = fitted(spec, train, start)
+    save_posterior(posterior, folder / MODEL)
+    scores = evaluate(posterior, scored_rows(results, spec["data"])).to_dict()
+    return {"evaluation": scores, "search": search_report(posterior)}
+
+
+def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] | None = None) -> Any:
+    """The model of `spec` fitted to these rows; "restarts", "iterations" and "tolerance" where its search has them."""
+    from forcegp.inference import OptimizerOptions
+
+    kind = MODELS[spec["model"]]
+    assert train.system is not None
+    model = kind.make(train.system)
+    more = dict(kind.fit_arguments(model.system))
+    if "iterations" in spec:
+        more["options"] = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
+        more |= {"restarts": spec["restarts"], "start": start}
+    return model.fit(train, seed=spec["seed"], **more)
+
+
+def search_report(posterior: Any) -> dict[str, Any] | None:
+    """How the search for hyper-parameters went; None for models without one."""
+    search = posterior.result
+    if search is None:
+        return None
+    return {
+        "objective": search.value,
+        "iterations": len(search.history) - 1,
+        "evaluations": search.evaluations,
+        "converged": search.converged,
+        "status": search.status,
+        "cpu_seconds": search.cpu_seconds,
+    }

@@ -1,0 +1,32 @@
+"""Published numbers of the paper: its curves, read from its vector graphics, and those of its text.
+
+Rath, Geist & Trimpe (2021), "Using Physics Knowledge for Learning Rigid-body Forward Dynamics with Gaussian Process
+Force Priors", CoRL.
+"""
+
+FIG2B_POINTS: tuple[int, ...] = (100, 200, 400, 600, 800, 1000)
+FIG2B_MAE = {
+    "gp": (0.4497, 0.2792, 0.1682, 0.1377, 0.1232, 0.1161),
+    "s-gp-38": (0.3987, 0.2469, 0.1523, 0.1288, 0.1175, 0.1111),
+    "s-gp": (0.5856, 0.2092, 0.1193, 0.1049, 0.1006, 0.0977),
+    "s-gp-mean": (0.1051, 0.0936, 0.0868, 0.0855, 0.0847, 0.0844),
+}
+"""Mean absolute error against noisy accelerations [rad/s^2], mean over the joints, by number of training points."""
+
+FIG2B_CONSTRAINT_ERROR = {
+    "gp": (0.229, 0.155, 0.087, 0.053, 0.041, 0.036),
+    "s-gp": (3e-12,) * 6,
+}
+"""Mean |A a - b| [m/s^2] of the predicted mean; for S-GP the paper shows about 3e-12 throughout."""
+
+MAE_10000 = {"analytical": 0.57, "neural-network": 0.13}
+"""The same error with 10,000 points."""
+
+FIG2C = {
+    "s-gp": {"mass_error": {40: -0.003, 399: -0.017}, "center_of_mass_error": 1e-4, "mae": {380: 0.091}},
+    "analytical": {"mass_error": {40: -0.38, 399: -0.052}, "mae": {399: 0.62}},
+}
+"""Errors of the tool's mass [kg] and centre of mass [m] and MAE [rad/s^2], by iteration."""
+
+NOISE_STD = 0.1
+"""Of the measured acceleration [rad/s^2]; a perfect model has the MAE 0.1 sqrt(2 / pi) = 0.0798."""

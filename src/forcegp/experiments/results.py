@@ -1,0 +1,154 @@
+"""A folder of finished cells: whatever happens, a cell is there whole or not at all."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from forcegp import __version__
+from forcegp.errors import FileFormatError, InvalidInput
+
+KIND = "forcegp reproduce"
+FORMAT_VERSION = 1
+DESCRIPTION, CELLS, LOCK = "reproduction.json", "cells", ".lock"
+CELL_FILE = "cell.json"
+
+
+@dataclass(frozen=True)
+class Results:
+    """Cells by name in `folder/cells/<name>/cell.json`, each beside the files that it made."""
+
+    folder: Path
+
+    @classmethod
+    def open(cls, folder: Path, preset: str) -> Results:
+        """The folder, made if it does not exist, for the preset of this name.
+
+        Raises InvalidInput for a folder of something else, or of another preset, and FileFormatError for one that
+        another version of forcegp wrote.
+        """
+        results = cls(folder)
+        description = folder / DESCRIPTION
+        if description.exists():
+            results._require_same(description, preset)
+        elif folder.exists() and (not folder.is_dir() or any(entry.name != LOCK for entry in folder.iterdir())):
+            raise InvalidInput(f"{folder} exists and was not written by `{KIND}`; choose another --out.")
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            content = {"kind": KIND, "format_version": FORMAT_VERSION, "forcegp_version": __version__}
+            write_json(description, {**content, "preset": preset})
+        return results
+
+    def _require_same(self, description: Path, preset: str) -> None:
+        stored = _read(description, f"choose another --out, or delete {self.folder}")
+        if stored.get("kind") != KIND:
+            raise InvalidInput(f"{self.folder} was not written by `{KIND}`; choose another --out.")
+        written_by = stored.get("forcegp_version"), stored.get("format_version")
+        if written_by != (__version__, FORMAT_VERSION):
+            raise FileFormatError(
+                f"{self.folder} holds results of forcegp {written_by[0]} (format {written_by[1]}); this is "
+                f"{__version__} (format {FORMAT_VERSION}). Choose another --out: the old results stay as they are."
+            )
+        if stored.get("preset") != preset:
+            raise InvalidInput(
+                f"{self.folder} holds results of preset {stored.get('preset')!r}, not {preset!r}; choose another --out."
+            )
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Only one process works on a folder; the lock dies with its process.
+
+        Raises InvalidInput if another one is at it.
+        """
+        with (self.folder / LOCK).open("w") as file:
+            _lock(file, self.folder)
+            yield
+
+    def cell_folder(self, name: str) -> Path:
+        """Where the cell of this name lies, or will lie."""
+        return self.folder / CELLS / name
+
+    def has(self, name: str, spec: Mapping[str, Any]) -> bool:
+        """Is this cell finished? Raises as `load`."""
+        if not self.cell_folder(name).exists():
+            return False
+        self.load(name, spec)
+        return True
+
+    def load(self, name: str, spec: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """What the cell stored. Raises FileFormatError if it is damaged or was made with another spec."""
+        file = self.cell_folder(name) / CELL_FILE
+        remedy = f"delete the folder {file.parent} and run the same command again: only this cell is computed anew"
+        stored = _read(file, remedy)
+        if not {"spec", "result"} <= set(stored):
+            raise FileFormatError(f"{file} is half written; {remedy}.")
+        if spec is not None and stored["spec"] != _as_json(spec):
+            raise FileFormatError(f"{file} was computed with other settings; {remedy}.")
+        return stored
+
+    def result(self, name: str) -> dict[str, Any]:
+        """The `result` of a finished cell."""
+        return self.load(name)["result"]
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """A temporary folder that becomes the cell at the end, and vanishes on failure."""
+        place = self.cell_folder(name)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary = place.with_name(f".{place.name}.{secrets.token_hex(6)}.tmp")
+        temporary.mkdir()
+        try:
+            yield temporary
+            os.replace(temporary, place)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+
+    def remove_leftovers(self) -> None:
+        """Delete the temporary folders of runs that were killed; call it under the lock."""
+        for entry in (self.folder / CELLS).glob("**/.*.tmp"):
+            shutil.rmtree(entry, ignore_errors=True)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Readable JSON under a temporary name, then renamed."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Text under a temporary name, then renamed."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _as_json(value: Mapping[str, Any]) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def _read(file: Path, remedy: str) -> dict[str, Any]:
+    try:
+        stored = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{file} is half written or damaged ({error}); {remedy}.") from None
+    if not isinstance(stored, dict):
+        raise FileFormatError(f"{file} is damaged; {remedy}.")
+    return stored
+
+
+def _lock(file: IO[str], folder: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InvalidInput(f"another `{KIND}` is at work in {folder}; wait for it, or choose another --out.") from None

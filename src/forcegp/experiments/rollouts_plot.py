@@ -1,0 +1,55 @@
+"""Plot: error and distance from the surface of roll-outs over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forcegp.evaluation.figure_style import LARGE, SMALL, new_figure, quiet
+from forcegp.experiments.learning_curves import COLORS
+from forcegp.experiments.model_names import MODELS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Arrays = Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]
+TITLES = {
+    "baumgarte": "with Baumgarte (black boxes: none)",
+    "none": "not stabilised",
+    "projected": "projecting integrator",
+}
+
+
+def rollouts_figure(arrays: Arrays, title: str) -> Figure:
+    """Joint error above, distance from the surface below; one column per way to hold the constraint."""
+    figure = new_figure(11.0, 6.0)
+    figure.suptitle(title, fontsize=LARGE, x=0.01, ha="left")
+    panels = figure.subplots(2, len(TITLES), sharex=True, sharey="row")
+    for column, (variant, heading) in enumerate(TITLES.items()):
+        shown = dict(arrays[variant])
+        if variant == "baumgarte":
+            shown = {model: each for model, each in arrays["none"].items() if model not in shown} | shown
+        for model, stored in shown.items():
+            for axes, name in zip(panels[:, column], ("joint_error", "constraint"), strict=True):
+                _draw(axes, stored["time"], stored[name], model)
+        quiet(panels[0, column], title=heading, y="mean |q − q recorded| [rad]" if column == 0 else "")
+        quiet(panels[1, column], x="time [s]", y="|c(q)| [m]" if column == 0 else "")
+    for axes in panels.flat:
+        axes.set_yscale("log")
+    panels[0, 0].set_ylim(1e-6, 1e1)
+    panels[1, 0].set_ylim(1e-17, 1e0)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=SMALL, frameon=False)
+    return figure
+
+
+def _draw(axes: Axes, time: np.ndarray, values: np.ndarray, model: str) -> None:
+    """Median over the motions, and the range from the 10th to the 90th percentile; diverged motions count as inf."""
+    values = np.where(np.isnan(values), np.inf, np.maximum(values, 1e-18))
+    low, middle, high = np.quantile(values, (0.1, 0.5, 0.9), axis=0, method="nearest")
+    high, middle = np.where(np.isinf(high), 1e3, high), np.where(np.isinf(middle), np.nan, middle)
+    axes.fill_between(time, low, high, color=COLORS[model], alpha=0.12, linewidth=0)
+    axes.plot(time, middle, color=COLORS[model], linewidth=1.2, label=MODELS[model].label)

@@ -1,0 +1,100 @@
+"""`forcegp reproduce` through the real executable: everything once at the smallest size, and its refusals."""
+
+import csv
+import json
+import re
+import shutil
+
+import pytest
+
+FIGURES = ("fig2b", "fig2c", "fig3", "fig4", "extrapolation", "ablation")
+
+
+@pytest.fixture(scope="module")
+def reproduced(forcegp, tmp_path_factory):
+    """The folder of `forcegp reproduce all --preset smoke`."""
+    pytest.importorskip("pybullet")
+    folder = tmp_path_factory.mktemp("reproduce")
+    done = forcegp(
+        "reproduce", "all", "--preset", "smoke", "--out", "out", "--docs", "docs", "--jobs", 2, folder=folder
+    )
+    assert done.returncode == 0, done.stderr
+    assert "reproduction.md tells what was found" in done.stdout
+    return folder
+
+
+def test_all_figures_tables_and_the_page_are_there(reproduced):
+    for root in (reproduced / "out", reproduced / "docs"):
+        page = (root / "reproduction.md").read_text()
+        for name in FIGURES:
+            document = json.loads((root / "reproduction" / f"{name}.json").read_text())
+            assert document["preset"] == "smoke"
+            assert document["config"]["data"]["rows"] == 400
+            with (root / "reproduction" / f"{name}.csv").open() as file:
+                assert list(csv.DictReader(file))
+            for figure in document["figures"]:
+                assert f"(reproduction/{figure}.png)" in page
+                assert (root / "reproduction" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+                assert (root / "reproduction" / f"{figure}.svg").read_text().startswith("<?xml")
+        assert "Its numbers say nothing about the models" in page
+        assert "nan" not in page.lower().replace("covariance", "")
+
+
+def test_a_second_run_computes_nothing_and_changes_no_number(reproduced, forcegp):
+    before = (reproduced / "out" / "reproduction.md").read_text()
+    cells = {file: file.stat().st_mtime_ns for file in (reproduced / "out" / "cells").glob("**/cell.json")}
+    assert len(cells) > 40
+    again = forcegp("reproduce", "all", "--out", "out", "--json", folder=reproduced)
+    assert again.returncode == 0, again.stderr
+    assert set(json.loads(again.stdout)["figures"]) == set(FIGURES)
+    assert (reproduced / "out" / "reproduction.md").read_text() == before
+    assert cells == {file: file.stat().st_mtime_ns for file in (reproduced / "out" / "cells").glob("**/cell.json")}
+
+
+def test_published_values_stand_beside_ours(reproduced):
+    rows = json.loads((reproduced / "out" / "reproduction" / "fig2b.json").read_text())["summary"]["curves"]
+    assert set(rows) == {"gp", "s-gp-38", "s-gp", "s-gp-mean"}
+    page = (reproduced / "out" / "reproduction.md").read_text()
+    assert re.search(r"\| analytical model \| 0\.57 \|", page)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fig9",), "no figure 'fig9'"),
+        (("fig2b", "--preset", "huge"), "no preset 'huge'"),
+        (("fig2b", "--jobs", -1), "--jobs is -1"),
+        (("fig2b", "--points", 500, "--out", "new"), "its data have 400 rows, so give 2 to 400"),
+        (("fig2b", "--points", 1, "--out", "new"), "asked for 1 training points"),
+        (("fig2b", "--seeds", -3, "--out", "new"), "--seeds"),
+        (("all", "--preset", "paper", "--out", "out"), "holds results of preset 'smoke', not 'paper'"),
+        (("all", "--out", "docs"), "was not written by `forcegp reproduce`"),
+    ],
+)
+def test_refusals_are_one_line_and_leave_everything(reproduced, forcegp, arguments, message):
+    before = sorted(reproduced.glob("**/*"))
+    refused = forcegp("reproduce", *arguments, folder=reproduced)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("forcegp: ")
+    assert len(refused.stderr.strip().splitlines()) == 1
+    assert message in refused.stderr
+    assert sorted(reproduced.glob("**/*")) == before
+
+
+def test_a_half_written_cell_and_another_version_are_named_and_nothing_is_lost(reproduced, forcegp, tmp_path):
+    shutil.copytree(reproduced / "out", tmp_path / "out")
+    file = next((tmp_path / "out" / "cells" / "fits").glob("**/cell.json"))
+    whole = file.read_text()
+    file.write_text(whole[:100])
+    refused = forcegp("reproduce", "all", "--out", "out", folder=tmp_path)
+    assert refused.returncode == 2
+    assert str(file.relative_to(tmp_path)) in refused.stderr
+    assert "only this cell is computed anew" in refused.stderr
+    assert file.read_text() == whole[:100]
+    file.write_text(whole)
+    description = tmp_path / "out" / "reproduction.json"
+    stored = json.loads(description.read_text())
+    description.write_text(json.dumps({**stored, "forcegp_version": "0.0.1"}))
+    refused = forcegp("reproduce", "all", "--out", "out", folder=tmp_path)
+    assert refused.returncode == 2
+    assert "holds results of forcegp 0.0.1" in refused.stderr

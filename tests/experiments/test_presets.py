@@ -1,0 +1,63 @@
+"""The presets, and the page that the documentation shows."""
+
+import pytest
+
+from forcegp.errors import InvalidInput
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.experiment import markdown_table, number, shown, spread
+from forcegp.experiments.presets import PRESETS, experiments_of
+from forcegp.experiments.report import report
+from forcegp.experiments.reproduction import as_csv, read_document
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_cells_that_experiments_share_are_the_same(preset):
+    known: dict[str, Cell] = {}
+    for experiment in PRESETS[preset]:
+        experiment.require_possible()
+        for cell in experiment.cells():
+            assert known.setdefault(cell.name, cell) == cell
+    assert all(name in known for cell in known.values() for name in cell.after)
+
+
+def test_figure_2b_has_the_seeds_and_points_that_it_promises():
+    (fig2b,) = experiments_of("paper", "fig2b")
+    assert fig2b.points == (100, 200, 400, 600, 800, 1000)
+    assert all(len(fig2b.seeds_of(count)) >= (5 if count <= 400 else 2) for count in fig2b.points)
+
+
+def test_other_points_and_seeds():
+    (fig2b,) = experiments_of("smoke", "fig2b")
+    changed = fig2b.with_points((50, 10, 50)).with_seeds((7, 8))
+    assert changed.points == (10, 50)
+    assert changed.seeds_of(10) == changed.seeds_of(50) == (7, 8)
+    with pytest.raises(InvalidInput, match="asked for 401"):
+        fig2b.with_points((401,)).require_possible()
+
+
+def test_unknown_names_list_the_known():
+    with pytest.raises(InvalidInput, match=r"did you mean .*all, .*fig2b"):
+        experiments_of("smoke", "fig2")
+    with pytest.raises(InvalidInput, match="paper"):
+        experiments_of("papers", "all")
+
+
+def test_the_committed_page_is_made_of_the_committed_numbers(repository):
+    folder = repository / "docs" / "reproduction"
+    experiments = PRESETS["paper"]
+    documents = {experiment.name: read_document(folder / f"{experiment.name}.json") for experiment in experiments}
+    assert (repository / "docs" / "reproduction.md").read_text() == report(experiments, documents, "reproduction")
+    for experiment in experiments:
+        document = documents[experiment.name]
+        assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
+        assert all((folder / f"{name}{ending}").exists() for name in document["figures"] for ending in (".png", ".svg"))
+
+
+def test_spreads_and_tables():
+    assert spread([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
+    assert spread([1.0, None]) is None
+    assert shown(spread([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
+    assert shown(spread([0.5])) == "0.5000"
+    assert shown(None) == "–"
+    assert [number(value) for value in (0.0, 1.2e-9, 0.08311, 23456.7)] == ["0.0000", "1.2e-09", "0.0831", "2.3e+04"]
+    assert markdown_table(["a", "b"], [["x", "1"]]) == "| a | b |\n|---|---:|\n| x | 1 |"
