@@ -23,7 +23,7 @@ def executable() -> Path:
 def forcegp(executable) -> Forcegp:
     """Run `forcegp` with these arguments in that folder; returns exit code, stdout and stderr."""
 
-    def run(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    def run(*arguments: object, folder: Path | None = None, timeout: float = 300.0) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [executable, *(str(argument) for argument in arguments)],
             cwd=folder,
@@ -31,7 +31,7 @@ def forcegp(executable) -> Forcegp:
             capture_output=True,
             text=True,
             check=False,
-            timeout=300,
+            timeout=timeout,
         )
 
     return run

@@ -15,9 +15,8 @@ def reproduced(forcegp, tmp_path_factory):
     """The folder of `forcegp reproduce all --preset smoke`."""
     pytest.importorskip("pybullet")
     folder = tmp_path_factory.mktemp("reproduce")
-    done = forcegp(
-        "reproduce", "all", "--preset", "smoke", "--out", "out", "--docs", "docs", "--jobs", 2, folder=folder
-    )
+    words = ("reproduce", "all", "--preset", "smoke", "--out", "out", "--docs", "docs", "--jobs", 2)
+    done = forcegp(*words, folder=folder, timeout=1200.0)
     assert done.returncode == 0, done.stderr
     assert "reproduction.md tells what was found" in done.stdout
     return folder

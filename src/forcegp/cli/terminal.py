@@ -20,6 +20,10 @@ PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
 
 
+LEAST_SHARE = 0.02
+"""Of the work that must be done before the remaining time is guessed from it."""
+
+
 class Report(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
 
@@ -144,7 +148,7 @@ class _PlainProgress:
 
 def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> str:
     """`12 s left` at the speed so far, or `at most 12 s left`."""
-    if not 0 < done < total or elapsed < 1.0:
+    if not LEAST_SHARE * total < done < total or elapsed < 1.0:
         return ""
     seconds = elapsed * (total - done) / done
     time_left = f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"

@@ -58,7 +58,7 @@ class Extrapolation(Experiment):
             for region in REGIONS:
                 for model in self.models:
                     points = None if model in NETWORKS else self.points
-                    settings = {} if model in NETWORKS else self.settings.of(self.points)
+                    settings = self.settings.of_network() if model in NETWORKS else self.settings.of(self.points)
                     spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
                     cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
                     cell = Cell(

@@ -58,7 +58,7 @@ class Fig2b(Experiment):
                 points = [count for count in self.points if seed in self.seeds_of(count)]
                 out += fit_series(model, cell.name, seed, points, self.settings)
         for model in self.on_all_rows:
-            out += [fit_to_all(model, data[seed].name, seed) for seed in self.seeds_many_points]
+            out += [fit_to_all(model, data[seed].name, seed, self.settings) for seed in self.seeds_many_points]
         return out
 
     @override

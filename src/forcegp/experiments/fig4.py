@@ -49,7 +49,7 @@ class Fig4(Experiment):
             out += [data, Cell(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
             for model in self.models:
                 if model == "neural-network":
-                    series = [fit_to_all(model, data.name, seed)]
+                    series = [fit_to_all(model, data.name, seed, self.settings)]
                 else:
                     series = fit_series(model, data.name, seed, list(self.points), self.settings)
                 out += series

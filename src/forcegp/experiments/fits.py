@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.experiments.cells import Cell
 from forcegp.experiments.data import scored_rows, training_rows
-from forcegp.experiments.model_names import MODELS
+from forcegp.experiments.model_names import MODELS, NETWORKS
 from forcegp.experiments.results import Results
 
 MODEL = "model"
@@ -31,6 +31,11 @@ class FitSettings:
     restarts: Mapping[str, int]
     iterations: int
     tolerance: Mapping[str, float]
+    network_steps: int | None = None
+
+    def of_network(self) -> dict[str, Any]:
+        """The settings of a network, as a cell's spec holds them; None leaves it its own number of training steps."""
+        return {} if self.network_steps is None else {"steps": self.network_steps}
 
     def of(self, points: int) -> dict[str, Any]:
         """The settings for this many points, as a cell's spec holds them."""
@@ -71,9 +76,10 @@ def fit_series(model: str, data: str, seed: int, points: list[int], settings: Fi
     return cells
 
 
-def fit_to_all(model: str, data: str, seed: int) -> Cell:
+def fit_to_all(model: str, data: str, seed: int, settings: FitSettings) -> Cell:
     """A network or an analytical model on all training rows of the data cell."""
     spec = {"model": model, "data": data, "points": None, "seed": seed, "start": None}
+    spec |= settings.of_network() if model in NETWORKS else {}
     return Cell(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
 
 
@@ -105,6 +111,8 @@ def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] 
     kind = MODELS[spec["model"]]
     assert train.system is not None
     model = kind.make(train.system)
+    if "steps" in spec:
+        model = replace(model, steps=spec["steps"])
     more = dict(kind.fit_arguments(model.system))
     if "iterations" in spec:
         more["options"] = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
