@@ -16,7 +16,7 @@ from forcegp.integration import (
     integrate,
     integrator_named,
 )
-from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.mechanics import Contact, ImplicitSurface, MechanicalSystem, Plane
 from forcegp.robots import Robot
 
 POINT = """<robot name="point"><link name="base"/>
@@ -115,6 +115,20 @@ def test_the_position_projection_acts_along_the_contact_forces_and_changes_nothi
     normal = at.A[:, 0]
     along = (push * normal).sum(-1, keepdim=True) / normal.square().sum(-1, keepdim=True) * normal
     assert (push - along).abs().max() <= 1e-3 * push.abs().max()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_the_position_tolerance_is_a_distance_whatever_the_scale_of_the_surface(scale):
+    plane = Plane((0.2, 0.0, 1.0), 0.4)
+    surface = ImplicitSurface(lambda p: scale * plane.value(p))
+    system = arm_system(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), surface)])
+    q0, _ = start(free_system("plane"))
+    distance = free_system("plane").contacts[0].distance
+    assert distance(system.robot.kinematics(q0 + 1e-6)).abs().min() > 1e-7
+    for off in (1e-2, 1e-6, 1e-10):  # a tolerance of 1e-12 in c itself would leave the last as it is, 1e-10 m off
+        at = ConstraintManifold(system).project_position(q0 + off)
+        assert at.converged.all()
+        assert distance(system.robot.kinematics(at.q)).abs().max() <= 1e-12
 
 
 def test_a_start_out_of_reach_is_refused_with_a_remedy():

@@ -210,14 +210,24 @@ def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, st
     assert free.rollout(q, v, u, DT, integrator="projected").constraint.shape == (2, STEPS + 1, 0)
 
 
-def test_feedback_is_added_to_the_forces_of_its_step(posterior, start):
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "projected"])
+def test_feedback_is_asked_once_per_step_and_acts_until_the_next(posterior, start, integrator):
     q, v, u = start
     gains = torch.linspace(0.5, 2.0, STEPS, dtype=torch.float64)
-    rollout = posterior.rollout(q, v, 0.0 * u, DT, feedback=lambda k, q, v: u[:, k] - gains[k] * v)
-    applied = u - gains[:, None] * rollout.v[:, :-1]  # symplectic Euler asks once per step, at its beginning
-    same = posterior.rollout(q, v, applied, DT)
+    asked = []
+
+    def feedback(k, q, v):
+        asked.append((k, q.clone(), v.clone()))
+        return u[:, k] - gains[k] * v
+
+    rollout = posterior.rollout(q, v, 0.0 * u, DT, integrator=integrator, feedback=feedback)
+    assert [k for k, _, _ in asked] == list(range(STEPS))
+    torch.testing.assert_close(torch.stack([at for _, at, _ in asked], dim=1), rollout.q[:, :-1], rtol=0, atol=0)
+    torch.testing.assert_close(torch.stack([rate for _, _, rate in asked], dim=1), rollout.v[:, :-1], rtol=0, atol=0)
+    applied = u - gains[:, None] * rollout.v[:, :-1]
+    same = posterior.rollout(q, v, applied, DT, integrator=integrator)
     torch.testing.assert_close(rollout.q, same.q, rtol=1e-12, atol=1e-12)
-    without = posterior.rollout(q, v, u, DT)
+    without = posterior.rollout(q, v, u, DT, integrator=integrator)
     assert not torch.allclose(rollout.v, without.v, atol=1e-6)
 
 

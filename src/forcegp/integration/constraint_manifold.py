@@ -14,7 +14,7 @@ from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
 from forcegp.robots import Kinematics
 
 POSITION_TOLERANCE = 1e-12
-"""A position counts as on the surface within this distance, in m."""
+"""A position counts as on the surface within this distance, |c| / |s_p|, in m."""
 MOST_ITERATIONS = 25
 
 
@@ -50,8 +50,9 @@ class ConstraintManifold:
         """The positions on all surfaces that Newton's method finds from q: dq = -M^-1 A^T (A M^-1 A^T)^+ c, M fixed.
 
         Source: Hairer, Lubich & Wanner (2006), Geometric Numerical Integration, sections IV.4 and VII.1.4, with the
-        gradients renewed in every iteration. Converged means |c| <= 1e-12 m in all contacts (times |s_p| for surfaces
-        that are no signed distances). States that do not converge are returned as such, for the caller to judge.
+        gradients renewed in every iteration. Converged means |c| <= 1e-12 m |s_p| in all contacts: 1e-12 m from the
+        surface, whatever the scale of the function that describes it (|s_p| = 1 for signed distances). States that do
+        not converge are returned as such, for the caller to judge.
         """
         given_finite = torch.isfinite(q).all(-1)
         q = torch.where(given_finite[:, None], q, 0.0)
@@ -60,7 +61,7 @@ class ConstraintManifold:
         iteration = 0
         while True:
             c, A, slope = self._constraint(kinematics)
-            on_surface = (c.abs() <= POSITION_TOLERANCE * slope.clamp_min(1.0)).all(-1)
+            on_surface = (c.abs() <= POSITION_TOLERANCE * slope).all(-1)
             finite = torch.isfinite(A).all(-1).all(-1) & torch.isfinite(c).all(-1) & given_finite
             moving = ~on_surface & finite
             if iteration == MOST_ITERATIONS or not bool(moving.any()):

@@ -19,7 +19,7 @@ SPEED_LIMIT = 100.0
 
 
 Feedback = Callable[[int, Tensor, Tensor], Tensor]
-"""(k, q, v) -> what a controller adds to u[k] there, of the shape of q; asked wherever the integrator asks for a."""
+"""(k, q, v) -> what a controller adds to u[k], of the shape of q; asked once per step, at the state where it begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,10 @@ def integrate(
     what: str = "motions",
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
-    """Carry n states through T steps of `dt` seconds; u[k] + feedback(k, q, v) acts from row k to row k + 1.
+    """Carry n states through T steps of `dt` seconds; u[k] + feedback(k, q[k], v[k]) acts from row k to row k + 1.
+
+    Like u, what the feedback adds is constant over a step (a zero-order hold), whatever states the integrator visits
+    on the way: so it is asked once per step, of finite states only.
 
     A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that cannot be kept on its
     constraint, ends there: the rest of it is NaN, `diverged_at` tells the row, and a NumericalWarning says so. The
@@ -72,7 +75,8 @@ def integrate(
     off_constraint = torch.zeros(n, dtype=torch.bool, device=q.device)
     alive = torch.ones(n, dtype=torch.bool, device=q.device)
     for k in range(steps):
-        step = integrator.step(_at_finite_states(_under(acceleration, u[k], feedback, k), q, v), q, v, dt)
+        forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
+        step = integrator.step(_at_finite_states(_under(acceleration, forces), q, v), q, v, dt)
         rows_a[k] = torch.where(alive[:, None], step.a, math.nan)
         bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
         good = alive & bounded & step.on_constraint
@@ -95,13 +99,9 @@ def integrate(
     return Trajectory(rows_q, rows_v, rows_a, diverged_at)
 
 
-def _under(
-    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], u: Tensor, feedback: Feedback | None, k: int
-) -> Acceleration:
-    """a(q, v) under the forces of step k."""
-    if feedback is None:
-        return lambda q, v: acceleration(q, v, u)
-    return lambda q, v: acceleration(q, v, u + feedback(k, q, v))
+def _under(acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], forces: Tensor) -> Acceleration:
+    """a(q, v) under the constant forces of one step."""
+    return lambda q, v: acceleration(q, v, forces)
 
 
 def _at_finite_states(acceleration: Acceleration, q0: Tensor, v0: Tensor) -> Acceleration:

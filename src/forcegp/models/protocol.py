@@ -151,9 +151,10 @@ class Posterior(ABC):
         integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order) or "projected"
             (second order; contacts hold exactly after every step, also in the first state, which is moved onto them).
         baumgarte: stabilisation in this rollout, instead of the one in `system`; None for none.
-        feedback: a controller that adds to u: feedback(k, q, v) -> (..., nv) in Nm or N at step k, with the batch
-            dimensions of the motions (those of q0, for sampled motions after one for the samples). Without one the
-            motion is open loop, where small errors of a model grow as the robot lets them.
+        feedback: a controller that adds to u: feedback(k, q, v) -> (..., nv) in Nm or N, asked once at the beginning of
+            step k and constant until k + 1, with the batch dimensions of the motions (those of q0, for sampled motions
+            after one for the samples). Without one the motion is open loop, where small errors of a model grow as the
+            robot lets them.
         samples: also integrate this many functions drawn from the posterior, by pathwise conditioning; `seed` draws
             them.
         progress: called as progress(step, steps).

@@ -32,7 +32,7 @@ class Rollout:
     time: (T+1,) in s, from 0.
     q, v: (..., T+1, nv) in rad and rad/s (m and m/s); row 0 is the initial state, which `integrator="projected"` moves
         onto the constraint first. Angles are not wrapped.
-    a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k].
+    a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
     constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
         signed distances).
     velocity_constraint: A(q) v (..., T+1, m) in m/s.
