@@ -7,8 +7,8 @@ import pytest
 import torch
 from tests.models.arm import arm_data, arm_system
 
-from forcegp.errors import InvalidInput, UnknownJoint, UnknownLink
-from forcegp.inference import OptimizerOptions
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, UnknownJoint, UnknownLink
+from forcegp.inference import OptimizerOptions, minimize_objective
 from forcegp.mechanics import (
     Actuation,
     Armature,
@@ -18,6 +18,7 @@ from forcegp.mechanics import (
 )
 from forcegp.models import Coefficients, StructuredGP
 from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.models.search import with_steps_before
 from forcegp.priors import NoForces
 from forcegp.robots import LinkInertia
 
@@ -144,6 +145,45 @@ def test_quiet_data_give_the_true_inertia_back(contacts):
     assert found.mass == pytest.approx(true.mass, abs=1e-5)
     assert found.center_of_mass == pytest.approx(true.center_of_mass, abs=1e-5)
     assert posterior.negative_log_likelihood == pytest.approx(posterior.result.value, abs=1e-4)
+
+
+def test_a_zero_mean_begins_at_the_given_system():
+    data = arm_data(15, seed=7, system=system())
+    learn = LinkInertia("hand", ("mass", "com"))
+    wrong = PhysicalParameters.of(system(), learn)
+    given = wrong.system_at(moved(wrong, 2, 0.5))
+    starts = {}
+    for mean in ("analytical", "zero"):
+        posterior = StructuredGP(given, mean=mean).fit(
+            data, restarts=1, learn=learn, options=OptimizerOptions(iterations=0)
+        )
+        starts[mean] = len(posterior.result.iterates), posterior.identification.values["hand.mass"]
+    mass = given.robot.link("hand").mass
+    assert starts["zero"] == (1, pytest.approx(mass, rel=1e-12))
+    # the analytical mean trusts the known forces, so that Gauss-Newton steps come first
+    assert starts["analytical"][0] > 1
+    assert starts["analytical"][1] != pytest.approx(mass, rel=0.01)
+
+
+def test_a_start_in_the_units_of_another_fit_is_refused():
+    data = arm_data(8, seed=7, system=system())
+    with pytest.raises(InvalidInput, match=r"start has 'physical'.*StructuredGP\(posterior.system\)"):
+        StructuredGP(system()).fit(data, learn=LinkInertia("hand"), start={PHYSICAL: torch.zeros(10).double()})
+
+
+def test_steps_without_an_objective_do_not_cost_the_fit():
+    def objective(parameters):
+        if float(parameters["x"]) > 2.0:
+            raise NumericalError("far away")
+        return parameters["x"].log()
+
+    points = [{"x": torch.tensor(x).double()} for x in (3.0, -1.0, 2.0)]
+    found = minimize_objective(lambda p: p["x"] ** 2, points[2], OptimizerOptions(keep_iterates=True))
+    with pytest.warns(NumericalWarning, match="at 2 of 3 steps before the search"):
+        longer = with_steps_before(found, objective, points)
+    assert longer.history == (pytest.approx(np.log(2.0)), *found.history)
+    assert longer.iterates == (points[2], *found.iterates)
+    assert with_steps_before(found, objective, []) == found
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ class Identify(FitOptions):
     iterations: Annotated[int, arg(metavar="N")] = 200
     """Most L-BFGS iterations of each start."""
     restarts: Annotated[int, arg(metavar="R")] = 1
-    """Starts of the search; the best is kept."""
+    """Starts of the search; the best is kept. They differ in the kernels only: the physical values begin the same."""
     json: Json = False
     debug: Debug = False
 

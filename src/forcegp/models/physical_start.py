@@ -2,16 +2,19 @@
 
 Masses, centres of mass and friction coefficients change the objective by many orders of magnitude more than the
 logarithms of kernel parameters do; and as long as they are wrong, the variances from moments of the residual are so
-large that the processes explain the error away. So before the search, a few Gauss-Newton steps lower
+large that the processes explain the error away. So before the search of a model with the analytical mean, a few
+Gauss-Newton steps lower
 
     1/2 s^T G s + 1/2 sum_i e_i^T S_i^-1 e_i,    e = P M (a - m) = P (M a - Q_K),    P = I - A^+ A,
 
 the weighted least squares of inverse dynamics where the contacts do not act. Other than a - m, e is linear in mass,
 first moments and inertias (Atkeson, An & Hollerbach 1986). S_i = P (M R M + B diag(k_c(x_i, x_i)) B^T) P takes rows as
 independent, with variances k_c from the moments of the residual, which are taken again before every step. G is 1, and
-the curvature of the prior on inertias where there is one.
+the curvature of the prior on inertias where there is one. A model with mean "zero" does not trust Q_K, so its estimate
+may not rest on it either: that search begins at the values of the given system.
 
-The units come from the information at the last step, of rows with covariances S_i = R_i + W_i diag(k_c(x_i, x_i)) W_i^T
+The units come from the information where the search begins, of rows with covariances
+S_i = R_i + W_i diag(k_c(x_i, x_i)) W_i^T:
 
     F = G + sum_i J_i^T S_i^-1 J_i + 1/2 tr(S_i^-1 dS_i S_i^-1 dS_i),    J = d(a - m)/ds
 
@@ -22,7 +25,7 @@ the search moves z, s = L^-T z. None of this changes what the objective is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -49,7 +52,7 @@ SMALL_STEP = 0.1
 class PhysicalStart:
     """Whitened parameters, and the parameters of the search at the values of the system and after every step.
 
-    The last entry of `path` is where the search begins; `kernels` are those that belong to it.
+    The last entry of `path` is where the search begins, with mean "zero" the only one; `kernels` belong to it.
     """
 
     physical: PhysicalParameters
@@ -64,7 +67,7 @@ class PhysicalStart:
         noise: Mapping[str, Tensor],
         prior_strength: float = 0.0,
     ) -> PhysicalStart:
-        """From the values that the system of `likelihood` has; its known forces are trusted even with mean "zero".
+        """From the values that the system of `likelihood` has.
 
         `noise` holds the noise parameters at their start.
         Raises as `PhysicalParameters.of`, and FitError where the likelihood cannot be evaluated at the start values.
@@ -73,7 +76,7 @@ class PhysicalStart:
         rows = _Rows(physical, likelihood, noise, _ridge(physical, prior_strength))
         try:
             with torch.no_grad():
-                scaled = _gauss_newton(replace(rows, likelihood=replace(likelihood, mean="analytical")))
+                scaled = _gauss_newton(rows) if likelihood.mean == "analytical" else [physical.zero]
                 lower = torch.linalg.cholesky(_information(rows, scaled[-1]))
         except (NumericalError, torch.linalg.LinAlgError) as error:
             raise FitError(f"the dynamics cannot be evaluated at the start values of `learn`: {error}") from None

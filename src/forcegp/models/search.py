@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,6 +14,8 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from forcegp.errors import NumericalError, NumericalWarning
+from forcegp.inference import OptimizationResult
 from forcegp.models.noise import ACCELERATION, FORCE
 from forcegp.models.physical_parameters import PHYSICAL
 
@@ -31,6 +35,8 @@ SMALL_COVARIANCE = 2000
 
 FitProgress = Callable[[int, int, float], None]
 """Called as progress(restart, iteration, objective)."""
+
+Objective = Callable[[Mapping[str, Tensor]], Tensor]
 
 Outcome = TypeVar("Outcome")
 
@@ -71,3 +77,30 @@ def run_restarts(
     from joblib import Parallel, delayed
 
     return Parallel(n_jobs=min(jobs, restarts))(delayed(search)(index, None) for index in range(restarts))  # type: ignore[return-value]
+
+
+def with_steps_before(
+    result: OptimizationResult, objective: Objective, before: Sequence[dict[str, Tensor]]
+) -> OptimizationResult:
+    """The result with the steps before the search in front; a step without a finite objective must not cost the fit."""
+    kept: list[tuple[float, dict[str, Tensor]]] = []
+    for point in before:
+        try:
+            with torch.no_grad():
+                value = float(objective(point))
+        except (NumericalError, torch.linalg.LinAlgError):
+            value = math.nan
+        if math.isfinite(value):
+            kept.append((value, point))
+    if len(kept) < len(before):
+        warnings.warn(
+            f"the objective cannot be evaluated at {len(before) - len(kept)} of {len(before)} steps before the search; "
+            "the history begins later, the estimates do not depend on it",
+            NumericalWarning,
+            stacklevel=3,
+        )
+    return replace(
+        result,
+        history=(*(value for value, _ in kept), *result.history),
+        iterates=(*(point for _, point in kept), *result.iterates),
+    )

@@ -28,7 +28,14 @@ from forcegp.models.objective import FitObjective
 from forcegp.models.physical_parameters import PHYSICAL, Learned, learn_to_list
 from forcegp.models.physical_start import PhysicalStart
 from forcegp.models.protocol import Model
-from forcegp.models.search import FitProgress, blas_threads, default_restarts, perturbed, run_restarts
+from forcegp.models.search import (
+    FitProgress,
+    blas_threads,
+    default_restarts,
+    perturbed,
+    run_restarts,
+    with_steps_before,
+)
 from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
 
@@ -90,7 +97,8 @@ class StructuredGP(Model):
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
         restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
             factors, every other one from a smoother start; the best final value wins. None means 4 up to 400 points,
-            where local optima cost most and searches cost little, and 1 beyond.
+            where local optima cost most and searches cost little, and 1 beyond. They draw kernel parameters only: all
+            begin at the same physical values.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
@@ -129,6 +137,12 @@ class StructuredGP(Model):
         kernels = likelihood.kernels() if begin is None else begin.kernels
         moments = (kernels.initial_parameters() if begin is None else begin.path[-1]) | learned_noise
         options = options or OptimizerOptions()
+        if PHYSICAL in (start or {}):
+            raise InvalidInput(
+                f"start has {PHYSICAL!r}, numbers in units that the data of their own fit gave them; leave it out, and "
+                "give the model the system whose values the search shall start from, as in "
+                "StructuredGP(posterior.system)"
+            )
         first = first_start(moments, start or {}, fixed)
         physical = None if begin is None else begin.physical
         objective = FitObjective(likelihood, kernels, noise, fixed, hyperprior, physical, prior_strength)
@@ -142,10 +156,7 @@ class StructuredGP(Model):
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
         result = best_of(usable)
         if begin is not None:  # the steps before the search are its first iterations
-            before = [point | learned_noise for point in begin.path[:-1]]
-            with torch.no_grad():
-                values = [float(objective(point)) for point in before]
-            result = replace(result, history=(*values, *result.history), iterates=(*before, *result.iterates))
+            result = with_steps_before(result, objective, [point | learned_noise for point in begin.path[:-1]])
         result = replace(
             result,
             evaluations=sum(search.evaluations for search in usable),
