@@ -50,6 +50,17 @@ def test_a_second_run_computes_nothing_and_changes_no_number(reproduced, forcegp
     assert cells == {file: file.stat().st_mtime_ns for file in (reproduced / "out" / "cells").glob("**/cell.json")}
 
 
+def test_one_figure_has_a_page_of_its_own_that_names_its_command(reproduced, forcegp, tmp_path):
+    shutil.copytree(reproduced / "out", tmp_path / "out")
+    before = (tmp_path / "out" / "reproduction.md").read_text()
+    words = ("reproduce", "fig3", "--points", 20, "--out", "out", "--jobs", 1)
+    done = forcegp(*words, folder=tmp_path, timeout=600.0)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "out" / "fig3.md").read_text()
+    assert "    forcegp reproduce fig3 --preset smoke --points 20\n" in page
+    assert (tmp_path / "out" / "reproduction.md").read_text() == before
+
+
 def test_published_values_stand_beside_ours(reproduced):
     rows = json.loads((reproduced / "out" / "reproduction" / "fig2b.json").read_text())["summary"]["curves"]
     assert set(rows) == {"gp", "s-gp-38", "s-gp", "s-gp-mean"}
@@ -68,6 +79,7 @@ def test_published_values_stand_beside_ours(reproduced):
         (("fig2b", "--seeds", -3, "--out", "new"), "--seeds"),
         (("all", "--preset", "paper", "--out", "out"), "holds results of preset 'smoke', not 'paper'"),
         (("all", "--out", "docs"), "was not written by `forcegp reproduce`"),
+        (("all", "--out", "out", "--docs", "docs/reproduction.md"), "cannot be made"),
     ],
 )
 def test_refusals_are_one_line_and_leave_everything(reproduced, forcegp, arguments, message):

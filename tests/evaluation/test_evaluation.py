@@ -73,8 +73,8 @@ def test_without_truth_and_noise_level_only_measurements_are_scored(posterior, t
     assert scores["constraint_error"] == evaluation.constraint_error  # of the model's own contact
 
 
-def test_the_noise_of_the_data_counts_and_another_one_of_the_model_is_named(posterior, test_data):
-    std = NOISE * np.array([1.0, 1.4, 3.0])
+def test_a_larger_noise_of_the_data_counts_and_another_one_of_the_model_is_named(posterior, test_data):
+    std = NOISE * np.array([1.0, 1.4, 3.0])  # the model's is NOISE
     noisier = dataclasses.replace(test_data, noise_std=std)
     predicted = predict_rows(posterior, noisier)
     np.testing.assert_allclose(predicted.measurement_variance - predicted.variance, np.tile(std**2, (60, 1)), rtol=1e-9)
@@ -86,6 +86,15 @@ def test_the_noise_of_the_data_counts_and_another_one_of_the_model_is_named(post
     for factor in (0.7, 1.4):
         assert evaluate(posterior, dataclasses.replace(test_data, noise_std=np.full(3, factor * NOISE))).warnings == ()
     assert len(evaluate(posterior, dataclasses.replace(test_data, noise_std=np.full(3, 0.6 * NOISE))).warnings) == 1
+
+
+def test_a_larger_noise_of_the_model_counts(posterior, test_data):
+    quieter = dataclasses.replace(test_data, noise_std=NOISE * np.array([0.1, 2.0, 0.5]))
+    predicted = predict_rows(posterior, quieter)
+    expected = np.square(NOISE * np.array([1.0, 2.0, 1.0]))
+    np.testing.assert_allclose(
+        predicted.measurement_variance - predicted.variance, np.tile(expected, (60, 1)), rtol=1e-9
+    )
 
 
 def test_without_a_stated_noise_that_of_the_model_counts(posterior, test_data):

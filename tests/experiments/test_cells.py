@@ -1,6 +1,7 @@
 """Cells run in order, several at once, each once; failures and kills cost only what was not finished."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.errors import FitError
-from forcegp.experiments.cells import Cell, run_cells
+from forcegp.errors import FileFormatError, FitError
+from forcegp.experiments.cells import Cell, digests, run_cells
 from forcegp.experiments.results import Results
 
 TOY = "tests.experiments.toy_tasks"
@@ -49,8 +50,31 @@ def test_a_failure_stops_only_what_needs_it(results):
     cells = [bad, next_to(bad), next_to(next_to(bad)), square(2)]
     with pytest.raises(FitError, match=r"bad failed.*no luck.*1 of \d cells are kept"):
         run_cells(results, cells, jobs=1)
-    assert results.has("square/2", {"number": 2})
+    assert results.result("square/2")["value"] == 4
     assert not results.cell_folder("bad").exists()
+
+
+@pytest.mark.parametrize(("task", "cause"), [("break_down", "ZeroDivisionError"), ("not_a_number", "ValueError")])
+def test_a_defect_in_one_cell_does_not_cost_the_others(results, task, cause):
+    with pytest.raises(FitError, match=rf"bad failed \({cause}: .*1 of 2 cells are kept"):
+        run_cells(results, [Cell("bad", f"{TOY}:{task}", {}), square(2)], jobs=2)
+    assert results.result("square/2")["value"] == 4
+    assert not results.cell_folder("bad").exists()
+
+
+def test_a_process_that_dies_is_reported_and_what_was_done_is_kept(results):
+    with pytest.raises(FitError, match="a process died while"):
+        run_cells(results, [square(2), Cell("dead", f"{TOY}:die", {}, ("square/2",))])
+    assert results.result("square/2")["value"] == 4
+
+
+def test_other_settings_of_what_a_cell_is_made_from_are_seen(results):
+    run_cells(results, [square(3), next_to(square(3))])
+    changed = Cell("square/3", f"{TOY}:square", {"number": 3, "more": 1})
+    assert digests([changed, next_to(square(3))])["next/3"] != digests([square(3), next_to(square(3))])["next/3"]
+    shutil.rmtree(results.cell_folder("square/3"))
+    with pytest.raises(FileFormatError, match=r"next/3/cell\.json was computed with other settings, or from cells"):
+        run_cells(results, [changed, next_to(changed)])
 
 
 def test_warnings_are_kept_with_the_cell(results):
@@ -76,7 +100,7 @@ def test_kill_9_loses_only_the_cell_at_work_and_leaves_no_process(tmp_path):
     worker = int(begun.read_text())
     _wait_until(lambda: not _alive(worker))
     results = Results.open(tmp_path / "out", "smoke")
-    first = results.load("square/2", {"number": 2})
+    first = results.load("square/2")
     assert not results.cell_folder("slow").exists()
     assert run_cells(results, [square(2), square(3)]) == 1
     assert results.load("square/2") == first

@@ -13,17 +13,17 @@ def results(tmp_path):
     return Results.open(tmp_path / "out", "smoke")
 
 
-def store(results, name, spec, result):
+def store(results, name, digest, result):
     with results.writing(name) as folder:
-        write_json(folder / "cell.json", {"spec": spec, "result": result})
+        write_json(folder / "cell.json", {"digest": digest, "spec": {}, "result": result})
 
 
 def test_a_cell_is_found_again(results):
-    store(results, "fits/a/n10", {"points": 10}, {"mae": 0.5})
+    store(results, "fits/a/n10", "10", {"mae": 0.5})
     again = Results.open(results.folder, "smoke")
-    assert again.has("fits/a/n10", {"points": 10})
+    assert again.has("fits/a/n10", "10")
     assert again.result("fits/a/n10") == {"mae": 0.5}
-    assert not again.has("fits/a/n20", {"points": 20})
+    assert not again.has("fits/a/n20", "20")
 
 
 def test_a_cell_that_fails_leaves_nothing(results):
@@ -38,18 +38,18 @@ def test_a_cell_that_fails_leaves_nothing(results):
 
 
 def test_other_settings_are_named_and_not_mixed(results):
-    store(results, "a", {"points": 10}, {})
-    with pytest.raises(FileFormatError, match=r"cells/a/cell\.json was computed with other settings; delete"):
-        results.has("a", {"points": 11})
+    store(results, "a", "10", {})
+    with pytest.raises(FileFormatError, match=r"cells/a/cell\.json was computed with other settings"):
+        results.has("a", "11")
 
 
 @pytest.mark.parametrize("content", ["", '{"spec": {}', '{"spec": {}}', "[1]"])
 def test_a_half_written_cell_is_named_and_kept(results, content):
-    store(results, "a", {}, {})
+    store(results, "a", "1", {})
     file = results.cell_folder("a") / "cell.json"
     file.write_text(content)
     with pytest.raises(FileFormatError, match="only this cell is computed anew"):
-        results.has("a", {})
+        results.has("a", "1")
     assert file.read_text() == content
 
 
@@ -82,9 +82,27 @@ def test_only_one_at_a_time(results):
 
 
 def test_leftovers_of_killed_runs_go(results):
-    store(results, "fits/a", {}, {})
+    store(results, "fits/a", "1", {})
     leftover = results.folder / "cells" / "fits" / ".b.0123456789ab.tmp"
     leftover.mkdir()
     results.remove_leftovers()
     assert not leftover.exists()
-    assert results.has("fits/a", {})
+    assert results.has("fits/a", "1")
+
+
+def test_a_run_killed_before_its_description_does_not_block_the_folder(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / ".reproduction.json.0123456789ab.tmp").write_text('{"kind"')
+    results = Results.open(folder, "smoke")
+    with results.locked():
+        results.remove_leftovers()
+    assert sorted(entry.name for entry in folder.iterdir()) == [".lock", "reproduction.json"]
+
+
+def test_a_cell_that_another_process_finished_meanwhile_stays(results):
+    with results.writing("a") as folder:
+        write_json(folder / "cell.json", {"digest": "1", "spec": {}, "result": {"first": False}})
+        store(results, "a", "1", {"first": True})
+    assert results.result("a") == {"first": True}
+    assert not list(results.folder.glob("**/*.tmp"))

@@ -20,6 +20,18 @@ def fail(results, spec, folder):
     raise FitError("no luck")
 
 
+def break_down(results, spec, folder):
+    return {"value": 1 / 0}
+
+
+def not_a_number(results, spec, folder):
+    return {"value": float("nan")}
+
+
+def die(results, spec, folder):
+    os._exit(3)
+
+
 def warn(results, spec, folder):
     warnings.warn("look here", stacklevel=1)
     return {}

@@ -53,7 +53,7 @@ class Reproduce(Command):
         if any(seed < 0 for seed in self.seeds):
             raise InvalidInput(f"--seeds are {self.seeds}; give numbers of at least 0.")
         from forcegp.experiments.presets import experiments_of
-        from forcegp.experiments.reproduction import BESIDE, PAGE, reproduce
+        from forcegp.experiments.reproduction import BESIDE, page_name, reproduce
 
         start = time.monotonic()
         experiments = experiments_of(self.preset, self.figure)
@@ -64,7 +64,24 @@ class Reproduce(Command):
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
         jobs = self.jobs or os.cpu_count() or 1
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
-            summaries = reproduce(experiments, self.preset, out, docs=self.docs, jobs=jobs, progress=report)
-        terminal.say(f"{out / PAGE} tells what was found; figures, JSON and CSV lie in {out / BESIDE}.")
+            summaries = reproduce(
+                experiments,
+                self.preset,
+                out,
+                command=self._command(),
+                docs=self.docs,
+                jobs=jobs,
+                progress=report,
+            )
+        terminal.say(
+            f"{out / page_name(experiments)} tells what was found; figures, JSON and CSV lie in {out / BESIDE}."
+        )
         terminal.note(f"{time.monotonic() - start:.0f} s")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
+
+    def _command(self) -> str:
+        """What has to be said for the same numbers."""
+        words = ["forcegp reproduce", self.figure, "--preset", self.preset]
+        for name, numbers in (("--points", self.points), ("--seeds", self.seeds)):
+            words += [name, *map(str, numbers)] if numbers else []
+        return " ".join(words)

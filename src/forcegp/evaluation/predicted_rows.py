@@ -27,8 +27,8 @@ ROWS_PER_BLOCK = 1024
 class PredictedRows:
     """What a model says about every row, and the mechanics there.
 
-    `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the Dataset if it
-    states it, else with the model's; `negative_log_density` of the measured rows under that noise; `known_physics` the
+    `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the model, or of
+    the Dataset where it states a larger one; `negative_log_density` of the measured rows under that noise; `known_physics` the
     acceleration of the known forces alone; `moving_force` M (mean - known_physics), the part of the unknown force that
     moves the robot (the other part presses on the surface); `unknown_force` Q_U and `carried_known_force` what of it
     is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all three None for a model that does not
@@ -111,10 +111,16 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
 
 
 def _noise_covariance(prediction: Prediction, dataset: Dataset) -> Float[np.ndarray, "*rows nv nv"]:
-    """Of the measurements compared with: as the Dataset states it, for they may be noisier than those learned from."""
+    """Of the measurements compared with: the model's, or the Dataset's where that is larger.
+
+    The measurements may be noisier than those learned from; and a model that has learned a level of noise counts to it
+    what it cannot explain otherwise.
+    """
+    noise = _array(prediction.noise_covariance)
     if dataset.noise_std is None:
-        return _array(prediction.noise_covariance)
-    return np.diag(np.square(dataset.noise_std))
+        return noise
+    missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
+    return noise + np.maximum(missing, 0.0)[..., None] * np.eye(noise.shape[-1])
 
 
 def _carried_known_force(posterior: Posterior, dynamics: ConstrainedDynamics) -> Float[np.ndarray, "rows nv"]:

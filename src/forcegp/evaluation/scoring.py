@@ -58,7 +58,7 @@ def _noise_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
         return ()
     return (
         f"the noise std of the model is {model[joint]:.3g}, that of the data {stated[joint]:.3g} "
-        f"(joint {dataset.joint_names[joint]}, where they differ most); coverage and NLPD use that of the data.",
+        f"(joint {dataset.joint_names[joint]}, where they differ most); coverage and NLPD use the larger one.",
     )
 
 

@@ -99,12 +99,13 @@ def dense(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, 
     start = time.process_time()
     fast = minimize_objective(ours, begin, OptimizerOptions(iterations=1000, tolerance=spec["tolerance"]))
     return {
-        "steps": spec["steps"],
+        "steps": len(slow.history) - 1,
         "dense_seconds": dense_seconds,
         "dense_nll": slow.value,
         "ours_seconds": time.process_time() - start,
         "ours_nll": fast.value,
         "ours_status": fast.status,
+        "ours_converged": fast.converged,
         "ours_iterations": len(fast.history) - 1,
         "gradient_difference": difference,
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import threading
 import time
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from forcegp.errors import FitError, ForceGPError
+from forcegp.experiments.machine import machine
 from forcegp.experiments.results import CELL_FILE, Results, write_json
 
 Task = Callable[[Results, Mapping[str, Any], Path], dict[str, Any]]
@@ -30,7 +33,7 @@ class Cell:
     """One piece of work.
 
     name: its place in the results folder; task: "package.module:function"; spec: what the function
-    is told, plain JSON values that alone decide the result; after: cells that must be finished before; cost: about how
+    is told, plain JSON values; after: the cells that it is made from, which must be finished before; cost: about how
     many CPU seconds it takes, for the remaining time and the order.
     """
 
@@ -47,21 +50,41 @@ def run_cells(results: Results, cells: Sequence[Cell], jobs: int = 1, progress: 
     Every finished cell is kept at once, so a run that is killed at any moment goes on where it was. A cell that fails
     stops only what depends on it. Raises FitError at the end if any has failed, naming the first.
     """
-    by_name = {cell.name: cell for cell in cells}
-    missing = {name: cell for name, cell in by_name.items() if not results.has(name, cell.spec)}
-    if not missing:
+    wanted = digests(cells)
+    if all(results.has(name, digest) for name, digest in wanted.items()):
         return 0
     with results.locked():
         results.remove_leftovers()
-        _Run(results, missing, progress).with_processes(jobs)
+        missing = {cell.name: cell for cell in cells if not results.has(cell.name, wanted[cell.name])}
+        if missing:
+            _Run(results, missing, wanted, progress).with_processes(jobs)
     return len(missing)
+
+
+def digests(cells: Sequence[Cell]) -> dict[str, str]:
+    """What decides the result of every cell: its task, its spec and the digests of the cells that it is made from."""
+    by_name = {cell.name: cell for cell in cells}
+    out: dict[str, str] = {}
+
+    def digest(cell: Cell) -> str:
+        if cell.name not in out:
+            made_of = [cell.task, dict(cell.spec), [digest(by_name[name]) for name in cell.after]]
+            out[cell.name] = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
+        return out[cell.name]
+
+    for cell in cells:
+        digest(cell)
+    return out
 
 
 class _Run:
     """The cells that wait, those that run, and those that are done."""
 
-    def __init__(self, results: Results, missing: Mapping[str, Cell], progress: Progress | None) -> None:
+    def __init__(
+        self, results: Results, missing: Mapping[str, Cell], wanted: Mapping[str, str], progress: Progress | None
+    ) -> None:
         self.results = results
+        self.digests = wanted
         self.waiting = dict(missing)
         self.total = sum(cell.cost for cell in missing.values())
         self.count = len(missing)
@@ -78,7 +101,7 @@ class _Run:
             try:
                 while self.waiting or running:
                     for cell in self._ready(jobs - len(running)):
-                        running[pool.submit(compute, self.results, cell)] = cell
+                        running[pool.submit(compute, self.results, cell, self.digests[cell.name])] = cell
                     if not running:
                         break  # what still waits depends on cells that failed
                     finished, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -106,9 +129,10 @@ class _Run:
         ready = [cell for cell in self.waiting.values() if not set(cell.after) & (pending - {cell.name})]
         ready = [cell for cell in ready if all(self._finished(name) for name in cell.after)]
         ready.sort(key=lambda cell: -self._work_behind(cell.name))
-        for cell in ready[:free]:
+        chosen = ready[: max(free, 0)]
+        for cell in chosen:
             del self.waiting[cell.name]
-        return ready[: max(free, 0)]
+        return chosen
 
     def _finished(self, name: str) -> bool:
         return self.results.cell_folder(name).exists()
@@ -124,21 +148,23 @@ class _Run:
         try:
             future.result()
             self.done.append(cell.name)
-        except ForceGPError as error:
-            self.failed[cell.name] = str(error)
         except BrokenProcessPool:
             raise FitError(
                 f"a process died while {cell.name} or another cell was at work, probably for want of memory; "
                 f"{len(self.done)} of {self.count} cells are kept, so the same command goes on from here, with fewer "
                 "--jobs if memory is short"
             ) from None
+        except ForceGPError as error:
+            self.failed[cell.name] = str(error)
+        except Exception as error:  # also a defect in one cell must not cost what other cells have done
+            self.failed[cell.name] = f"{type(error).__name__}: {error}"
         self.done_cost += cell.cost
         if self.progress is not None:
             note = f"{len(self.done) + len(self.failed)} of {self.count} cells, last {cell.name}"
             self.progress(int(self.done_cost * 10), max(1, int(self.total * 10)), note)
 
 
-def compute(results: Results, cell: Cell) -> None:
+def compute(results: Results, cell: Cell, digest: str) -> None:
     """Compute one cell and keep it."""
     module, _, function = cell.task.partition(":")
     task: Task = getattr(import_module(module), function)
@@ -147,8 +173,10 @@ def compute(results: Results, cell: Cell) -> None:
         warnings.simplefilter("always")
         result = task(results, cell.spec, folder)
         stored = {
+            "digest": digest,
             "task": cell.task,
             "spec": dict(cell.spec),
+            "machine": machine(),
             "result": result,
             "cpu_seconds": time.process_time() - start,
             "wall_seconds": time.monotonic() - wall,

@@ -35,9 +35,8 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
             axes.axhline(bound, color=QUIET, linewidth=0.8)
         for model, values in published.FIG2C.items():
             points = values.get(name, {})
-            if isinstance(points, dict) and points:
-                errors = [abs(value) for value in points.values()]
-                axes.plot(list(points), errors, "x", color=COLORS[model], markersize=6)
+            errors = [abs(value) for value in points.values()]
+            axes.plot(list(points), errors, "x", color=COLORS[model], markersize=6)
         axes.set_yscale("log")
         axes.set_xscale("symlog", linthresh=10)
         quiet(axes, title=title, x="iteration")

@@ -29,10 +29,10 @@ TARGETS = {
 
 @dataclass(frozen=True)
 class Extrapolation(Experiment):
-    """Every Gaussian process on `points` rows, networks on all training rows of the region, five seeds."""
+    """Gaussian processes and analytical models on `points` rows, networks on all training rows of the region."""
 
     name: ClassVar[str] = "extrapolation"
-    title: ClassVar[str] = "Extrapolation: where structure pays"
+    title: ClassVar[str] = "Extrapolation: the other half of the table, and faster"
 
     data: DataSettings
     points: int
@@ -110,8 +110,9 @@ class Extrapolation(Experiment):
         parts = [
             f"Trained on {self.points} farthest points with the tool at x < {TRAIN_X} m (networks on all such rows of "
             f"the training set), tested on other trajectories: inside (x < {TRAIN_X} m) and outside (x > {TEST_X} m). "
-            "For “faster”, training and inside rows have a tool speed below the median of the training trajectory, "
-            f"outside rows one above it. {len(self.seeds)} seeds; errors against the noise-free acceleration."
+            "For “faster”, training and inside rows have a tool speed below the median of the training set (which "
+            "farthest-point sampling makes fast), outside rows one above it. "
+            f"{len(self.seeds)} seeds; errors against the noise-free acceleration."
         ]
         header = ["model", "points", "MAE inside", "MAE outside", "NLPD outside", "coverage outside", "\\|A a − b\\|"]
         for region, label in REGIONS.items():
@@ -125,9 +126,9 @@ class Extrapolation(Experiment):
             parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table(header, rows)]
         scale = summary["scale"]
         parts.append(
-            "Why: what a Gaussian process does not know about it takes to be zero, so away from its data it errs by "
-            "about the size of what it was left to learn, and a force error reaches the acceleration through H, whose "
-            f"largest entry on these data is {shown(scale['largest_H'], 0)} /(kg m²). Root mean squares:"
+            "What each model was left to learn, root mean square over training rows. A Gaussian process falls back to "
+            "zero away from its data, so this is the size that its errors can reach there; a force error reaches the "
+            f"acceleration through H, whose largest entry on these data is {shown(scale['largest_H'], 0)} /(kg m²)."
         )
         parts.append(markdown_table(["what", "size"], [[text, shown(scale[key], 2)] for key, text in TARGETS.items()]))
         return "\n\n".join(parts)

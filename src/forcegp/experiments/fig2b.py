@@ -25,7 +25,7 @@ HEADINGS = {
     "constraint_error": "mean constraint error \\|A a − b\\| [m/s²]",
     "nlpd": "negative log predictive density of a measurement [nats per row]",
     "coverage_95": "share of measurements inside the 95 % interval",
-    "cpu_seconds": "CPU seconds of one fit, search only",
+    "cpu_seconds": "CPU seconds of the search of this fit alone, without those that it began from",
 }
 
 
@@ -60,6 +60,14 @@ class Fig2b(Experiment):
         for model in self.on_all_rows:
             out += [fit_to_all(model, data[seed].name, seed, self.settings) for seed in self.seeds_many_points]
         return out
+
+    def _search_words(self) -> list[str]:
+        """Starts and tolerance by number of points."""
+        by_points = {count: self.settings.of(count) for count in self.points}
+        return [
+            f"N = {count}: {each['restarts']} starts, tolerance {each['tolerance']:g}"
+            for count, each in by_points.items()
+        ]
 
     @override
     def summary(self, results: Results) -> dict[str, Any]:
@@ -105,7 +113,9 @@ class Fig2b(Experiment):
         parts = [
             f"Medians over seeds (least–largest), {len(self.seeds)} seeds up to N = {self.few_points}, "
             f"{len(self.seeds_many_points)} above. Training and test rows come from different trajectories. The floor "
-            f"of the MAE against noisy accelerations is {summary['noise_floor']:.4f}."
+            f"of the MAE against noisy accelerations is {summary['noise_floor']:.4f}. Searches: "
+            + "; ".join(self._search_words())
+            + ". From the second number of points on, the first start is where the fit to fewer points ended."
         ]
         for score in SCORES:
             rows = []

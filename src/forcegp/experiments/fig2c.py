@@ -70,7 +70,9 @@ class Fig2c(Experiment):
             }
             for name in names
         }
-        return {"points": self.points, "traces": traces, "intervals": intervals, "seeds": len(estimates)}
+        converged = sum(each["converged"] for each in estimates)
+        out = {"points": self.points, "traces": traces, "intervals": intervals}
+        return {**out, "seeds": len(estimates), "converged": converged}
 
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
@@ -102,7 +104,7 @@ class Fig2c(Experiment):
                 last = [number(trace[name][-1]) for name in ("mass_error", "center_error", "mae")]
                 found = "never" if trace["found_at"] is None else str(trace["found_at"])
                 std = [shown(trace["std"]["mass"]), " ".join(shown(trace["std"][axis]) for axis in AXES)]
-                iterations = str(len(trace["mass_error"]) - 1)
+                iterations = f"{len(trace['mass_error']) - 1}{'' if trace['converged'] else ' (limit)'}"
                 rows.append([f"{MODELS[model]}, {MEANS[mean]}", iterations, found, *last[:2], *std, last[2]])
         header = [
             "model",
@@ -133,7 +135,8 @@ class Fig2c(Experiment):
                 for mean, trace in means.items()
             ),
             f"**Are the standard errors right?** S-GP with Q_K on {summary['seeds']} seeds, "
-            f"N = {self.points_interval}; how often the 95 % interval (1.96 standard errors) holds the truth:",
+            f"N = {self.points_interval}; how often the 95 % interval (1.96 standard errors) holds the truth (an "
+            f"infinite one counts as holding it). {summary['converged']} of the searches met their tolerance.",
             markdown_table(["parameter", "\\|error\\|", "standard error", "truth inside"], intervals),
         ]
         return "\n\n".join(parts)

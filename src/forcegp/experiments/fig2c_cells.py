@@ -59,7 +59,8 @@ def estimate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[st
     posterior = _fitted(train, {**spec, "model": "s-gp", "mean": "analytical"})
     values = {NAMES[name]: value for name, value in _identification(posterior).values.items()}
     error = {name: values[name] - true[name] for name in values}
-    return {"error": error, "iterations": len(posterior.result.history) - 1, **_uncertainty(posterior)}
+    search = {"iterations": len(posterior.result.history) - 1, "converged": posterior.result.converged}
+    return {"error": error, **search, **_uncertainty(posterior)}
 
 
 def wrong_system(system: MechanicalSystem) -> MechanicalSystem:

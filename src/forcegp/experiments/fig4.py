@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -10,8 +12,8 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
-from forcegp.experiments.fig4_cells import ARRAYS, CONTROLS, DIVERGED, FREQUENCY, VARIANTS
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, spread
+from forcegp.experiments.fig4_cells import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
 from forcegp.experiments.results import Results
@@ -75,7 +77,7 @@ class Fig4(Experiment):
         }
         true = [results.result(_truth_name(seed)) for seed in self.seeds]
         twins = {
-            size: {second: spread(x for each in true for x in each["joint_error"][size][second]) for second in rows}
+            size: {second: _spread([x for each in true for x in each["joint_error"][size][second]]) for second in rows}
             for size, rows in true[0]["joint_error"].items()
         }
         recorded = {
@@ -90,11 +92,16 @@ class Fig4(Experiment):
         for second in self.seconds:
             parts = [cell["scores"][f"{second:g}"] for cell in found]
             out[f"{second:g}"] = {
-                "joint_error": spread(error for part in parts for error in part["joint_error"]),
+                "joint_error": _spread([error for part in parts for error in part["joint_error"]]),
                 "constraint": spread(value for part in parts for value in part["constraint_median"]),
                 "constraint_largest": max(max(part["constraint_largest"]) for part in parts),
             }
         return out
+
+    def _first_median(self, summary: Mapping[str, Any], model: str) -> float | None:
+        """Open loop, the first of `seconds`; None if it diverged, or is not part of this experiment."""
+        scores = summary["motions"]["open-loop"][variants_of(model)[0]].get(model)
+        return None if scores is None else scores[f"{self.seconds[0]:g}"]["joint_error"]["median"]
 
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
@@ -125,7 +132,7 @@ class Fig4(Experiment):
                     name: parts[0][name] if name == "time" else np.concatenate([part[name] for part in parts])
                     for name in parts[0]
                 }
-            figures[f"fig4-{control}"] = rollouts_figure(arrays, f"{CONTROLS[control]}, N = {summary['points']}")
+            figures[f"fig4-{control}"] = rollouts_figure(arrays, CONTROLS[control])
         return figures
 
     @override
@@ -136,7 +143,8 @@ class Fig4(Experiment):
         parts = [
             f"{count} initial states ({self.starts} from the test trajectory of each of {len(self.seeds)} seeds), the "
             f"recorded torques, symplectic Euler with the recorded step (or the projecting integrator), mean of the "
-            f"posterior, N = {summary['points']}. Joint error: mean over the joints of |q − q recorded|, median over "
+            f"posterior; Gaussian processes of {summary['points']} points, the network of all {self.data.rows} "
+            "training rows. Joint error: mean over the joints of |q − q recorded|, median over "
             "the motions (least–largest). The recorded motion itself is off the surface by "
             f"{number(recorded['median'])} m in the median and by {number(recorded['largest'])} m at most.",
             "**How long can an open loop be compared?** The recording comes from a stiff controller; its torques alone "
@@ -166,12 +174,11 @@ class Fig4(Experiment):
             "A motion that diverges (a joint beyond 100 rad/s) counts as infinitely wrong from there on, and its |c| "
             "up to there."
         )
-        gp, mean = (summary["motions"]["open-loop"][variants_of(m)[0]].get(m) for m in ("gp", "s-gp-mean"))
-        if gp is not None and mean is not None:
-            share = mean[seconds[0]]["joint_error"]["median"] / gp[seconds[0]]["joint_error"]["median"]
+        gp, mean = (self._first_median(summary, model) for model in ("gp", "s-gp-mean"))
+        if gp and mean:
             parts.append(
                 f"After {seconds[0]} s of open loop the median joint error of S-GP + analytical mean (Baumgarte) is "
-                f"{share:.3f} of the GP's."
+                f"{mean / gp:.3f} of the GP's."
             )
         return "\n\n".join(parts)
 
@@ -198,9 +205,17 @@ def _each(summary: Mapping[str, Any]) -> list[tuple[str, str, str, Mapping[str, 
     ]
 
 
+def _spread(errors: Sequence[float | None]) -> dict[str, Any]:
+    """Median and range of errors of which None is infinite (diverged); the median of an even number is the larger one.
+
+    What is infinite is None in the result, too.
+    """
+    ordered = sorted(math.inf if error is None else error for error in errors)
+    parts = {"median": statistics.median_high(ordered), "min": ordered[0], "max": ordered[-1]}
+    return {**{name: x if math.isfinite(x) else None for name, x in parts.items()}, "values": list(errors)}
+
+
 def _error(error: Mapping[str, Any]) -> str:
-    """A spread of joint errors, in which motions that diverged are infinite."""
-    if error["median"] >= DIVERGED:
-        return f"diverged (best {number(error['min'])})"
-    text = shown(error)
-    return text.replace(number(DIVERGED), "∞")
+    """`.0831 (.0825–∞)`: motions that diverged are infinite."""
+    median, least, largest = ("∞" if error[part] is None else number(error[part]) for part in ("median", "min", "max"))
+    return f"{median} ({least}–{largest})"

@@ -40,8 +40,6 @@ VARIANTS = {
     "none": "not stabilised",
     "projected": "projected onto the surface",
 }
-DIVERGED = 1e9
-"""Joint error of a motion that diverged [rad]: larger than any other, and a number that JSON can hold."""
 
 
 def roll(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -82,7 +80,7 @@ def truth(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, 
 
     generator = torch.Generator().manual_seed(0)
     change = torch.randn(recorded.q[:, 0].shape, generator=generator, dtype=torch.float64)
-    errors: dict[str, dict[str, list[float]]] = {}
+    errors: dict[str, dict[str, list[float | None]]] = {}
     with torch.no_grad():
         for size in (0.0, *PERTURBATIONS):
             start = recorded.q[:, 0] + size * change
@@ -91,9 +89,7 @@ def truth(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, 
             )
             error = (motion.q.movedim(0, 1) - recorded.q).abs().mean(-1).numpy()
             rows = {f"{second:g}": round(second / recorded.dt) for second in spec["seconds"]}
-            errors[f"{size:g}"] = {
-                name: np.nan_to_num(error[:, row], nan=DIVERGED).tolist() for name, row in rows.items()
-            }
+            errors[f"{size:g}"] = {name: _finite(error[:, row]) for name, row in rows.items()}
     c = contact.distance(system.robot.kinematics(recorded.q)).abs().numpy()
     constraint = {"largest": float(c.max()), "median": float(np.median(c))}
     return {"joint_error": errors, "recorded_constraint": constraint}
@@ -127,14 +123,20 @@ class _Recorded:
         return feedback
 
 
-def _scores(error: Float[np.ndarray, "n rows"], c: Float[np.ndarray, "n rows"], step: int) -> dict[str, list[float]]:
-    """Per motion: error at `step`, median and largest |c| up to there, or up to where it diverged."""
+def _scores(
+    error: Float[np.ndarray, "n rows"], c: Float[np.ndarray, "n rows"], step: int
+) -> dict[str, list[float | None]]:
+    """Per motion: error at `step` (None if it diverged before), median and largest |c| up to there, or to its end."""
     until = c[:, : step + 1]
     return {
-        "joint_error": np.nan_to_num(error[:, step], nan=DIVERGED).tolist(),
+        "joint_error": _finite(error[:, step]),
         "constraint_median": np.nanmedian(until, axis=1).tolist(),
         "constraint_largest": np.nanmax(until, axis=1).tolist(),
     }
+
+
+def _finite(errors: Float[np.ndarray, " n"]) -> list[float | None]:
+    return [float(error) if np.isfinite(error) else None for error in errors]
 
 
 def _displaced(system: MechanicalSystem, q: Float[Tensor, "n nv"]) -> Float[Tensor, "n nv"]:

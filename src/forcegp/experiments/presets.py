@@ -54,7 +54,7 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
         ),
         Extrapolation(data=PAPER_DATA, points=200, seeds=PAPER_SEEDS[:3], settings=PAPER_SEARCH),
         Ablation(
-            data=PAPER_DATA, points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:2], settings=PAPER_SEARCH, cutoffs=(30.0, 10.0)
+            data=PAPER_DATA, points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:1], settings=PAPER_SEARCH, cutoffs=(30.0, 10.0)
         ),
     ),
     "smoke": (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,9 +24,8 @@ def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[st
     `beside` is the folder of the figures, relative to the page.
     """
     preset = documents[experiments[0].name]["preset"]
-    figure = experiments[0].name if len(experiments) == 1 else "all"
     parts = ["# Reproduction of the paper"]
-    parts.append(INTRODUCTION.format(command=f"forcegp reproduce {figure} --preset {preset}"))
+    parts.append(INTRODUCTION.format(command=documents[experiments[0].name]["command"]))
     if preset != "paper":
         parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers say nothing about the models.**")
     for experiment in experiments:
@@ -33,9 +33,23 @@ def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[st
         parts.append(f"## {experiment.title}")
         parts += [f"![{experiment.title}]({beside}/{name}.png)" for name in document["figures"]]
         parts.append(experiment.section(document["summary"]))
+        parts += _warnings(document["warnings"])
     seconds = {name: value for document in documents.values() for name, value in document["cpu_seconds"].items()}
-    parts += ["## Time", _times(documents[experiments[0].name]["machine"], seconds)]
+    machines = sorted({machine for document in documents.values() for machine in document["machines"]})
+    parts += ["## Time", _times(" and ".join(machines), seconds)]
     return "\n\n".join(parts) + "\n"
+
+
+def _warnings(by_cell: Mapping[str, Sequence[str]]) -> list[str]:
+    """What the computation warned of, with the number of cells and one of them; numbers in the text are that one's."""
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for cell, messages in by_cell.items():
+        for message in messages:
+            kinds.setdefault(re.sub(r"\d[\d.e+-]*", "#", message), []).append((cell, message))
+    if not kinds:
+        return []
+    lines = [f"* in {len(found)} cells, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
+    return ["Warnings while this was computed:\n\n" + "\n".join(lines)]
 
 
 def _times(machine: str, times: Mapping[str, float]) -> str:

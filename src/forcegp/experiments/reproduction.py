@@ -6,15 +6,13 @@ import csv
 import io
 import json
 import os
-import platform
 import secrets
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forcegp import __version__
-from forcegp.errors import FileFormatError
+from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.evaluation import save_figure
 from forcegp.experiments.cells import Progress, run_cells
 from forcegp.experiments.experiment import Experiment, Row
@@ -24,10 +22,8 @@ from forcegp.experiments.results import KIND, Results, write_json, write_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAGE, BESIDE = "reproduction.md", "reproduction"
-"""The page, and the folder beside it with its figures, JSON and CSV."""
-
-LIBRARIES = ("torch", "gpytorch", "scipy", "numpy", "pybullet")
+BESIDE = "reproduction"
+"""The folder beside the page with its figures, JSON and CSV."""
 
 
 def reproduce(
@@ -35,32 +31,40 @@ def reproduce(
     preset: str,
     out: Path,
     *,
+    command: str,
     docs: Path | None = None,
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
-    Writes `reproduction.md` and, in `reproduction/`, `<name>.json`, `<name>.csv` and the figures as PNG and SVG, into
-    `out` and, if given, into `docs`, too. Raises as `Results.open` and `run_cells`.
+    Writes the page (`page_name`) and, in `reproduction/`, `<name>.json`, `<name>.csv` and the figures as PNG and SVG,
+    into `out` and, if given, into `docs`, too. `command` is what the page says that it was written by.
+    Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and as
+    `Results.open` and `run_cells`.
     """
     for experiment in experiments:
         experiment.require_possible()
     results = Results.open(out, preset)
+    for root in (out, docs) if docs is not None else (out,):
+        _make_folder(root / BESIDE)
     cells = {cell.name: cell for experiment in experiments for cell in experiment.cells()}
     run_cells(results, list(cells.values()), jobs, progress)
     documents, pictures, tables = {}, {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)
         figures = experiment.figures(summary, results)
+        stored = {cell.name: results.load(cell.name) for cell in experiment.cells()}
         documents[experiment.name] = {
             "kind": KIND,
             "forcegp_version": __version__,
             "preset": preset,
+            "command": command,
             "config": experiment.config(),
-            "machine": machine(),
             "figures": list(figures),
-            "cpu_seconds": {cell.name: results.load(cell.name)["cpu_seconds"] for cell in experiment.cells()},
+            "machines": sorted({cell["machine"] for cell in stored.values()}),
+            "cpu_seconds": {name: cell["cpu_seconds"] for name, cell in stored.items()},
+            "warnings": {name: cell["warnings"] for name, cell in stored.items() if cell["warnings"]},
             "summary": summary,
         }
         pictures |= figures
@@ -78,14 +82,25 @@ def _publish(
     tables: Mapping[str, str],
 ) -> None:
     beside = root / BESIDE
-    beside.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
         save_figure(figure, beside / f"{name}.png")
         save_vector(figure, beside / f"{name}.svg")
     for name, document in documents.items():
         write_json(beside / f"{name}.json", document)
         write_text(beside / f"{name}.csv", tables[name])
-    write_text(root / PAGE, report(experiments, documents, BESIDE))
+    write_text(root / page_name(experiments), report(experiments, documents, BESIDE))
+
+
+def page_name(experiments: Sequence[Experiment]) -> str:
+    """`reproduction.md` for all experiments, `fig3.md` for one: a part does not take the place of the whole."""
+    return f"{experiments[0].name}.md" if len(experiments) == 1 else "reproduction.md"
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
 
 
 def read_document(file: Path) -> dict[str, Any]:
@@ -97,17 +112,6 @@ def read_document(file: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") != KIND:
         raise FileFormatError(f"{file} was not written by `{KIND}`.")
     return document
-
-
-def machine() -> str:
-    """Processor, cores and the versions that decide the numbers."""
-    model = platform.processor() or platform.machine()
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else ():
-        if line.startswith("model name"):
-            model = line.partition(":")[2].strip()
-            break
-    versions = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
-    return f"{model}, {os.cpu_count()} cores; Python {platform.python_version()}, {versions}"
 
 
 def as_csv(rows: Sequence[Row]) -> str:

@@ -39,7 +39,7 @@ class Results:
         description = folder / DESCRIPTION
         if description.exists():
             results._require_same(description, preset)
-        elif folder.exists() and (not folder.is_dir() or any(entry.name != LOCK for entry in folder.iterdir())):
+        elif folder.exists() and (not folder.is_dir() or not all(map(_is_own_start, folder.iterdir()))):
             raise InvalidInput(f"{folder} exists and was not written by `{KIND}`; choose another --out.")
         else:
             folder.mkdir(parents=True, exist_ok=True)
@@ -76,22 +76,25 @@ class Results:
         """Where the cell of this name lies, or will lie."""
         return self.folder / CELLS / name
 
-    def has(self, name: str, spec: Mapping[str, Any]) -> bool:
+    def has(self, name: str, digest: str) -> bool:
         """Is this cell finished? Raises as `load`."""
         if not self.cell_folder(name).exists():
             return False
-        self.load(name, spec)
+        self.load(name, digest)
         return True
 
-    def load(self, name: str, spec: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """What the cell stored. Raises FileFormatError if it is damaged or was made with another spec."""
+    def load(self, name: str, digest: str | None = None) -> dict[str, Any]:
+        """What the cell stored. Raises FileFormatError if it is damaged, or of another digest than the one given."""
         file = self.cell_folder(name) / CELL_FILE
         remedy = f"delete the folder {file.parent} and run the same command again: only this cell is computed anew"
         stored = _read(file, remedy)
-        if not {"spec", "result"} <= set(stored):
+        if not {"digest", "spec", "result"} <= set(stored):
             raise FileFormatError(f"{file} is half written; {remedy}.")
-        if spec is not None and stored["spec"] != _as_json(spec):
-            raise FileFormatError(f"{file} was computed with other settings; {remedy}.")
+        if digest is not None and stored["digest"] != digest:
+            raise FileFormatError(
+                f"{file} was computed with other settings, or from cells with other settings; choose another --out, or "
+                f"delete {file.parent} to compute it anew."
+            )
         return stored
 
     def result(self, name: str) -> dict[str, Any]:
@@ -107,15 +110,20 @@ class Results:
         temporary.mkdir()
         try:
             yield temporary
-            os.replace(temporary, place)
+            if (place / CELL_FILE).exists():  # by a process of a killed run that ended later than it should
+                shutil.rmtree(temporary)
+            else:
+                os.replace(temporary, place)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
 
     def remove_leftovers(self) -> None:
         """Delete the temporary folders of runs that were killed; call it under the lock."""
-        for entry in (self.folder / CELLS).glob("**/.*.tmp"):
+        for entry in list((self.folder / CELLS).glob("**/.*.tmp")):
             shutil.rmtree(entry, ignore_errors=True)
+        for entry in list(self.folder.glob(".*.tmp")):
+            entry.unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -133,8 +141,9 @@ def write_text(path: Path, text: str) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _as_json(value: Mapping[str, Any]) -> Any:
-    return json.loads(json.dumps(value))
+def _is_own_start(entry: Path) -> bool:
+    """What a run leaves that is killed before it has written its description."""
+    return entry.name == LOCK or (entry.name.startswith(f".{DESCRIPTION}.") and entry.name.endswith(".tmp"))
 
 
 def _read(file: Path, remedy: str) -> dict[str, Any]:
