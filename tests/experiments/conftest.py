@@ -1,0 +1,31 @@
+"""One short `kuka-surface` motion, as it is and as the data cell of a run, for tests of the experiments' numbers."""
+
+import pytest
+from tests.experiments.stored_cells import DATA, keep
+
+from forcegp.experiments.results import Results
+
+
+@pytest.fixture(scope="session")
+def motion():
+    """480 rows, 2 s, in the order of time, with noise-free accelerations among the truth."""
+    pytest.importorskip("pybullet")
+    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=2, seed=1))
+
+
+@pytest.fixture(scope="module")
+def run(motion, tmp_path_factory):
+    """Results with one data cell: 60 rows to train on, and the motion itself as test trajectory."""
+    from forcegp.data import farthest_rows
+    from forcegp.experiments.data import TEST, TRAIN
+
+    results = Results.open(tmp_path_factory.mktemp("run") / "out", "smoke")
+
+    def write(folder):
+        farthest_rows(motion, 60).save(folder / TRAIN)
+        motion.save(folder / TEST)
+
+    keep(results, DATA, {"seed": 1, "every": 4}, {}, write)
+    return results

@@ -1,0 +1,34 @@
+"""How settings depend on the number of points, and that a series begins where the fit before it ended."""
+
+import json
+
+import pytest
+
+from forcegp.experiments.fits import FitSettings, fit_series
+
+SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, tolerance={"0": 1e-6, "400": 1e-5})
+
+
+@pytest.mark.parametrize(
+    ("points", "restarts", "tolerance"),
+    [(1, 4, 1e-6), (199, 4, 1e-6), (200, 2, 1e-6), (400, 2, 1e-5), (999, 2, 1e-5), (1000, 1, 1e-5), (5000, 1, 1e-5)],
+)
+def test_the_largest_key_that_does_not_exceed_the_points_counts(points, restarts, tolerance):
+    assert SETTINGS.of(points) == {"restarts": restarts, "iterations": 50, "tolerance": tolerance}
+    stored = json.loads(json.dumps(SETTINGS.of(points)))
+    assert stored == SETTINGS.of(points)
+
+
+def test_networks_are_told_their_steps_only_where_the_preset_has_some():
+    assert SETTINGS.of_network() == {}
+    assert FitSettings({"0": 1}, 5, {"0": 1e-6}, network_steps=100).of_network() == {"steps": 100}
+
+
+def test_a_series_begins_where_the_fit_with_fewer_points_ended():
+    cells = fit_series("s-gp", "data/seed3", 3, [400, 100, 200], SETTINGS)
+    assert [cell.spec["points"] for cell in cells] == [100, 200, 400]
+    assert [cell.spec["start"] for cell in cells] == [None, cells[0].name, cells[1].name]
+    assert [cell.spec["restarts"] for cell in cells] == [4, 2, 2]
+    assert cells[0].after == ("data/seed3",)
+    assert all(cell.after == ("data/seed3", cell.spec["start"]) for cell in cells[1:])
+    assert all(cell.spec["seed"] == 3 for cell in cells)
