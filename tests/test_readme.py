@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from forcegp.cli.arguments import parse_arguments
+
 
 def test_the_python_example_runs(repository: Path, tmp_path: Path):
     (example,) = re.findall(r"```python\n(.*?)```", (repository / "README.md").read_text(encoding="utf-8"), re.DOTALL)
@@ -52,3 +54,21 @@ def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_pa
         program, *words = command.split()
         subprocess.run([scripts / program, *words], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert (tmp_path / "identified" / "identified.urdf").exists()
+
+
+def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    states, more, diverged, free, held = done.stdout.splitlines()[-5:]
+    assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
+    assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
+    assert diverged == "tensor([-1, -1])"
+    assert float(held.split()[0]) < 0.5 * float(free.split()[0])
+
+
+def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
+    page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
+    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
+    assert names == ["Simulate", "Simulate", "Fit", "Rollout"]

@@ -1,0 +1,68 @@
+"""How far do rollouts of one fitted model go astray, per integrator, and what do they cost?
+
+Prints the table of docs/rollouts.md: motions of a test trajectory under recorded torques, and one row of samples.
+
+    python benchmarks/rollouts.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+import torch
+
+from forcegp import Baumgarte, KukaSurfaceConfig, StructuredGP, simulate_kuka_surface
+from forcegp.evaluation import recorded_motions, rollout_errors
+
+HELD = Baumgarte(10.0, 1.0)
+RUNS = (("symplectic-euler", HELD, 0), ("symplectic-euler", None, 0), ("rk4", HELD, 0), ("projected", None, 0))
+RUNS_WITH_SAMPLES = (("symplectic-euler", HELD, 20),)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--points", type=int, default=200)
+    parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=21, help="trains on this trajectory, tests on the next")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    train, test = (simulate_kuka_surface(KukaSurfaceConfig(seconds=20, seed=given.seed + k)) for k in (0, 1))
+    assert train.system is not None
+    assert test.system is not None
+    posterior = StructuredGP(train.system).fit(train, points=given.points, restarts=1)
+    recorded = recorded_motions(test, given.starts, given.seconds)
+    header = ("integrator", "Baumgarte", "largest \\|c\\| [mm]", "median \\|c\\| [mm]")
+    print("|", " | ".join((*header, "joint error [rad]: median, largest", "CPU")), "|")
+    print("|---|---|---:|---:|---:|---:|")
+    for integrator, baumgarte, samples in (*RUNS, *RUNS_WITH_SAMPLES):
+        begin = time.process_time()
+        rollout = posterior.rollout(
+            recorded.q[:, 0],
+            recorded.v[:, 0],
+            recorded.u,
+            recorded.dt,
+            integrator=integrator,
+            baumgarte=baumgarte,
+            samples=samples,
+        )
+        seconds = time.process_time() - begin
+        errors = rollout_errors(rollout, recorded, posterior.system)
+        assert errors.constraint is not None
+        if errors.inside is not None:
+            share = f"{np.mean(errors.inside[:, 1:]):.1%} of the recorded positions"
+            print(f"\n{samples} samples: 95 % intervals hold {share}; {seconds:.1f} s CPU")
+            continue
+        worst = errors.joint[:, -1].max(-1)
+        name = "none" if baumgarte is None else f"{baumgarte.omega:g}, {baumgarte.zeta:g}"
+        sizes = f"{1e3 * np.max(errors.constraint):.2g} | {1e3 * np.median(errors.constraint):.2g}"
+        print(
+            f"| `{integrator}` | {name} | {sizes} | {np.median(worst):.3f}, {worst.max():.3f} | {seconds:.1f} s |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
