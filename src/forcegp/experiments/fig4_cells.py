@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.evaluation.recorded_motions import recorded_motions
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.fits import MODEL
 from forcegp.experiments.results import Results
@@ -101,15 +101,9 @@ class _Recorded:
     def __init__(self, trajectory: Dataset, starts: int, seconds: float) -> None:
         assert trajectory.system is not None
         self.system = trajectory.system
-        self.dt = float(np.median(np.diff(trajectory.time)))
-        steps = round(seconds / self.dt)
-        last = len(trajectory) - 1 - steps
-        if last < starts:
-            raise InvalidInput(f"{starts} motions of {steps} steps do not fit into {len(trajectory)} rows.")
-        first = np.linspace(0, last, starts).round().astype(int)
-        index = first[:, None] + np.arange(steps + 1)
-        self.q, self.v, u = (torch.tensor(np.asarray(x)[index]) for x in (trajectory.q, trajectory.v, trajectory.u))
-        self.u = u[:, :-1]
+        motions = recorded_motions(trajectory, starts, seconds)
+        self.dt = motions.dt
+        self.q, self.v, self.u = (torch.tensor(np.asarray(x)) for x in (motions.q, motions.v, motions.u))
 
     def feedback(self) -> Feedback:
         """M (omega^2 (q_recorded - q) + 2 omega (v_recorded - v)) with the recorded M: the same for every model."""
