@@ -1,6 +1,7 @@
 """How well are mass and centre of mass of the tool found, and do the standard errors tell the truth?
 
-One line per seed: errors of the mass (g) and of the centre of mass (mm), each also in standard errors.
+One line per seed: errors of the mass (g) and of the centre of mass (mm), each also in standard errors; how the search
+ended; and the decrement, by how many standard errors a Newton step would still move the estimates.
 
     python benchmarks/identification.py --points 100 --seeds 11 12 13
 """
@@ -19,6 +20,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.robots import parameters_from_physical
 from forcegp.simulation.kuka_description import TOOL_LINK
 
+F64 = torch.float64
 TOO_HEAVY = 0.5
 """kg"""
 TOO_FAR = (0.05, 0.05, -0.03)
@@ -30,6 +32,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=300)
     parser.add_argument("--seeds", type=int, nargs="+", default=[11])
     parser.add_argument("--iterations", type=int, default=60)
+    parser.add_argument("--tolerance", type=float, default=OptimizerOptions.tolerance)
     parser.add_argument("--mean", choices=["analytical", "zero"], default="analytical")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -39,8 +42,8 @@ def main() -> None:
         data = simulate_kuka_surface(KukaSurfaceConfig(seconds=100, seed=seed))
         assert data.system is not None
         link = data.system.robot.link(TOOL_LINK)
-        mass, center, inertia = (torch.tensor(x).double() for x in (link.mass, link.center_of_mass, link.inertia))
-        wrong = parameters_from_physical(mass + TOO_HEAVY, center + torch.tensor(TOO_FAR).double(), inertia)
+        mass, center, inertia = (torch.tensor(x, dtype=F64) for x in (link.mass, link.center_of_mass, link.inertia))
+        wrong = parameters_from_physical(mass + TOO_HEAVY, center + torch.tensor(TOO_FAR, dtype=F64), inertia)
         robot = data.system.robot.with_inertials({TOOL_LINK: wrong})
         begin = time.process_time()
         posterior = StructuredGP(data.system.with_robot(robot), mean=given.mean).fit(
@@ -48,19 +51,20 @@ def main() -> None:
             points=given.points,
             restarts=1,
             learn=robot.link(TOOL_LINK).inertial("mass", "com"),
-            options=OptimizerOptions(iterations=given.iterations),
+            options=OptimizerOptions(iterations=given.iterations, tolerance=given.tolerance),
         )
         fitted = time.process_time()
         found = posterior.identification
         assert found is not None
-        standard = torch.tensor(list(found.standard_errors.values()))
+        standard = torch.tensor(list(found.standard_errors.values()), dtype=F64)
         known = time.process_time()
-        error = torch.tensor(list(found.values.values())).double() - torch.cat([mass[None], center])
+        error = torch.tensor(list(found.values.values()), dtype=F64) - torch.cat([mass[None], center])
         covered, count = covered + ((error / standard).abs() <= 1.96), count + 1
         shown = " ".join(f"{1e3 * e:+.4f} ({e / s:+.2f})" for e, s in zip(error, standard, strict=True))
         print(
             f"seed {seed}: {shown}; {len(found.history) - 1} iterations, {fitted - begin:.1f} s CPU, "
-            f"standard errors {known - fitted:.1f} s",
+            f"standard errors {known - fitted:.1f} s, decrement {found.decrement:.2g}, "
+            f"{'converged' if posterior.result.converged else 'not converged'}",
             flush=True,
         )
     print("in the 95 % interval:", ", ".join(f"{int(c)} of {count}" for c in covered))

@@ -7,18 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gpytorch.kernels import RBFKernel, ScaleKernel
+from gpytorch.priors import NormalPrior
 from tests.models.arm import NOISE, arm_data, arm_system
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.inference import OptimizerOptions
+from forcegp.inference import LatentKernels, OptimizerOptions, minimize_objective
 from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
 from forcegp.models import Coefficients, Noise, StructuredGP, load_posterior, save_posterior
-from forcegp.models.curvature import information_about
-from forcegp.models.objective import squared_distance
+from forcegp.models.curvature import FLAT, curvature_about
+from forcegp.models.objective import squared_distance, with_variance_priors
 from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.priors import NoForces
+from forcegp.priors.kernels import squared_exponential_kernel
 from forcegp.robots import LinkInertia, pseudo_inertia_from_parameters
 
+AT_THE_CENTER = -math.log(2.0 * math.sqrt(2.0 * math.pi))  # log density of N(c, 2^2) at c
 LEARN = (LinkInertia("hand", ("mass", "com")), Coefficients("viscous-joint-friction"))
 
 
@@ -99,6 +103,8 @@ def test_the_posterior_needs_nothing_but_its_system(analytical, tmp_path):
     assert torch.equal(again.predict(q, v, u).mean, posterior.predict(q, v, u).mean)
     stored = json.loads(json.dumps(posterior.identification.to_dict(), allow_nan=False))
     assert stored["parameters"]["hand.com.z"]["unit"] == "m"
+    assert posterior.identification.at_optimum
+    assert stored["decrement"] == posterior.identification.decrement < 0.1
 
 
 def test_noise_is_learned_with_the_physical_parameters():
@@ -137,19 +143,55 @@ def test_schur_complement_of_a_known_quadratic_form():
 
     point = {"a": torch.zeros(2, 1).double(), "p": torch.zeros(3).double(), "b": torch.zeros(2).double()}
     seen = []
-    found = information_about("p", objective, point, lambda done, of: seen.append((done, of)))
+    found = curvature_about("p", objective, point, lambda done, of: seen.append((done, of)))
     expected = torch.linalg.inv(torch.linalg.inv(H)[2:5, 2:5])
-    assert torch.allclose(found, expected, rtol=1e-8)
+    assert torch.allclose(found.information, expected, rtol=1e-8)
     assert seen[-1] == (11, 11)
-    assert torch.allclose(
-        information_about("p", lambda x: (x["p"] ** 2).sum(), {"p": point["p"]}), 2 * torch.eye(3).double()
-    )
+    assert found.decrement == pytest.approx(0.0, abs=1e-9)
+    assert not found.doubts
+    alone = curvature_about("p", lambda x: (x["p"] ** 2).sum(), {"p": point["p"]})
+    assert torch.allclose(alone.information, 2 * torch.eye(3).double())
+
+    # away from the optimum: Newton's method would go to 0, by p in units of the covariance
+    away = {name: torch.as_tensor(generator.standard_normal(tuple(value.shape))) for name, value in point.items()}
+    with pytest.warns(NumericalWarning, match=r"move the estimates by .* raise `iterations`"):
+        moved = curvature_about("p", objective, away)
+    assert moved.decrement == pytest.approx(float(away["p"] @ expected @ away["p"]) ** 0.5, rel=1e-7)
+    size = 0.09 / moved.decrement
+    near = curvature_about("p", objective, {name: size * value for name, value in away.items()})
+    assert near.decrement == pytest.approx(0.09)
+    assert not near.doubts
 
 
-def test_a_saddle_is_told():
+def quadratic(pp, pk, kk):
+    """1/2 pp p^2 + pk p b + 1/2 kk b^2 at 0."""
     point = {"p": torch.zeros(1).double(), "b": torch.zeros(1).double()}
-    with pytest.warns(NumericalWarning, match="not ended at a minimum"):
-        information_about("p", lambda x: (x["p"] ** 2 - x["b"] ** 2).sum(), point)
+    return (lambda x: (0.5 * pp * x["p"] ** 2 + pk * x["p"] * x["b"] + 0.5 * kk * x["b"] ** 2).sum()), point
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [((2.0, 0.0, -2.0), "kernel and noise parameters falls to -2"), ((1.0, 2.0, 1.0), "physical.* falls to -3")],
+)
+def test_a_saddle_is_told(form, words):
+    with pytest.warns(NumericalWarning, match=f"not ended at a minimum.*{words}"):
+        found = curvature_about("p", *quadratic(*form))
+    assert len(found.doubts) == 1
+
+
+def test_no_information_is_no_saddle():
+    found = curvature_about("p", *quadratic(0.0, 0.0, 1.0))
+    assert found.information.item() == pytest.approx(0.0, abs=1e-9)
+    assert not found.doubts
+
+
+def test_a_flat_direction_of_the_others_does_not_count_as_known():
+    # b is known to 1/sqrt(kk) = 45 and takes 80 % of the information along; a prior of 1/sqrt(FLAT) = 32 leaves 40 %
+    kk = 0.5 * FLAT
+    found = curvature_about("p", *quadratic(1.0, (0.8 * kk) ** 0.5, kk))
+    assert found.information.item() == pytest.approx(1.0 - 0.8 * kk / FLAT, rel=1e-6)
+    # at a minimum the coupling vanishes with the curvature (pk^2 <= pp kk), so nothing is lost to rounding
+    assert curvature_about("p", *quadratic(1.0, 1e-6, 1e-12)).information.item() == pytest.approx(1.0, rel=1e-6)
 
 
 def test_the_prior_is_the_affine_invariant_distance_and_pulls_to_the_start():
@@ -192,9 +234,68 @@ def test_every_iterate_of_a_structured_fit_is_kept():
         posterior.at_iteration(len(result.history))
     assert posterior.settings["learned"] == [{"link": "hand", "parts": ["mass"]}]
     seen = []
+    again = replace(found, progress=lambda done, of: seen.append((done, of)))
     with pytest.warns(NumericalWarning, match="not ended at a minimum"):  # after 4 iterations
-        _ = replace(found, progress=lambda done, of: seen.append((done, of))).information
+        _ = again.information
+    assert not again.at_optimum
     assert seen[-1] == (33, 33)  # 2 for the mass, 1 at the optimum, 30 for kernels
+    assert again.verdict.startswith("The search has not ended at a minimum (")
+    assert not again.to_dict()["at_optimum"]
+
+
+def quiet_joint(rows, seed):
+    """Data whose unknown force acts on pan alone; moments of the residual see noise on the other joints."""
+    system = damped()
+    data = arm_data(rows, seed, system)
+    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
+    force = torch.stack([-0.8 * torch.tanh(v[:, 0] / 0.4), *torch.zeros(2, rows).double()], -1)
+    noise = NOISE * np.random.default_rng([seed, 1]).standard_normal((rows, 3))
+    return replace(data, a=system.dynamics(q, v, u).acceleration(force).numpy() + noise, truth={})
+
+
+def test_a_variance_does_not_collapse():
+    data, learn, options = quiet_joint(12, 1), LinkInertia("hand", ("mass",)), OptimizerOptions(iterations=100)
+    posterior = StructuredGP(damped()).fit(data, learn=learn, restarts=1, options=options)
+    objective = posterior.identification.objective
+    bare = replace(objective, kernels=objective.likelihood.kernels())  # the same without priors on variances
+    names = [f"kernels.{k}.raw_outputscale" for k in range(3)]
+    start = objective.kernels.initial_parameters() | {PHYSICAL: posterior.result.iterates[0][PHYSICAL]}
+    assert float(bare(start)) == pytest.approx(float(objective(start)) + 3 * AT_THE_CENTER, abs=1e-9)
+    collapsed = minimize_objective(bare, start, options)
+
+    def fall(parameters):
+        return min(float(parameters[name] - start[name]) for name in names)
+
+    assert fall(collapsed.parameters) < -10.0
+    assert -4.0 < fall(posterior.parameters) < -1.0
+    # the curvature knows of the prior: 1/4 for the log of each variance, less what the likelihood takes away
+    assert posterior.identification.curvature.lowest_other > 0.1
+    assert float(replace(objective, hyperprior=False)(start)) == float(replace(bare, hyperprior=False)(start))
+
+
+def test_the_prior_on_variances_is_log_normal_and_has_its_gradient():
+    shared = squared_exponential_kernel(2, 1.0, 0.3)
+    own = ScaleKernel(RBFKernel(), outputscale_prior=NormalPrior(1.0, 5.0)).double()
+    softplus = ScaleKernel(RBFKernel()).double()
+    softplus.outputscale = torch.tensor(0.02).double()
+    plain = LatentKernels([shared, shared, own, softplus])
+    held = with_variance_priors(plain)
+    parameters = {
+        name: (value + 0.7).requires_grad_(name.endswith("raw_outputscale"))
+        for name, value in plain.initial_parameters().items()
+    }
+    variance = math.log1p(float(parameters["kernels.3.raw_outputscale"].detach().exp()))
+    moved = [math.log(variance / 0.02), 0.7]  # in the logarithm of the variance, whatever its constraint
+    expected = sum(-0.5 * (x / 2.0) ** 2 - math.log(2.0 * math.sqrt(2.0 * math.pi)) for x in moved)
+    difference = held.log_prior(parameters) - plain.log_prior(parameters)
+    assert float(difference.detach()) == pytest.approx(expected, rel=1e-9)
+    names = ("kernels.0.raw_outputscale", "kernels.3.raw_outputscale")
+
+    def prior(*raw):
+        return held.log_prior({**parameters, **dict(zip(names, raw, strict=True))})
+
+    assert torch.autograd.gradcheck(prior, tuple(parameters[name] for name in names))
+    assert with_variance_priors(held).log_prior(parameters) == held.log_prior(parameters)
 
 
 def test_a_negative_strength_is_refused():

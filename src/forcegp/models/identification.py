@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.curvature import Report, information_about
+from forcegp.models.curvature import Curvature, Report, curvature_about
 from forcegp.models.objective import FitObjective
 from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.models.search import blas_threads
@@ -91,15 +91,26 @@ class Identification:
         return self.physical.system_at(self.parameters[PHYSICAL])
 
     @cached_property
-    def information(self) -> Float[Tensor, "k k"]:
-        """Curvature of the objective in the scaled parameters s, after all others have followed.
-
-        Warns NumericalWarning where the search has not ended at a minimum.
-        """
+    def curvature(self) -> Curvature:
+        """Curvature of the objective where the search ended, in z; warns NumericalWarning where that is no minimum."""
         with blas_threads(self.objective.likelihood.training.q.numel()):
-            in_z = information_about(PHYSICAL, self.objective, self.parameters, self.progress)
+            return curvature_about(PHYSICAL, self.objective, self.parameters, self.progress)
+
+    @property
+    def decrement(self) -> float:
+        """Standard errors by which a Newton step would still move the estimates; 0 at an optimum."""
+        return self.curvature.decrement
+
+    @property
+    def at_optimum(self) -> bool:
+        """Whether the search ended at a minimum: `decrement` below 0.1 and no negative curvature."""
+        return not self.curvature.doubts
+
+    @cached_property
+    def information(self) -> Float[Tensor, "k k"]:
+        """Curvature of the objective in the scaled parameters s, after all others have followed."""
         inverse = torch.linalg.inv(self.physical.transform)  # z = T^-1 s
-        return inverse.mT @ in_z @ inverse
+        return inverse.mT @ self.curvature.information @ inverse
 
     @cached_property
     def _directions(self) -> tuple[Tensor, Tensor]:
@@ -154,7 +165,14 @@ class Identification:
 
     @property
     def verdict(self) -> str:
-        """What the data cannot tell, as a sentence."""
+        """What the data cannot tell, as a sentence, after what the search did not reach."""
+        if not self.at_optimum:
+            doubts = "; ".join(self.curvature.doubts)
+            return f"The search has not ended at a minimum ({doubts}): let it go on. {self._identified}"
+        return self._identified
+
+    @property
+    def _identified(self) -> str:
         if not self.weak_directions:
             return "The data identify every parameter that was learned."
         listed = "; ".join(map(str, self.weak_directions))
@@ -185,5 +203,7 @@ class Identification:
             },
             "weak_directions": [{"weights": d.weights, "std": plain(d.std)} for d in self.weak_directions],
             "verdict": self.verdict,
+            "at_optimum": self.at_optimum,
+            "decrement": self.decrement,
             "history": list(self.history),
         }

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
+from gpytorch.kernels import ScaleKernel
+from gpytorch.priors import NormalPrior
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,13 +18,16 @@ from forcegp.models.noise import Noise
 from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.robots import pseudo_inertia_from_parameters
 
+LOG_VARIANCE_SPREAD = 2.0
+"""Standard deviation of the prior on the logarithm of a latent's variance, where physical parameters are learned."""
+
 
 @dataclass(frozen=True, eq=False)
 class FitObjective:
     """The objective as a function of the free parameters alone; a class so that processes can receive it.
 
-    With `hyperprior` kernels and learned noise have their priors; `prior_strength` is the weight of the learned
-    inertias' distance from where they start.
+    With `hyperprior` kernels (see also `with_variance_priors`) and learned noise have their priors; `prior_strength` is
+    the weight of the learned inertias' distance from where they start.
     """
 
     likelihood: MarginalLikelihood
@@ -47,6 +53,27 @@ class FitObjective:
             return value
         nv = self.likelihood.system.robot.nv
         return value - self.kernels.log_prior(parameters) - self.noise.log_prior(parameters, nv)
+
+
+def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
+    """A copy of which every output scale (variance) carries the prior log variance ~ N(log of its present value, 2^2).
+
+    For fits that learn physical parameters, whose present values come from moments of the residual. The likelihood is
+    flat below the noise: there a variance can run off to zero, the curvature takes the force for known to be zero, and
+    standard errors of what competes with it are too small. Shared kernels count once; priors that a kernel brought
+    along stay.
+    """
+    out = deepcopy(kernels)
+    for module in out.modules():
+        if isinstance(module, ScaleKernel) and "outputscale_prior" not in [name for name, *_ in module.named_priors()]:
+            center = _log_variance(module).detach()
+            prior = NormalPrior(center, torch.full_like(center, LOG_VARIANCE_SPREAD))
+            module.register_prior("outputscale_prior", prior, _log_variance)
+    return out
+
+
+def _log_variance(kernel: ScaleKernel) -> Tensor:
+    return torch.as_tensor(kernel.outputscale).log()
 
 
 def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "10"]) -> Float[Tensor, ""]:

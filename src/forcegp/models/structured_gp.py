@@ -24,7 +24,7 @@ from forcegp.models.fit_arguments import check_search_numbers, first_start, reso
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import Noise
-from forcegp.models.objective import FitObjective
+from forcegp.models.objective import LOG_VARIANCE_SPREAD, FitObjective, with_variance_priors
 from forcegp.models.physical_parameters import PHYSICAL, Learned, learn_to_list
 from forcegp.models.physical_start import PhysicalStart
 from forcegp.models.protocol import Model
@@ -102,7 +102,8 @@ class StructuredGP(Model):
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: processes for the restarts (joblib); results do not depend on it.
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
-            maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
+            maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood. With
+            `learn` the variances of the processes have a weak one as well (`models.objective.with_variance_priors`).
         options: the search itself.
         start: unconstrained parameters at which the first search begins instead of moments, for example
             `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
@@ -135,6 +136,8 @@ class StructuredGP(Model):
         learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
         begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters, prior_strength)
         kernels = likelihood.kernels() if begin is None else begin.kernels
+        if begin is not None and hyperprior:
+            kernels = with_variance_priors(kernels)
         moments = (kernels.initial_parameters() if begin is None else begin.path[-1]) | learned_noise
         options = options or OptimizerOptions()
         if PHYSICAL in (start or {}):
@@ -180,6 +183,7 @@ class StructuredGP(Model):
         if begin is None:
             return fitted._posterior(likelihood, kernels, result.parameters | fixed, result, settings)
         settings |= {"learned": learn_to_list(begin.physical), "prior_strength": prior_strength}
+        settings["log_variance_spread"] = LOG_VARIANCE_SPREAD if hyperprior else None
         identification = Identification.of(begin.physical, objective, result)
         parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
         posterior = replace(fitted, system=identification.system).condition(
