@@ -277,7 +277,7 @@ def test_the_prior_on_variances_is_log_normal_and_has_its_gradient():
     shared = squared_exponential_kernel(2, 1.0, 0.3)
     own = ScaleKernel(RBFKernel(), outputscale_prior=NormalPrior(1.0, 5.0)).double()
     softplus = ScaleKernel(RBFKernel()).double()
-    softplus.outputscale = torch.tensor(0.02).double()
+    softplus.outputscale = torch.tensor(0.02, dtype=torch.float64)
     plain = LatentKernels([shared, shared, own, softplus])
     held = with_variance_priors(plain)
     parameters = {
