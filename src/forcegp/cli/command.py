@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from tyro.conf import arg
 
@@ -17,6 +17,8 @@ Debug = Annotated[bool, arg(help="Show the traceback of an error.")]
 class Command(ABC):
     """One command: a frozen dataclass with its options as fields, the two below last, and what it does as `run`."""
 
+    interrupted: ClassVar[str] = "no partial output was kept"
+    """What Ctrl-C has left behind."""
     json: Json
     debug: Debug
 

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import NoReturn
 
 from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.command import Command
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError
 
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"forcegp {__version__}")
         return OK
-    debug = "--debug" in given
+    debug, command = "--debug" in given, None
     showwarning, terminate = warnings.showwarning, None
     with contextlib.suppress(ValueError):  # not in the main thread
         terminate = signal.signal(signal.SIGTERM, _terminate)  # so that temporary files are removed then, too
@@ -42,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:
-        return _fail("interrupted; no partial output was kept.", INTERRUPTED, debug)
+        return _fail(f"interrupted; {(command or Command).interrupted}.", INTERRUPTED, debug)
     except BrokenPipeError:  # the reader of a pipe has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK

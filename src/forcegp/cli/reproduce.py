@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from tyro.conf import Positional, arg
 
@@ -28,6 +28,8 @@ class Reproduce(Command):
       forcegp reproduce fig2b --preset paper --jobs 2
       forcegp reproduce fig2b --points 50 100 --seeds 7 8 --out my-curves
     """
+
+    interrupted: ClassVar[str] = "finished cells are kept, and the same command goes on from there"
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""
