@@ -172,6 +172,22 @@ def test_a_warm_start_begins_where_another_fit_ended(train):
         model.fit(train, points=20, start={"kernels.9.raw_outputscale": torch.zeros(())})
 
 
+@pytest.mark.parametrize("learn", [False, True])
+def test_iterates_belong_to_the_history(train, learn):
+    model = IndependentGP(train.system, noise=Noise(NOISE, learn=learn))
+    options = OptimizerOptions(iterations=6, keep_iterates=True)
+    posterior = model.fit(train, points=15, restarts=2, hyperprior=False, options=options)
+    result = posterior.result
+    assert len(result.iterates) == len(result.history) > 3
+    training = posterior.likelihood.training
+    for value, iterate in zip(result.history, result.iterates, strict=True):
+        assert set(iterate) == set(result.parameters)
+        point = {**posterior.parameters, **iterate}
+        there = model.condition(training, point, result, posterior.settings).negative_log_likelihood
+        assert there == pytest.approx(value, rel=1e-9)
+    assert model.fit(train, points=15, restarts=1, options=OptimizerOptions(iterations=2)).result.iterates == ()
+
+
 def test_restarts_in_processes_give_the_same(train):
     model = IndependentGP(train.system)
     how = {"points": 12, "restarts": 2, "seed": 7, "options": OptimizerOptions(iterations=3)}

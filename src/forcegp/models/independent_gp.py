@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from forcegp.models.search import FitProgress, blas_threads, default_restarts, p
 from forcegp.priors import JointForces
 
 Outcomes = list[OptimizationResult | FitError]
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +138,7 @@ class IndependentGP(Model):
             converged=all(result.converged for result in best),
             evaluations=sum(result.evaluations for result in every),
             cpu_seconds=sum(result.cpu_seconds for result in every),
+            iterates=_iterates(best),
         )
 
     @override
@@ -222,9 +224,20 @@ def _all_joints(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def _summed(histories: Sequence[Sequence[float]]) -> tuple[float, ...]:
-    """The sum of the objectives after every iteration; a search that has ended stays where it is."""
+    """The sum of the objectives after every iteration."""
     longest = max(len(history) for history in histories)
-    return tuple(sum(history[min(k, len(history) - 1)] for history in histories) for k in range(longest))
+    return tuple(sum(_at(history, k) for history in histories) for k in range(longest))
+
+
+def _iterates(results: Sequence[OptimizationResult]) -> tuple[dict[str, Tensor], ...]:
+    """The parameters of all joints that belong to the summed history; empty where they were not kept."""
+    longest = max(len(result.iterates) for result in results)
+    return tuple(_all_joints([_at(result.iterates, k) for result in results]) for k in range(longest))
+
+
+def _at(values: Sequence[Value], k: int) -> Value:
+    """The value after iteration k of a search; one that has ended stays where it is."""
+    return values[min(k, len(values) - 1)]
 
 
 def _total(outcomes: Outcomes) -> float | None:
