@@ -121,9 +121,9 @@ class DataWarning(UserWarning):
     """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
 
 
-def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str]) -> str:
-    """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Frames: ...`."""
+def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Valid frames: ...`; `cutoff` as in difflib."""
     names = sorted(valid)
-    close = difflib.get_close_matches(given, names, n=1)
+    close = difflib.get_close_matches(given, names, n=1, cutoff=cutoff)
     hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"no {kind} {given!r} in {owner}{hint} Valid {kind}s: {', '.join(names) or '(none)'}"

@@ -99,7 +99,10 @@ WRONG = [
     ("rollout run gap.h5 --start 5 --seconds 0.05", "the time steps are uneven: 0.02 s after row 6"),
     ("rollout run backwards.h5 --starts 1 --seconds 0.05", "not in the order of time"),
     ("rollout run other.h5 --starts 1 --seconds 0.05", "joints a, b, c; the model was trained on pan, lift, bend"),
-    ("rollout run arm.h5 --starts 1 --seconds 0.05 --integrator euler", "allowed: symplectic-euler, rk4, projected"),
+    (
+        "rollout run arm.h5 --starts 1 --seconds 0.05 --integrator euler",
+        "did you mean 'symplectic-euler'",
+    ),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte strong", "--baumgarte is 'strong'; give none, OMEGA"),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte 1,2,3", "--baumgarte is '1,2,3'"),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte -1", "Baumgarte omega is -1.0"),

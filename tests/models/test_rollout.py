@@ -181,7 +181,7 @@ def test_progress_counts_mean_and_samples(posterior, start):
         ({"q0": torch.zeros(0, 1, 3)}, "no motion at all"),
         ({"samples": -1}, "samples is -1"),
         ({"seed": -1}, "seed is -1"),
-        ({"integrator": "euler"}, r"integrator is 'euler'; did you mean .* allowed: symplectic-euler, rk4, projected"),
+        ({"integrator": "euler"}, "no integrator 'euler' in forcegp; did you mean 'symplectic-euler'"),
         ({"dt": 0.0}, r"dt is 0\.0"),
     ],
 )

@@ -67,7 +67,7 @@ def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> D
 
     The rank r is found from the data. U_i comes from the singular value decomposition of W~_i. Points of lower rank
     than the largest keep orthonormal columns with zero rows in C_i, which is exact too. Not differentiable on its own:
-    `deflated_negative_log_likelihood` carries the gradients, which do not depend on the choice of basis. Raises
+    `negative_log_likelihood` carries the gradients, which do not depend on the choice of basis. Raises
     NumericalError where W~ or y~ is not finite.
     """
     with torch.no_grad():

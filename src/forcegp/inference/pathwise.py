@@ -132,13 +132,12 @@ class FunctionSamples:
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
         """Every function at points of its own: f_s,c(z_s,i)."""
-        samples, latents = self.beta.shape[:2]
+        samples = self.beta.shape[0]
         scaled = self.kernels.scaled(features)
         cross = self.kernels.cross(scaled).unflatten(1, (samples, -1))  # C S n N
         update = (cross @ self.beta.transpose(0, 1)[..., None])[..., 0]
         points = scaled.unflatten(1, (samples, -1)).transpose(0, 1)
         prior = _cosines(points, self.frequencies, self.amplitudes)
-        assert update.shape[0] == latents
         return prior.movedim(1, -1) + update.permute(1, 2, 0)
 
 

@@ -6,7 +6,6 @@ over the step. All states are batched, (n, nv).
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.integration.constraint_manifold import ConstraintManifold
 from forcegp.mechanics import MechanicalSystem
 
@@ -116,9 +115,7 @@ INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
 def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
     """The integrator of that name for motions of `system`. Raises InvalidInput for any other name."""
     if not isinstance(name, str) or name not in INTEGRATORS:
-        close = difflib.get_close_matches(str(name), INTEGRATORS, n=1, cutoff=0.4)
-        hint = f" did you mean {close[0]!r}?" if close else ""
-        raise InvalidInput(f"integrator is {name!r};{hint} allowed: {', '.join(INTEGRATORS)}.")
+        raise InvalidInput(unknown_name_message("integrator", str(name), "forcegp", INTEGRATORS, cutoff=0.4))
     return INTEGRATORS[name](system)
 
 
