@@ -1,11 +1,14 @@
 """The README's Python example runs as it stands and prints what its comments say."""
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 from forcegp.cli.arguments import parse_arguments
+from forcegp.experiments import published
+from forcegp.experiments.model_names import MODELS
 
 
 def test_the_python_example_runs(repository: Path, tmp_path: Path):
@@ -72,3 +75,15 @@ def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
     assert names == ["Simulate", "Simulate", "Fit", "Rollout"]
+
+
+def test_the_reproduced_numbers_are_those_of_the_reproduction(repository: Path):
+    document = json.loads((repository / "docs" / "reproduction" / "fig2b.json").read_text(encoding="utf-8"))
+    readme = (repository / "README.md").read_text(encoding="utf-8")
+    for model, curve in document["summary"]["curves"].items():
+        cells = [
+            f"{dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[model], strict=True))[count]:.4f} / "
+            f"**{curve[str(count)]['mae']['median']:.4f}**"
+            for count in (100, 200, 400, 1000)
+        ]
+        assert f"| {MODELS[model].label} | {' | '.join(cells)} |" in readme

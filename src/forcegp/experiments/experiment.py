@@ -111,8 +111,8 @@ def shown(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number of ordinary size with that many decimals, others as a power of ten."""
-    if value == 0 or 10.0**-digits * 5 <= abs(value) < 1e4:
+    """With that many decimals; where three or more are asked for, very small and very large ones as a power of ten."""
+    if digits < 3 or value == 0 or 10.0**-digits * 5 <= abs(value) < 1e4:
         return f"{value:.{digits}f}"
     return f"{value:.1e}"
 

@@ -125,7 +125,7 @@ class Fig2b(Experiment):
                     cells = [f"{paper[int(count)]:.4f}" if int(count) in paper else "–" for count in curve]
                     rows.append([f"{MODELS[model].label}, paper", *cells])
                 label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
-                digits = {"cpu_seconds": 0, "nlpd": 2, "coverage_95": 3}.get(score, 4)
+                digits = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}.get(score, 4)
                 rows.append([label, *(shown(scores[score], digits) for scores in curve.values())])
             parts += [f"**{HEADINGS[score]}**", markdown_table(["N", *map(str, self.points)], rows)]
         unconverged = [

@@ -40,8 +40,8 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
             seed=101,
             points_interval=300,
             seeds=tuple(range(101, 111)),
-            iterations=100,
-            tolerance=1e-6,
+            iterations=200,
+            tolerance=1e-7,
         ),
         Fig3(data=PAPER_DATA, points=PAPER_POINTS[:1], seed=101, start=5.0, seconds=3.0, settings=PAPER_SEARCH),
         Fig4(
