@@ -113,6 +113,7 @@ class _Run:
                     worker.terminate()
                 for worker in workers:
                     worker.join()  # before the lock is given back: none of them may finish a cell after that
+                self.results.remove_leftovers()
                 raise
         if self.failed:
             name, cause = next(iter(self.failed.items()))
