@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OURS = "ours"
-FILTERED_MODELS = ("s-gp", "s-gp-mean")
+FILTERED_MODELS = ("s-gp-mean",)
 OVERLAP_MODELS = ("gp", "s-gp-mean")
 
 
@@ -180,7 +180,7 @@ class Ablation(Experiment):
             f"(N = {self.largest}, {len(self.seeds)} seeds), MAE against noisy accelerations; “ours” are the fits of "
             "figure 2b (hyperprior, several starts, one of them where the fit to fewer points ended); the others have "
             "one start and no hyperprior: L-BFGS from moments of the data, and Adam on the logarithms of all "
-            "parameters, from there and from ones:"
+            "parameters, from ones:"
             "\n\n"
             + markdown_table(["model", "paper", *columns.values()], rows)
             + "\n\nNegative log likelihood that each plain search reached (lower is better):\n\n"

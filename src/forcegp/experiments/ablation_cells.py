@@ -26,7 +26,6 @@ from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 PAPER_STEPS, PAPER_RATE = 500, 0.2
 SCHEDULES = {
     "maximum-likelihood": "L-BFGS, no hyperprior",
-    "adam-moments": "Adam from our start",
     "adam-ones": "Adam from ones",
 }
 """Searches without hyperprior and without restarts; "ones": all length scales and variances begin at 1."""

@@ -36,11 +36,11 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
         ),
         Fig2c(
             data=PAPER_DATA,
-            points=400,
+            points=300,
             seed=101,
             points_interval=300,
             seeds=tuple(range(101, 111)),
-            iterations=200,
+            iterations=150,
             tolerance=1e-7,
         ),
         Fig3(data=PAPER_DATA, points=PAPER_POINTS[:1], seed=101, start=5.0, seconds=3.0, settings=PAPER_SEARCH),
@@ -52,9 +52,9 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
             seconds=(1.0, 5.0),
             settings=PAPER_SEARCH,
         ),
-        Extrapolation(data=PAPER_DATA, points=200, seeds=PAPER_SEEDS[:3], settings=PAPER_SEARCH),
+        Extrapolation(data=PAPER_DATA, points=200, seeds=PAPER_SEEDS[:2], settings=PAPER_SEARCH),
         Ablation(
-            data=PAPER_DATA, points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:1], settings=PAPER_SEARCH, cutoffs=(30.0, 10.0)
+            data=PAPER_DATA, points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:1], settings=PAPER_SEARCH, cutoffs=(30.0,)
         ),
     ),
     "smoke": (
