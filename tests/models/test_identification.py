@@ -302,3 +302,25 @@ def test_a_negative_strength_is_refused():
     data = arm_data(5, seed=0, system=damped())
     with pytest.raises(InvalidInput, match="prior_strength is -1"):
         StructuredGP(damped()).fit(data, learn=LEARN, prior_strength=-1.0)
+
+
+def test_estimates_at_the_limit_of_what_is_allowed_count_as_unknown():
+    """Without known forces and without processes, nothing but M^-1 Q_b speaks of the mass, and it runs away."""
+    data = arm_data(30, 1)
+    system = data.system
+    learn = system.robot.link("hand").inertial("mass")
+    posterior = StructuredGP(system, NoForces(), "zero").fit(data, learn=learn)
+    found = posterior.identification
+    at_limit = replace(
+        found,
+        parameters={
+            **found.parameters,
+            PHYSICAL: torch.linalg.solve(found.physical.transform, torch.full((1,), 25.0).double()),
+        },
+    )
+    with pytest.warns(NumericalWarning, match="nothing counts as identified"):
+        errors = at_limit.standard_errors
+    assert list(errors.values()) == [float("inf")]
+    assert not at_limit.at_optimum
+    assert "has not ended at a minimum" in at_limit.verdict
+    assert at_limit.to_dict()["decrement"] is None

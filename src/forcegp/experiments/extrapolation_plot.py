@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from forcegp.evaluation.figure_style import QUIET, SMALL, new_figure, quiet
 from forcegp.experiments.extrapolation_cells import REGIONS
 from forcegp.experiments.learning_curves import COLORS
-from forcegp.experiments.model_names import MODELS
+from forcegp.experiments.model_names import MODELS, NETWORKS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +34,8 @@ def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
 
 
 def _label(model: str, scores: Mapping[str, Any]) -> str:
-    return f"{MODELS[model].label} ({scores['points']['median']:.0f} points)"
+    points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
+    return f"{MODELS[model].label} ({points})"
 
 
 def _draw_model(axes: Axes, place: int, scores: Mapping[str, Any], color: str) -> None:

@@ -65,6 +65,11 @@ class Curvature:
     lowest_other: float
     tolerated: float
 
+    @classmethod
+    def unknown(cls, like: Float[Tensor, "k"]) -> Curvature:
+        """No information about parameters of this shape, and no optimum."""
+        return cls(like.new_zeros(len(like), len(like)), float("inf"), 0.0, 0.0, 0.0)
+
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why this is not the curvature at a minimum; empty where it is."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.curvature import Curvature, Report, curvature_about
@@ -93,8 +95,17 @@ class Identification:
     @cached_property
     def curvature(self) -> Curvature:
         """Curvature of the objective where the search ended, in z; warns NumericalWarning where that is no minimum."""
-        with blas_threads(self.objective.likelihood.training.q.numel()):
-            return curvature_about(PHYSICAL, self.objective, self.parameters, self.progress)
+        try:
+            with blas_threads(self.objective.likelihood.training.q.numel()):
+                return curvature_about(PHYSICAL, self.objective, self.parameters, self.progress)
+        except NumericalError as error:  # estimates that ran to the limit of what is allowed
+            warnings.warn(
+                f"the curvature cannot be computed where the search ended ({error}), so nothing counts as identified: "
+                "fix a parameter that the data say nothing about, or give a prior",
+                NumericalWarning,
+                stacklevel=2,
+            )
+            return Curvature.unknown(self.physical.zero)
 
     @property
     def decrement(self) -> float:
@@ -204,6 +215,6 @@ class Identification:
             "weak_directions": [{"weights": d.weights, "std": plain(d.std)} for d in self.weak_directions],
             "verdict": self.verdict,
             "at_optimum": self.at_optimum,
-            "decrement": self.decrement,
+            "decrement": plain(self.decrement),
             "history": list(self.history),
         }
