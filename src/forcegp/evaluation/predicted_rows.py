@@ -29,10 +29,10 @@ class PredictedRows:
 
     `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the model, or of
     the Dataset where it states a larger one; `negative_log_density` of the measured rows under that noise;
-    `known_physics` the acceleration of the known forces alone; `moving_force` M (mean - known_physics), the part of the
-    unknown force that moves the robot (the other part presses on the surface); `unknown_force` Q_U and
-    `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all three None for a model that does not
-    speak of forces; `A`, `b` and the mass matrix `mass`.
+    `known_physics` the acceleration of the known forces alone; `moving_force` M (mean - known_physics), the part of
+    the unknown force that moves the robot (the other part presses on the surface); `unknown_force` Q_U and
+    `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all
+    three None for a model that does not speak of forces; `A`, `b` and the mass matrix `mass`.
     """
 
     mean: Float[np.ndarray, "rows nv"]
