@@ -39,6 +39,8 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
             axes.plot(list(points), errors, "x", color=COLORS[model], markersize=6)
         axes.set_yscale("log")
         axes.set_xscale("symlog", linthresh=10)
+        axes.set_xlim(0, 450)
+        axes.set_xticks([0, 5, 10, 40, 100, 400], ["0", "5", "10", "40", "100", "400"])
         quiet(axes, title=title, x="iteration")
     panels[0].plot([], [], "x", color=QUIET, label="published (2021)")
     entries = panels[0].get_legend_handles_labels()

@@ -125,9 +125,11 @@ class Fig2c(Experiment):
         parts = [
             f"From a tool {start['start_mass']:+.2f} kg too heavy and a centre of mass off by ({first}) m, with all "
             f"kernel hyper-parameters, N = {summary['points']}. The contact point is kinematic: no parameter moves it. "
-            "“With Q_K” the mean holds gravity, Coriolis forces and actuation; “without”, the Gaussian process carries "
-            "them, too, and the tool shows in M alone, through H and M⁻¹ Q_b. (The text of the paper says Q_K = 0, "
-            "the legend of its figure “S-GP + analytical mean”.) Standard errors are those of the curvature.",
+            "“With Q_K” the mean holds gravity, Coriolis forces and actuation, and the first iterations are "
+            "Gauss-Newton steps on inverse dynamics. “Without”, no force is known: the Gaussian processes carry them "
+            "all, so that the scale of forces is free, and the tool shows only in M, through H and M⁻¹ Q_b. (The text "
+            "of the paper says Q_K = 0, the legend of its figure “S-GP + analytical mean”.) Standard errors are those "
+            "of the curvature; a dash is an infinite one.",
             markdown_table(header, rows),
             *(
                 f"{MODELS[model]}, {MEANS[mean]}: {trace['verdict']}"
