@@ -23,6 +23,10 @@ TITLES = {
 }
 
 
+MOST_DRAWN = 300
+"""Points of a curve, about: more than the eye sees would make megabytes of vector graphics."""
+
+
 def rollouts_figure(arrays: Arrays, title: str) -> Figure:
     """Joint error above (diverged: infinite), distance from the surface below (of those that have not diverged)."""
     figure = new_figure(11.0, 6.0)
@@ -32,7 +36,9 @@ def rollouts_figure(arrays: Arrays, title: str) -> Figure:
         shown = dict(arrays[variant])
         if variant == "baumgarte":
             shown = {model: each for model, each in arrays["none"].items() if model not in shown} | shown
-        for model, stored in shown.items():
+        for model, whole in shown.items():
+            every = max(1, len(whole["time"]) // MOST_DRAWN)
+            stored = {name: rows[..., ::every] for name, rows in whole.items()}
             gone = np.isnan(stored["joint_error"])
             _draw(panels[0, column], stored["time"], np.where(gone, np.inf, stored["joint_error"]), model)
             _draw(panels[1, column], stored["time"], _of_the_living(stored["constraint"], gone), model)
