@@ -177,7 +177,7 @@ class Ablation(Experiment):
         return (
             f"**Was the search converged?** The paper takes {PAPER_STEPS} steps of Adam (rate 0.2) from one start, and "
             "the starts of its models differ. The same models on the same data "
-            f"(N = {self.largest}, {len(self.seeds)} seeds), MAE against noisy accelerations; “ours” are the fits of "
+            f"(N = {self.largest}, seeds: {len(self.seeds)}), MAE against noisy accelerations; “ours” are the fits of "
             "figure 2b (hyperprior, several starts, one of them where the fit to fewer points ended); the others have "
             "one start and no hyperprior: L-BFGS from moments of the data, and Adam on the logarithms of all "
             "parameters, from ones:"

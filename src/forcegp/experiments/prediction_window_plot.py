@@ -26,7 +26,15 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
         for row, joint in enumerate(SHOWN_JOINTS):
             axes = panels[row, column]
             time, mean, std = stored["time"], stored["mean"][:, joint], stored["std"][:, joint]
-            axes.plot(time, stored["measured"][:, joint], ".", color=MEASUREMENT, markersize=1.5, label="measured")
+            axes.plot(
+                time,
+                stored["measured"][:, joint],
+                ".",
+                color=MEASUREMENT,
+                markersize=1.5,
+                label="measured",
+                rasterized=True,
+            )
             axes.fill_between(
                 time,
                 mean - INTERVAL * std,

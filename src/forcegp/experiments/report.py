@@ -48,7 +48,7 @@ def _warnings(by_cell: Mapping[str, Sequence[str]]) -> list[str]:
             kinds.setdefault(re.sub(r"\d[\d.e+-]*", "#", message), []).append((cell, message))
     if not kinds:
         return []
-    lines = [f"* in {len(found)} cells, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
+    lines = [f"* cells: {len(found)}, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
     return ["Warnings while this was computed:\n\n" + "\n".join(lines)]
 
 
