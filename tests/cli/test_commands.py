@@ -174,11 +174,17 @@ def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path,
     assert json.loads((tmp_path / "demo" / "results.json").read_text())["seeds"]["train"] == 5
 
 
+def interruptible():
+    """Hear Ctrl-C even where the tests run in the background, whose processes inherit that it is ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path):
     pytest.importorskip("pybullet")
     screen, terminal = pty.openpty()
     command = [executable, "simulate", "kuka-surface", "--seconds", "5000", "--out", "long.h5"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=terminal) as process:
+    to = {"stdout": subprocess.DEVNULL, "stderr": terminal, "preexec_fn": interruptible}
+    with subprocess.Popen(command, cwd=tmp_path, **to) as process:
         os.close(terminal)
         seen = b""
         while b" left" not in seen:  # the bar tells the remaining time, so the work is under way
@@ -197,7 +203,10 @@ def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path)
 def test_ctrl_c_during_reproduce_keeps_the_finished_cells_and_says_so(executable, tmp_path):
     pytest.importorskip("pybullet")
     command = [executable, "reproduce", "fig2b", "--preset", "smoke", "--jobs", "1", "--out", "out"]
-    group = {"start_new_session": True}  # as in a terminal, which interrupts the workers, too
+    group = {
+        "start_new_session": True,
+        "preexec_fn": interruptible,
+    }  # as in a terminal, which interrupts the workers, too
     finished = "[!.]*/[!.]*/cell.json"  # a cell at work has a hidden folder
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **group) as process:
         while not list((tmp_path / "out" / "cells").glob(finished)):
