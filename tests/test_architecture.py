@@ -26,32 +26,9 @@ ROOMS = {
     "models": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration"},
     "simulation": {"errors", "robots", "mechanics", "data"},
     "evaluation": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration", "models"},
-    "experiments": {
-        "errors",
-        "robots",
-        "mechanics",
-        "data",
-        "priors",
-        "inference",
-        "integration",
-        "models",
-        "simulation",
-        "evaluation",
-    },
-    "cli": {
-        "errors",
-        "robots",
-        "mechanics",
-        "data",
-        "priors",
-        "inference",
-        "integration",
-        "models",
-        "simulation",
-        "evaluation",
-        "experiments",
-    },
 }
+ROOMS["experiments"] = set(ROOMS)
+ROOMS["cli"] = set(ROOMS)
 
 # Optional or slow to import: imported inside the function that uses them. The rooms named here may import them at once.
 IMPORTED_WHERE_USED = {"pybullet": set(), "matplotlib": set(), "joblib": set(), "tyro": {"cli"}, "rich": {"cli"}}

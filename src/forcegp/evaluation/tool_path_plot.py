@@ -83,7 +83,7 @@ def fit_figure_to_path(figure: Figure, axes: Axes, *, least: float, most: float)
     """Let the first row of the figure grow for a tall path: `least` and `most` are its parts of the row heights."""
     grid = axes.get_gridspec()
     assert grid is not None  # the axes come from subplots
-    rows = [least, *list(grid.get_height_ratios())[1:]]  # type: ignore[arg-type]
+    rows = [least, *list(grid.get_height_ratios())[1:]]  # type: ignore[arg-type]  # the stub omits that ratios are a sequence
     inch = figure.get_figheight() / sum(rows)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     wanted = 0.8 * figure.get_figwidth() * (high - low) / (right - left) / inch

@@ -82,7 +82,7 @@ def dense(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, 
     """CPU time of the paper's schedule in its dense formulation, and of our search to convergence, side by side."""
     train = training_rows(results, spec["data"], spec["points"])
     assert train.system is not None
-    training = TrainingData(*(torch.tensor(x) for x in (train.q, train.v, train.u, train.a)))
+    training = TrainingData.of(train, train.system.robot.device)
     model = StructuredGP(train.system, mean="zero")
     likelihood = MarginalLikelihood(train.system, model.prior, model.mean, training)
     kernels = likelihood.kernels()

@@ -126,9 +126,7 @@ class _Run:
 
     def _ready(self, free: int) -> list[Cell]:
         """The next cells whose conditions are fulfilled: those that others wait for longest come first."""
-        pending = set(self.waiting) | set(self.failed)
-        ready = [cell for cell in self.waiting.values() if not set(cell.after) & (pending - {cell.name})]
-        ready = [cell for cell in ready if all(self._finished(name) for name in cell.after)]
+        ready = [cell for cell in self.waiting.values() if all(self._finished(name) for name in cell.after)]
         ready.sort(key=lambda cell: -self._work_behind(cell.name))
         chosen = ready[: max(free, 0)]
         for cell in chosen:

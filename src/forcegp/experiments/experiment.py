@@ -34,6 +34,7 @@ class DataSettings:
         return data_cell(seed, **dataclasses.asdict(self))
 
 
+@dataclass(frozen=True)
 class Experiment(ABC):
     """A frozen dataclass whose fields are the configuration; among them `data` and `points`, one number or several."""
 
@@ -46,14 +47,14 @@ class Experiment(ABC):
     def with_points(self, points: Sequence[int]) -> Experiment:
         """The same with other numbers of training points; an experiment at one number takes the largest."""
         given = tuple(sorted(set(points)))
-        return dataclasses.replace(self, points=given[-1] if isinstance(self.points, int) else given)  # type: ignore[type-var]
+        return dataclasses.replace(self, points=given[-1] if isinstance(self.points, int) else given)
 
     def with_seeds(self, seeds: Sequence[int]) -> Experiment:
         """The same on other trajectories."""
         given = tuple(dict.fromkeys(seeds))
         changed = {"seed": given[0], "seeds": given, "seeds_many_points": given}
-        names = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
-        return dataclasses.replace(self, **{name: value for name, value in changed.items() if name in names})  # type: ignore[type-var]
+        names = {field.name for field in dataclasses.fields(self)}
+        return dataclasses.replace(self, **{name: value for name, value in changed.items() if name in names})
 
     def require_possible(self) -> None:
         """Raise InvalidInput for numbers of points that the data do not have."""
@@ -87,7 +88,7 @@ class Experiment(ABC):
 
     def config(self) -> dict[str, Any]:
         """The configuration as plain JSON values."""
-        return dataclasses.asdict(self)  # type: ignore[call-overload]  # every experiment is a dataclass
+        return dataclasses.asdict(self)
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any] | None:

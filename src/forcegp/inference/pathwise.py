@@ -162,4 +162,4 @@ def _scaled(features: Sequence[Tensor], lengthscales: Sequence[Tensor]) -> Float
 
 
 def _names(kernels: Sequence[Kernel] | object) -> str:
-    return ", ".join(sorted({type(kernel).__name__ for kernel in kernels})) or "no kernel at all"  # type: ignore[attr-defined]
+    return ", ".join(sorted({type(kernel).__name__ for kernel in kernels})) or "no kernel at all"  # type: ignore[attr-defined]  # a module list yields kernels

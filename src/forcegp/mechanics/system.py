@@ -156,7 +156,7 @@ class MechanicalSystem:
         forces = list(self.known_forces)
         for name, values in coefficients.items():
             index = self.force_index(name)
-            forces[index] = replace(forces[index], **{str(forces[index].learned): values})  # type: ignore[type-var]
+            forces[index] = replace(forces[index], **{str(forces[index].learned): values})  # type: ignore[type-var]  # known forces are dataclasses
         return replace(self, known_forces=tuple(forces))
 
     def to_dict(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -73,3 +74,12 @@ def first_start(
             )
         first[name] = value.detach().to(first[name])
     return first
+
+
+def described_rows(rows: Dataset, dataset: Dataset) -> dict[str, Any]:
+    """What the settings of a fit tell about its training rows and where they come from, as plain JSON values."""
+    return {
+        "points": len(rows),
+        "rows_available": len(dataset),
+        "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
+    }

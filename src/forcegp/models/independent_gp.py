@@ -14,7 +14,13 @@ from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, minimize_objective
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.fit_arguments import check_search_numbers, first_start, resolved_noise, training_rows
+from forcegp.models.fit_arguments import (
+    check_search_numbers,
+    described_rows,
+    first_start,
+    resolved_noise,
+    training_rows,
+)
 from forcegp.models.independent_posterior import IndependentLikelihood, IndependentPosterior, joint_part, one_joint
 from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.noise import ACCELERATION, Noise
@@ -87,8 +93,7 @@ class IndependentGP(Model):
         noise = resolved_noise(self.noise, dataset)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, jobs, seed)
-        device = self.system.robot.device
-        training = TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
+        training = TrainingData.of(rows, self.system.robot.device)
         likelihood = IndependentLikelihood(self.inputs, training)
         kernels = likelihood.kernels()
         noise_parameters = noise.parameters(self.system.robot.nv)
@@ -104,9 +109,7 @@ class IndependentGP(Model):
             outcomes = run_restarts(search, restarts, jobs, progress)
         result = self._chosen(outcomes)
         settings = {
-            "points": len(rows),
-            "rows_available": len(dataset),
-            "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
+            **described_rows(rows, dataset),
             "restarts": restarts,
             "warm_start": start is not None,
             "seed": seed,

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult, negative_log_likelihood
-from forcegp.mechanics import Baumgarte, MechanicalSystem
+from forcegp.mechanics import Baumgarte
 from forcegp.models.accelerations import AccelerationModel, IndependentAccelerations
 from forcegp.models.marginal_likelihood import RESIDUAL_FLOOR, Standardization, TrainingData
 from forcegp.models.noise import ACCELERATION
@@ -118,11 +118,6 @@ class IndependentPosterior(Posterior):
             self.likelihood.condition(joint, one_joint(kernels, joint), joint_part(self.parameters, joint))
             for joint in range(self.system.robot.nv)
         )
-
-    @property
-    @override
-    def system(self) -> MechanicalSystem:
-        return self.model.system
 
     @property
     @override

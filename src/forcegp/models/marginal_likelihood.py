@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, negative_log_likelihood
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
@@ -34,6 +35,11 @@ class TrainingData:
     v: Float[Tensor, "N nv"]
     u: Float[Tensor, "N nv"]
     a: Float[Tensor, "N nv"]
+
+    @classmethod
+    def of(cls, rows: Dataset, device: torch.device) -> TrainingData:
+        """Copies of all rows of a Dataset."""
+        return cls(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
 
 
 @dataclass(frozen=True, eq=False)

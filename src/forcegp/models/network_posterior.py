@@ -18,7 +18,7 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.fit_arguments import check_search_numbers, training_rows
+from forcegp.models.fit_arguments import check_search_numbers, described_rows, training_rows
 from forcegp.models.marginal_likelihood import Standardization, TrainingData
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Prediction
@@ -72,8 +72,7 @@ class NetworkModel(Model):
         """The rows to train on, as a Dataset and as tensors."""
         rows = training_rows(self.system.robot.joint_names, dataset, points)
         check_search_numbers(1, 1, seed)
-        device = self.system.robot.device
-        return rows, TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
+        return rows, TrainingData.of(rows, self.system.robot.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +89,6 @@ class NetworkPosterior(Posterior):
     parameters: Mapping[str, Tensor]
     result: OptimizationResult
     settings: Mapping[str, Any]
-
-    @property
-    @override
-    def system(self) -> MechanicalSystem:
-        return self.model.system
 
     @property
     @override
@@ -181,9 +175,7 @@ def inputs(
 def fit_settings(rows: Dataset, dataset: Dataset, seed: int, noise: Noise | None, **numbers: Any) -> dict[str, Any]:
     """The resolved configuration of a fit, as plain JSON values."""
     return {
-        "points": len(rows),
-        "rows_available": len(dataset),
-        "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
+        **described_rows(rows, dataset),
         "seed": seed,
         "noise": None if noise is None else noise.to_dict(),
         **numbers,

@@ -47,9 +47,9 @@ class Posterior(ABC):
     result: OptimizationResult
 
     @property
-    @abstractmethod
     def system(self) -> MechanicalSystem:
         """The robot, contacts and known forces."""
+        return self.model.system
 
     @property
     @abstractmethod

@@ -20,7 +20,13 @@ from forcegp.inference import (
     minimize_objective,
 )
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.fit_arguments import check_search_numbers, first_start, resolved_noise, training_rows
+from forcegp.models.fit_arguments import (
+    check_search_numbers,
+    described_rows,
+    first_start,
+    resolved_noise,
+    training_rows,
+)
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import Noise
@@ -127,8 +133,7 @@ class StructuredGP(Model):
         check_search_numbers(restarts, jobs, seed)
         if not 0.0 <= prior_strength < float("inf"):
             raise InvalidInput(f"prior_strength is {prior_strength}; it must be finite and at least 0")
-        device = self.system.robot.device
-        training = TrainingData(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
+        training = TrainingData.of(rows, self.system.robot.device)
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
         _warn_of_distance(self.system, training)
@@ -166,9 +171,7 @@ class StructuredGP(Model):
             cpu_seconds=sum(search.cpu_seconds for search in usable),
         )
         settings = {
-            "points": len(rows),
-            "rows_available": len(dataset),
-            "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
+            **described_rows(rows, dataset),
             "restarts": restarts,
             "warm_start": start is not None,
             "seed": seed,

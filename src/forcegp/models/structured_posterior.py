@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
-from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
@@ -48,11 +48,6 @@ class StructuredPosterior(Posterior):
     def latent(self) -> LatentPosterior:
         """The posterior of the latent functions."""
         return self.likelihood.condition(self.kernels, self.parameters)
-
-    @property
-    @override
-    def system(self) -> MechanicalSystem:
-        return self.model.system
 
     @property
     @override
