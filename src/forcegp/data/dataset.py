@@ -19,7 +19,9 @@ from forcegp.errors import DatasetError, FileFormatError, InvalidInput
 if TYPE_CHECKING:
     from forcegp.mechanics import MechanicalSystem
 
-TRUTH_NAMES = ("a", "lambda", "Q_U")
+TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
+TRUTH_KINDS = ("Q_U.", "force.")
+"""Beginnings of names of which there may be several: parts of Q_U, and forces on a point of the robot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -40,8 +42,9 @@ class Dataset:
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     system: the robot and what it touches, or None.
     noise_std: (nv,) standard deviation of the noise on `a`, if known.
-    truth: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N] and the unknown joint forces "Q_U"
-        (rows, nv), as far as a simulation knows them.
+    truth: as far as a simulation knows them, noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
+        the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
+        "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: anything that JSON can hold; frozen.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 
@@ -206,23 +209,30 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
 def _truth(
     given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, system: MechanicalSystem | None
 ) -> FrozenDict:
-    unknown = sorted(set(given) - set(TRUTH_NAMES))
+    unknown = sorted(name for name in given if name not in TRUTH_NAMES and not _of_a_kind(name))
     if unknown:
-        raise DatasetError(f"truth has no {unknown}; allowed: {list(TRUTH_NAMES)}.")
+        kinds = ", ".join(f"{kind}<name>" for kind in TRUTH_KINDS)
+        raise DatasetError(f"truth has no {unknown}; allowed: {', '.join(TRUTH_NAMES)}, {kinds}.")
     checked = {}
-    for name in TRUTH_NAMES:
-        if name not in given:
-            continue
-        if name == "lambda":
-            values = finite_columns("truth['lambda']", given[name], (), rows)
+    for name in sorted(given, key=lambda name: TRUTH_NAMES.index(name) if name in TRUTH_NAMES else len(TRUTH_NAMES)):
+        what = f"truth[{name!r}]"
+        if name in ("lambda", "in_contact"):
+            values = finite_columns(what, given[name], (), rows)
             if system is not None and values.shape[1] != len(system.contacts):
                 raise DatasetError(
-                    f"truth['lambda'] has {values.shape[1]} columns; the system has {len(system.contacts)} contacts."
+                    f"{what} has {values.shape[1]} columns; the system has {len(system.contacts)} contacts."
                 )
+        elif name.startswith("force."):
+            values = finite_columns(what, given[name], ("x", "y", "z"), rows)
         else:
-            values = finite_columns(f"truth[{name!r}]", given[name], joint_names, rows)
+            values = finite_columns(what, given[name], joint_names, rows)
         checked[name] = values
     return FrozenDict(checked)
+
+
+def _of_a_kind(name: str) -> bool:
+    """`Q_U.tool`, `force.tool-friction`: a beginning from `TRUTH_KINDS` and a name that a file can carry."""
+    return any(name.startswith(kind) and name[len(kind) :].replace("-", "").isalnum() for kind in TRUTH_KINDS)
 
 
 def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import NumericalError
+from forcegp.mechanics.contacts import Contact
 from forcegp.mechanics.state import State
 
 REDUNDANCY_TOLERANCE = 1e-9
@@ -41,7 +42,7 @@ class ConstrainedDynamics:
 
     `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_b`, `Q_K` (..., nv); `normals` (..., m, 3) are the
     surface gradients s_p, so that the contact force on the robot in N is s_p^T lambda. `state` holds (q, v, u)
-    themselves.
+    themselves, `contacts` what the rows of A belong to (none for a constraint that was given as a matrix).
     """
 
     state: State
@@ -55,6 +56,7 @@ class ConstrainedDynamics:
     constrained_offset: Float[Tensor, "*batch nv"]  # M^-1 Q_b
     inverse_lower: Float[Tensor, "*batch nv nv"]  # L^-1
     pseudo_inverse: Float[Tensor, "*batch nv m"]  # A~^+
+    contacts: tuple[Contact, ...] = ()
 
     @classmethod
     def from_constraint(
@@ -65,6 +67,7 @@ class ConstrainedDynamics:
         b: Float[Tensor, "*batch m"],
         normals: Float[Tensor, "*batch m 3"],
         Q_K: Float[Tensor, "*batch nv"],
+        contacts: tuple[Contact, ...] = (),
     ) -> ConstrainedDynamics:
         """Gauss' principle for M (..., nv, nv) and A a = b.
 
@@ -93,7 +96,7 @@ class ConstrainedDynamics:
         white_offset = pseudo_inverse @ b[..., None]
         Q_b = (lower @ white_offset)[..., 0]
         offset = (inverse_lower.mT @ white_offset)[..., 0]
-        return cls(state, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse)
+        return cls(state, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse, contacts)
 
     def acceleration_map(self, known: bool = True) -> AffineMap:
         """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K.

@@ -87,7 +87,8 @@ class MechanicalSystem:
         A, b, normals = self._constraint(state)
         batch = M.shape[:-2]  # inertials may carry batch dimensions of their own
         A, normals = (part.expand(*batch, *part.shape[-2:]) for part in (A, normals))
-        return ConstrainedDynamics.from_constraint(state, M, A, b.expand(*batch, -1), normals, Q_K.expand(*batch, -1))
+        b, Q_K = b.expand(*batch, -1), Q_K.expand(*batch, -1)
+        return ConstrainedDynamics.from_constraint(state, M, A, b, normals, Q_K, self.contacts)
 
     def _constraint(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """A (..., m, nv), b (..., m) and the surface gradients (..., m, 3)."""
