@@ -41,6 +41,12 @@ def test_a_sample_out_of_order_and_units_per_joint_come_back(tmp_path):
     assert_equal(Dataset.load(tmp_path / "log.h5"), data)
 
 
+def test_noise_of_every_row_comes_back(tmp_path):
+    data = dataset(noise_std=np.linspace(0.1, 0.9, 80).reshape(40, 2))
+    data.save(tmp_path / "log.h5")
+    assert_equal(Dataset.load(tmp_path / "log.h5"), data)
+
+
 @settings(max_examples=20)
 @given(hnp.arrays(np.float64, (3, 2), elements=st.floats(allow_nan=False, allow_infinity=False)))
 def test_every_finite_number_comes_back_bit_by_bit(tmp_path_factory, values):

@@ -12,6 +12,7 @@ from forcegp.data.filtering import (
 )
 from forcegp.data.frozen_dict import FrozenDict
 from forcegp.data.splits import require_disjoint, train_test_split
+from forcegp.data.time_blocks import time_blocks
 from forcegp.data.units import REVOLUTE_UNITS, units_for
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "low_pass",
     "require_disjoint",
     "resample",
+    "time_blocks",
     "train_test_split",
     "uniform_step",
     "units_for",

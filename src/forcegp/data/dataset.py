@@ -41,7 +41,7 @@ class Dataset:
         those that the joint types of `system.robot` ask for. Without a system both must be given.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     system: the robot and what it touches, or None.
-    noise_std: (nv,) standard deviation of the noise on `a`, if known.
+    noise_std: standard deviation of the noise on `a`, if known: (nv,), or (rows, nv) where it differs between rows.
     truth: as far as a simulation knows them, noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
@@ -63,7 +63,7 @@ class Dataset:
     units: Mapping[str, Any] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
     system: MechanicalSystem | None = None
-    noise_std: Float[np.ndarray, " nv"] | None = None
+    noise_std: Float[np.ndarray, " nv"] | Float[np.ndarray, "rows nv"] | None = None
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
     time_ordered: bool = True
@@ -92,7 +92,7 @@ class Dataset:
                 f"units are {self.units}; the joint types of {self.system.robot.name!r} ask for "
                 f"{units_for(self.system.robot)}."
             )
-        put("noise_std", _noise_std(self.noise_std, names))
+        put("noise_std", _noise_std(self.noise_std, names, rows))
         put("truth", _truth(self.truth, names, rows, self.system))
         put("metadata", frozen_json(self.metadata))
         put("time_ordered", bool(self.time_ordered))
@@ -120,6 +120,13 @@ class Dataset:
         values, first = np.unique(self.episode, return_index=True)
         return tuple(int(value) for value in values[np.argsort(first)])
 
+    @property
+    def noise_level(self) -> Float[np.ndarray, " nv"] | None:
+        """`noise_std` as one number per joint: itself, or its root mean square over the rows. None if unknown."""
+        if self.noise_std is None or self.noise_std.ndim == 1:
+            return self.noise_std
+        return np.sqrt(np.square(self.noise_std).mean(axis=0))
+
     def rows(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
         """The rows of a slice, boolean mask (rows,) or list of row numbers, in the order given.
 
@@ -128,6 +135,8 @@ class Dataset:
         chosen = _row_numbers(index, len(self))
         truth = {name: values[chosen] for name, values in self.truth.items()}
         arrays = {name: getattr(self, name)[chosen] for name in ("q", "v", "u", "a", "time", "episode")}
+        if self.noise_std is not None and self.noise_std.ndim == 2:
+            arrays["noise_std"] = self.noise_std[chosen]
         ordered = _first_disorder(arrays["time"], arrays["episode"]) is None
         return replace(self, **arrays, truth=truth, time_ordered=ordered)
 
@@ -193,17 +202,29 @@ def _joint_names(given: Sequence[str], system: MechanicalSystem | None) -> tuple
     return names
 
 
-def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None:
+def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.ndarray | None:
     if given is None:
         return None
-    values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
+    if _is_table(given):
+        values = finite_columns("noise_std", given, joint_names, rows)
+    else:
+        values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
     if (values <= 0).any():
-        column = int(np.argmax(values <= 0))
+        *row, column = np.argwhere(values <= 0)[0]
+        where = f" at row {row[0]}" if row else ""
         raise DatasetError(
-            f"noise_std of joint {joint_names[column]!r} is {values[column]}; it must be > 0. "
+            f"noise_std of joint {joint_names[column]!r} is {values[(*row, column)]}{where}; it must be > 0. "
             "Give None if it is not known or if there is no noise."
         )
     return values
+
+
+def _is_table(given: object) -> bool:
+    """Whether this is meant as (rows, nv); what is no array at all is complained about as a vector."""
+    try:
+        return np.ndim(given) > 1  # type: ignore[arg-type]  # anything may be given
+    except (TypeError, ValueError, RuntimeError):
+        return False
 
 
 def _truth(

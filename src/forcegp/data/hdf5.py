@@ -75,7 +75,7 @@ def _write(fields: Mapping[str, Any], file: h5py.File) -> None:
         file[name].attrs.create("units", unit, dtype=_TEXT)
     file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
     if fields["noise_std"] is not None:
-        file.create_dataset("noise_std", data=fields["noise_std"])
+        _put(file, "noise_std", fields["noise_std"])
     for name, values in fields["truth"].items():
         _put(file, f"truth/{name}", values)
     file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)

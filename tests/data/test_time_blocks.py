@@ -1,0 +1,40 @@
+"""Rows in stretches of time."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.data.samples import dataset
+
+from forcegp.data import farthest_rows, time_blocks
+from forcegp.errors import InvalidInput
+
+
+def test_rows_of_one_stretch_and_episode_form_a_block_in_order_of_time():
+    time = np.array([5.0, 5.9, 7.1, 6.2, 5.0, 9.9])
+    episode = np.array([0, 0, 0, 0, 3, 3])
+    assert time_blocks(time, episode, 1.0) == ((0, 1), (3,), (2,), (4,), (5,))
+    assert time_blocks(time, episode, 100.0) == ((0, 1, 3, 2), (4, 5))
+
+
+@given(st.integers(2, 40), st.integers(0, 100), st.floats(0.005, 1.0))
+def test_every_row_is_in_one_block_that_is_no_longer_than_said(count, seed, seconds):
+    rows = farthest_rows(dataset(40, seed=seed), count)
+    blocks = time_blocks(rows.time, rows.episode, seconds)
+    assert sorted(row for block in blocks for row in block) == list(range(count))
+    for block in blocks:
+        chosen = list(block)
+        assert len(set(rows.episode[chosen])) == 1
+        assert np.ptp(rows.time[chosen]) <= seconds * (1.0 + 1e-12)
+        assert (np.diff(rows.time[chosen]) > 0).all()
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_length_that_is_none_is_refused(seconds):
+    with pytest.raises(InvalidInput, match="must be positive and finite"):
+        time_blocks(np.zeros(2), np.zeros(2, int), seconds)
+
+
+def test_columns_of_different_rows_are_refused():
+    with pytest.raises(InvalidInput, match="time has 3 rows and episode 2"):
+        time_blocks(np.zeros(3), np.zeros(2, int), 1.0)
