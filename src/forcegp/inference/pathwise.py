@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernels import squared_exponential_parameters
+from forcegp.inference.kernel_matrices import squared_exponential_parameters
 from forcegp.inference.posterior import LatentPosterior
 
 FREQUENCIES = 256

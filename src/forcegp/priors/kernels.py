@@ -1,51 +1,60 @@
-"""Kernels with start values.
+"""Kernels by name, with start values.
 
-Any GPyTorch kernel may be used by a prior; these are the ones that the built-in priors share.
+Any GPyTorch kernel may be used by a prior; these are the ones that the built-in priors share and that settings can
+name.
 """
 
 from __future__ import annotations
 
-import math
+from functools import partial
 
-import torch
-from gpytorch.constraints import Positive
-from gpytorch.kernels import RBFKernel, ScaleKernel
-from gpytorch.priors import NormalPrior
+from gpytorch.kernels import Kernel
 from torch import Tensor
 
-LOG_LENGTHSCALE_SHIFT = 3.0
-LOG_LENGTHSCALE_SPREAD = 2.0
+from forcegp.priors.deep_kernel import deep
+from forcegp.priors.kernel_expressions import KernelExpression, KernelFactory
+from forcegp.priors.stationary_kernels import (
+    matern,
+    periodic,
+    rational_quadratic,
+    squared_exponential,
+    squared_exponential_kernel,
+)
+from forcegp.priors.weight_kernels import SmoothSignKernel, constant, friction, linear
+
+__all__ = ["KERNELS", "KernelFactory", "SmoothSignKernel", "check_kernel", "kernel_of", "squared_exponential_kernel"]
+
+KERNELS: dict[str, KernelFactory] = {
+    "squared-exponential": squared_exponential,
+    "matern-1/2": partial(matern, smoothness=0.5),
+    "matern-3/2": partial(matern, smoothness=1.5),
+    "matern-5/2": partial(matern, smoothness=2.5),
+    "rational-quadratic": rational_quadratic,
+    "periodic": periodic,
+    "constant": constant,
+    "linear": linear,
+    "friction": friction,
+    "deep": deep,
+}
+"""Kernels that an expression can name: name -> factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`;
+a name may hold anything but white space, parentheses, "+" and "*".
+"""
 
 
-def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outputscale: float | Tensor) -> ScaleKernel:
-    """A GPyTorch squared-exponential kernel with one length scale per input, both parameters optimised on a log scale.
+def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kernel:
+    """A fresh float64 kernel on `dimension` prepared features, for a function that starts with `variance`.
 
-    `lengthscale` (scalar or (dimension,)) and `outputscale` (variance) are the start values. The length scales carry a
-    wide normal prior on their logarithm, N(log sqrt(dimension) + 3, 2^2), for standardised inputs: most inputs matter
-    little to most forces, and with fewer points than parameters plain maximum likelihood finds relevance by chance. It
-    is the dimension-scaled prior of Hvarfner et al. (2024), shifted to longer and made wider; measured in
-    docs/architecture.md.
+    `expression` is a name in `KERNELS`, or several joined by "+" and "*", as in "linear + squared-exponential" or
+    "periodic * (constant + linear)". The terms of a sum start with equal parts of the variance. In a product one factor
+    carries it, and output scales of the others, of which only the product counts, are taken away.
+
+    Raises
+    ------
+    InvalidInput: an unknown name, an expression that cannot be read, or a kernel that cannot have so many features.
     """
-
-    def positive() -> Positive:
-        return Positive(transform=torch.exp, inv_transform=torch.log)  # type: ignore[arg-type]  # stubs want a Softplus
-
-    kernel = ScaleKernel(
-        RBFKernel(ard_num_dims=dimension, lengthscale_constraint=positive()), outputscale_constraint=positive()
-    ).double()
-    kernel.base_kernel.register_prior(
-        "lengthscale_prior",
-        NormalPrior(_scalar(0.5 * math.log(dimension) + LOG_LENGTHSCALE_SHIFT), _scalar(LOG_LENGTHSCALE_SPREAD)),
-        _log_lengthscale,
-    )
-    kernel.base_kernel.lengthscale = torch.as_tensor(lengthscale, dtype=torch.float64).expand(1, dimension)
-    kernel.outputscale = torch.as_tensor(outputscale, dtype=torch.float64)
-    return kernel
+    return KernelExpression(expression, KERNELS).kernel(dimension, variance)
 
 
-def _log_lengthscale(kernel: RBFKernel) -> Tensor:
-    return kernel.lengthscale.log()
-
-
-def _scalar(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)  # a Python number would be rounded to float32 on the way
+def check_kernel(expression: str) -> None:
+    """Raise InvalidInput if `expression` cannot be read or has an unknown name; for constructors."""
+    KernelExpression(expression, KERNELS)

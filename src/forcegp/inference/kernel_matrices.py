@@ -1,0 +1,228 @@
+"""Dense kernel matrices of GPyTorch kernels, exact and lean: sums and products are taken apart into their leaves.
+
+GPyTorch's own sums are not used: it adds a low-rank matrix (a linear kernel) to a dense one through a root
+decomposition of the latter, which needs jitter where that is singular and is approximate where it is large. Its lazy
+paths switch silently to conjugate gradients above N D = 800 (measured error of the predictive mean 7.9 rad/s^2 on the
+iiwa).
+
+The leaves: functions of the distance (squared exponential, Matern) have hand-written gradients, one N x N by N x d
+product and no N x N x d tensor; linear and constant kernels, and those with one of the two methods below, are matrix
+products; every other kernel is called as it is, and once more in the backward pass. A kernel class may have one of
+
+    squared_exponential_embedding(z) (n, e): then k(z, z') = exp(-1/2 |e(z) - e(z')|^2)
+    weight_features(z) (n, p): then k(z, z') = phi(z) . phi(z')
+
+both differentiable in z and in the kernel's parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from operator import add, mul
+from typing import cast
+
+import torch
+from gpytorch.kernels import (
+    AdditiveKernel,
+    ConstantKernel,
+    Kernel,
+    LinearKernel,
+    MaternKernel,
+    ProductKernel,
+    RBFKernel,
+    ScaleKernel,
+)
+from jaxtyping import Float
+from torch import Tensor
+from torch.func import functional_call
+from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
+
+NO_DISTANCE = 1e-8
+"""Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
+
+KNOWN = (AdditiveKernel, ProductKernel, ScaleKernel, RBFKernel, MaternKernel, LinearKernel, ConstantKernel)
+"""GPyTorch classes whose formulas are evaluated here; subclasses may have other formulas and are called."""
+
+
+def dense_matrix(
+    kernel: Kernel, z: Float[Tensor, "n d"], other: Float[Tensor, "N d"] | None = None
+) -> Float[Tensor, "n _"]:
+    """k(z_i, other_j) (n, N); without `other` k(z_i, z_j) (n, n), of which there are first derivatives only."""
+    if not _is_known(kernel):
+        if other is None and torch.is_grad_enabled():
+            return _recomputed(kernel, z)
+        return kernel(z, z if other is None else other).to_dense()
+    z, other = _selected(kernel, z), None if other is None else _selected(kernel, other)
+    if type(kernel) is AdditiveKernel or type(kernel) is ProductKernel:
+        inner = [dense_matrix(cast(Kernel, part), z, other) for part in kernel.kernels]
+        return reduce(add if type(kernel) is AdditiveKernel else mul, inner)
+    if type(kernel) is ScaleKernel:
+        base, outputscale = kernel.base_kernel, cast(Tensor, kernel.outputscale)
+        if type(base) in (RBFKernel, MaternKernel):
+            return _of_distance(base, z, other, outputscale)
+        return outputscale * dense_matrix(base, z, other)
+    if type(kernel) in (RBFKernel, MaternKernel):
+        return _of_distance(kernel, z, other, torch.ones((), dtype=z.dtype, device=z.device))
+    if type(kernel) is ConstantKernel:
+        return kernel.constant.reshape(1, 1).expand(len(z), len(z if other is None else other)).contiguous()
+    if type(kernel) is LinearKernel:
+        return (z * kernel.variance.reshape(-1)) @ (z if other is None else other).mT
+    return _from_method(kernel, z, other)
+
+
+def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
+    """Length scales and output scale of a plain scaled squared exponential; None for every other kernel."""
+    if type(kernel) is not ScaleKernel or type(kernel.base_kernel) is not RBFKernel:
+        return None
+    base = kernel.base_kernel
+    if kernel.active_dims is not None or base.active_dims is not None or kernel.batch_shape or base.batch_shape:
+        return None
+    return _lengthscale(base), cast(Tensor, kernel.outputscale)
+
+
+def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+    """|x_i - y_j|^2 by one matrix product, centred first: cancellation stays below 1e-14 for standardised inputs."""
+    centre = y.mean(dim=0, keepdim=True) if y.shape[0] else 0.0
+    x, y = x - centre, y - centre
+    return (x.square().sum(-1)[:, None] + y.square().sum(-1)[None, :]).addmm(x, y.mT, alpha=-2.0).clamp_min(0.0)
+
+
+def _is_known(kernel: Kernel) -> bool:
+    """Whether `dense_matrix` evaluates the kernel itself."""
+    if kernel.batch_shape:
+        return False
+    if type(kernel) is ScaleKernel:
+        # It takes over the `active_dims` of its base, which then does not select again.
+        base = kernel.base_kernel
+        return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
+    methods = ("squared_exponential_embedding", "weight_features")
+    return type(kernel) in KNOWN or any(hasattr(kernel, method) for method in methods)
+
+
+def _selected(kernel: Kernel, z: Tensor) -> Tensor:
+    """The features that the kernel looks at, its `active_dims`."""
+    return z if kernel.active_dims is None else z.index_select(-1, cast(Tensor, kernel.active_dims))
+
+
+def _lengthscale(kernel: Kernel) -> Tensor:
+    return cast(Tensor, kernel.lengthscale).reshape(-1)
+
+
+def _of_distance(kernel: Kernel, z: Tensor, other: Tensor | None, outputscale: Tensor) -> Tensor:
+    smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
+    lengthscale = _lengthscale(kernel)
+    if other is None:
+        return cast(Tensor, _Stationary.apply(z, lengthscale, outputscale, smoothness))
+    z, other = z / lengthscale, other / lengthscale
+    if smoothness == math.inf:
+        return outputscale * torch.exp(-0.5 * squared_distance(z, other))
+    return outputscale * _matern(distance(z, other), smoothness)
+
+
+def _from_method(kernel: Kernel, z: Tensor, other: Tensor | None) -> Tensor:
+    embedding = getattr(kernel, "squared_exponential_embedding", None)
+    function = getattr(kernel, "weight_features") if embedding is None else embedding  # noqa: B009
+    left, right = function(z), None if other is None else function(other)
+    if embedding is None:
+        return left @ (left if right is None else right).mT
+    if right is not None:
+        return torch.exp(-0.5 * squared_distance(left, right))
+    one = torch.ones(1, dtype=z.dtype, device=z.device)
+    return cast(Tensor, _Stationary.apply(left, one, one[0], math.inf))
+
+
+def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+    """|x_i - y_j| from the differences themselves: a root would make 1e-8 of what cancels in `squared_distance`."""
+    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _matern(r: Tensor, smoothness: float) -> Tensor:
+    """Rasmussen & Williams (2006), eq. 4.17, with scaled distances r."""
+    a = math.sqrt(2.0 * smoothness) * r
+    polynomial = {0.5: lambda: 1.0, 1.5: lambda: 1.0 + a, 2.5: lambda: 1.0 + a * (1.0 + a / 3.0)}[smoothness]()
+    return polynomial * torch.exp(-a)
+
+
+def _matern_slope(r: Tensor, smoothness: float) -> Tensor:
+    """-2 dk/d(r^2); for smoothness 1/2 it grows as 1/r and counts as 0 where the points coincide."""
+    a = math.sqrt(2.0 * smoothness) * r
+    decay = torch.exp(-a)
+    if smoothness == 0.5:
+        return torch.where(r > NO_DISTANCE, decay / r, torch.zeros_like(r))
+    return 3.0 * decay if smoothness == 1.5 else 5.0 / 3.0 * (1.0 + a) * decay
+
+
+class _Stationary(torch.autograd.Function):
+    """s k(r) with r_ij = |(z_i - z_j) / l|: the squared exponential (smoothness inf) or a Matern.
+
+    Saves nothing of size N x N but its own result and, for a Matern, the derivative of it.
+    """
+
+    @staticmethod
+    def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor, smoothness: float) -> Tensor:  # type: ignore[override]
+        scaled = z / lengthscale
+        if smoothness == math.inf:
+            K = squared_distance(scaled, scaled).mul_(-0.5)
+            K.diagonal().zero_()
+            slope = K.exp_().mul_(outputscale)
+        else:
+            r = distance(scaled, scaled)
+            K = _matern(r, smoothness).mul_(outputscale)
+            slope = _matern_slope(r, smoothness).mul_(outputscale)
+        ctx.save_for_backward(z, lengthscale, outputscale, K, slope)
+        return K
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        # With create_graph=True: `once_differentiable` would let it pass where upstream is a constant.
+        if torch.is_grad_enabled():
+            raise NotImplementedError(
+                "this kernel matrix has first derivatives only; for a Hessian take finite differences of its gradient"
+            )
+        z, lengthscale, outputscale, K, slope = ctx.saved_tensors
+        weighted = upstream * slope
+        scaled = (z - z.mean(0)) / lengthscale  # centred, or features far from zero cancel below
+        product = weighted @ scaled
+        rows, columns = weighted.sum(1), weighted.sum(0)
+        z_gradient = lengthscale_gradient = outputscale_gradient = None
+        if ctx.needs_input_grad[2]:
+            outputscale_gradient = (weighted.sum() if slope is K else (upstream * K).sum()) / outputscale
+        if ctx.needs_input_grad[1]:
+            # sum_ij G_ij slope_ij (x_id - x_jd)^2 / l_d^3, expanded so that only N x d arrays appear
+            per_input = ((rows + columns)[:, None] * scaled.square()).sum(0) - 2.0 * (scaled * product).sum(0)
+            lengthscale_gradient = per_input / lengthscale
+            if lengthscale.numel() == 1:
+                lengthscale_gradient = lengthscale_gradient.sum().reshape(lengthscale.shape)
+        if ctx.needs_input_grad[0]:
+            transposed = weighted.mT @ scaled
+            z_gradient = (product + transposed - (rows + columns)[:, None] * scaled) / lengthscale
+        return z_gradient, lengthscale_gradient, outputscale_gradient, None
+
+
+def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
+    """A kernel of any kind, called now and again in the backward pass, so that nothing of size N x N is kept."""
+    dense = _DenseKernel(kernel)
+    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own
+    # ones back.
+    names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
+    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims`
+    # back.
+    with set_checkpoint_early_stop(False):
+        return checkpoint(
+            lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
+            z,
+            *values,
+            use_reentrant=False,
+        )
+
+
+class _DenseKernel(torch.nn.Module):
+    """A kernel whose call returns the dense matrix at once, so that `functional_call` covers the whole evaluation."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        super().__init__()
+        self.kernel = kernel
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.kernel(z, z).to_dense()

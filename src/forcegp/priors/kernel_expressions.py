@@ -1,0 +1,109 @@
+"""Kernels written as text: names of a registry, "+", "*" and parentheses with the usual precedence.
+
+    expression = term { "+" term }        term = factor { "*" factor }        factor = name | "(" expression ")"
+
+Sums of independent functions have the sum of their kernels, and a product of kernels is a kernel (Rasmussen & Williams
+2006, section 4.2.4).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+
+from gpytorch.kernels import AdditiveKernel, Kernel, ProductKernel, ScaleKernel
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.priors.kernel_parameters import float64
+
+KernelFactory = Callable[[int, Tensor | float], Kernel]
+"""Called with the number of features and the start variance of the function; returns a fresh float64 kernel."""
+
+_TOKEN = re.compile(r"[()+*]|[^()+*\s]+")
+
+
+class KernelExpression:
+    """One expression, read once; `kernel` makes fresh kernels of it.
+
+    Raises InvalidInput for an unknown name or a wrong expression, with what is allowed.
+    """
+
+    def __init__(self, expression: str, factories: Mapping[str, KernelFactory]) -> None:
+        self.expression = expression
+        self.factories = factories
+        self._tokens = _TOKEN.findall(expression)
+        self._build = self._sum()
+        if self._tokens:
+            raise self._wrong(f"{self._tokens[0]!r} is not expected there")
+
+    def kernel(self, dimension: int, variance: Tensor | float) -> Kernel:
+        """A fresh kernel for `dimension` features whose function starts with `variance` at standardised features."""
+        return self._build(dimension, variance)
+
+    def _sum(self) -> KernelFactory:
+        terms = [self._product()]
+        while self._accept("+"):
+            terms.append(self._product())
+        return terms[0] if len(terms) == 1 else lambda d, variance: _sum_of(terms, d, variance)
+
+    def _product(self) -> KernelFactory:
+        factors = [self._factor()]
+        while self._accept("*"):
+            factors.append(self._factor())
+        return factors[0] if len(factors) == 1 else lambda d, variance: _product_of(factors, d, variance)
+
+    def _factor(self) -> KernelFactory:
+        if self._accept("("):
+            inner = self._sum()
+            if not self._accept(")"):
+                raise self._wrong("a parenthesis is not closed")
+            return inner
+        if not self._tokens:
+            raise self._wrong("it ends where a name is expected")
+        name = self._tokens.pop(0)
+        if name in "()+*":
+            raise self._wrong(f"{name!r} stands where a name is expected")
+        if name not in self.factories:
+            where = "the registry" if name == self.expression.strip() else repr(self.expression)
+            raise InvalidInput(unknown_name_message("kernel", name, where, self.factories))
+        return self.factories[name]
+
+    def _accept(self, token: str) -> bool:
+        if self._tokens[:1] == [token]:
+            self._tokens.pop(0)
+            return True
+        return False
+
+    def _wrong(self, what: str) -> InvalidInput:
+        return InvalidInput(
+            f"the kernel {self.expression!r} cannot be read: {what}; write names joined by '+' and '*', with "
+            f"parentheses where needed. Names: {', '.join(sorted(self.factories))}"
+        )
+
+
+def _sum_of(terms: list[KernelFactory], dimension: int, variance: Tensor | float) -> Kernel:
+    """Every term starts with an equal part of the variance, so that the whole starts with all of it."""
+    share = float64(variance) / len(terms)
+    kernels = []
+    for term in terms:
+        kernel = term(dimension, share)
+        kernels.extend(kernel.kernels if type(kernel) is AdditiveKernel else [kernel])
+    return AdditiveKernel(*kernels)
+
+
+def _product_of(factors: list[KernelFactory], dimension: int, variance: Tensor | float) -> Kernel:
+    """One factor carries the variance; the output scales of the others are taken away, for only their product counts.
+
+    It is the first factor that is more than a scaled kernel (a linear one, a sum), or else the first.
+    """
+    plain = [factor(dimension, 1.0) for factor in factors]
+    carrier = next((i for i, kernel in enumerate(plain) if type(kernel) is not ScaleKernel), 0)
+    kernels = []
+    for i, kernel in enumerate(plain):
+        if i == carrier:
+            kernel = factors[i](dimension, variance)
+        elif type(kernel) is ScaleKernel:
+            kernel = kernel.base_kernel
+        kernels.extend(kernel.kernels if type(kernel) is ProductKernel else [kernel])
+    return ProductKernel(*kernels)
