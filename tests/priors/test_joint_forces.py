@@ -26,14 +26,14 @@ def test_mixing_is_the_identity_and_features_are_the_chosen_states(dynamics):
 
 
 def test_kernels_start_at_the_given_variance_and_the_typical_distance():
-    kernels = JointForces().kernels((9, 9, 9), torch.tensor([1.0, 4.0, 0.25]).double())
+    kernels = JointForces().kernels(arm_system().robot, (9, 9, 9), torch.tensor([1.0, 4.0, 0.25]).double())
     z = torch.zeros(1, 9).double()
     assert [kernel(z, z).to_dense().item() for kernel in kernels] == pytest.approx([1.0, 4.0, 0.25])
     assert torch.allclose(kernels[0].base_kernel.lengthscale, torch.tensor(3.0).double())
 
 
 def test_the_hyperprior_is_normal_in_the_logarithm_of_the_length_scales():
-    latent = LatentKernels(JointForces().kernels((4,), torch.ones(1).double()))
+    latent = LatentKernels(JointForces().kernels(arm_system().robot, (4,), torch.ones(1).double()))
     parameters = latent.initial_parameters()
     raw = torch.tensor([[0.0, 1.0, 2.0, 5.0]]).double()
     parameters["kernels.0.base_kernel.raw_lengthscale"] = raw.requires_grad_()

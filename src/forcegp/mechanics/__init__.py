@@ -11,6 +11,7 @@ from forcegp.mechanics.known_forces import (
     ViscousJointFriction,
 )
 from forcegp.mechanics.state import State
+from forcegp.mechanics.surface_axes import surface_axes
 from forcegp.mechanics.surfaces import Cylinder, ImplicitSurface, Plane, Sphere, Surface
 from forcegp.mechanics.system import MechanicalSystem
 
@@ -32,4 +33,5 @@ __all__ = [
     "State",
     "Surface",
     "ViscousJointFriction",
+    "surface_axes",
 ]

@@ -20,7 +20,7 @@ from forcegp.models.marginal_likelihood import RESIDUAL_FLOOR, Standardization, 
 from forcegp.models.noise import ACCELERATION
 from forcegp.models.prediction import Prediction
 from forcegp.models.protocol import Posterior
-from forcegp.priors import JointForces
+from forcegp.priors.joint_forces import kernels_of
 
 if TYPE_CHECKING:
     from forcegp.models.independent_gp import IndependentGP
@@ -68,9 +68,8 @@ class IndependentLikelihood:
         if not largest > 0.0:
             raise InvalidInput("all accelerations are zero, so there is nothing to learn; check that a was measured.")
         dimension = self._training_features.shape[-1]
-        prior = JointForces(self.inputs)
-        floor = RESIDUAL_FLOOR * largest
-        return LatentKernels(prior.kernels((dimension,) * len(variances), variances.clamp_min(floor)))
+        floored = variances.clamp_min(RESIDUAL_FLOOR * largest)
+        return LatentKernels(kernels_of("squared-exponential", (dimension,) * len(variances), floored))
 
     def __call__(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood of one joint, at parameters named as by `joint_part`."""
@@ -89,7 +88,11 @@ class IndependentLikelihood:
     def _terms(self, joint: int, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Mixing W = 1, residual and noise variance of one joint."""
         target = self.training.a[:, joint : joint + 1]
-        return torch.ones_like(target)[..., None], target, (2.0 * parameters[ACCELERATION]).exp()[None]
+        variance = (2.0 * parameters[ACCELERATION]).exp()[None]
+        factors = self.training.noise_factors
+        if factors is not None:
+            variance = variance * factors[:, joint : joint + 1].square()
+        return torch.ones_like(target)[..., None], target, variance
 
     def _columns(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         states = {"q": q, "v": v, "u": u}

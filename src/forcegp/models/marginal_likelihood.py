@@ -16,11 +16,13 @@ from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior, negative_log_likelihood
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
-from forcegp.priors import ForcePrior
+from forcegp.priors import ForcePrior, Scaling
 
 Mean = Literal["analytical", "zero"]
 INERTIALS = "inertials."
 COEFFICIENTS = "coefficients."
+CONSTANT = 1e-12
+"""Spread of a feature, relative to 1 plus its size, below which it is constant."""
 RESIDUAL_FLOOR = 1e-6
 """Smallest start variance of a latent as a fraction of the largest: a latent that the start residual does not
 excite can still grow.
@@ -29,17 +31,26 @@ excite can still grow.
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """States and measured accelerations (N, nv), float64."""
+    """States and measured accelerations (N, nv), float64; `noise_std` where the data state the noise of every row."""
 
     q: Float[Tensor, "N nv"]
     v: Float[Tensor, "N nv"]
     u: Float[Tensor, "N nv"]
     a: Float[Tensor, "N nv"]
+    noise_std: Float[Tensor, "N nv"] | None = None
 
     @classmethod
     def of(cls, rows: Dataset, device: torch.device) -> TrainingData:
         """Copies of all rows of a Dataset."""
-        return cls(*(torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a)))
+        noise = rows.noise_std if rows.noise_std is not None and rows.noise_std.ndim == 2 else None
+        noise_std = None if noise is None else torch.tensor(noise, device=device)
+        states = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
+        return cls(*states, noise_std=noise_std)
+
+    @property
+    def noise_factors(self) -> Float[Tensor, "N nv"] | None:
+        """The noise of every row over its root mean square, joint by joint; None where all rows are equally noisy."""
+        return None if self.noise_std is None else self.noise_std / self.noise_std.square().mean(0).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +61,24 @@ class Standardization:
     scale: tuple[Float[Tensor, "_"], ...]
 
     @classmethod
-    def of(cls, features: Sequence[Float[Tensor, "N _"]]) -> Standardization:
-        """Mean and standard deviation over the points."""
-        shift = tuple(z.mean(0) for z in features)
-        variances = [z.var(0, correction=0) for z in features]
-        # below rounding of the values themselves a feature counts as constant; the root comes after that choice,
-        # for its derivative at 0 is infinite
-        scale = tuple(
-            torch.where(variance > (1e-12 * (1.0 + mean.abs())).square(), variance, torch.ones_like(variance)).sqrt()
-            for variance, mean in zip(variances, shift, strict=True)
-        )
-        return cls(shift, scale)
+    def of(
+        cls, features: Sequence[Float[Tensor, "N _"]], scalings: Sequence[tuple[Scaling, ...] | Scaling] | None = None
+    ) -> Standardization:
+        """As `scalings` say for each latent or each of its features; None shifts and scales all of them."""
+        scalings = ("standardize",) * len(features) if scalings is None else scalings
+        shifts, scales = [], []
+        for z, given in zip(features, scalings, strict=True):
+            ways = (given,) * z.shape[-1] if isinstance(given, str) else given
+            shifted = torch.tensor([way == "standardize" for way in ways], device=z.device)
+            scaled = torch.tensor([way != "none" for way in ways], device=z.device)
+            shift = torch.where(shifted, z.mean(0), torch.zeros_like(z[0]))
+            size = (z - shift).square().mean(0)
+            # below rounding of the values themselves a feature counts as constant; the root comes after that choice,
+            # for its derivative at 0 is infinite
+            varies = scaled & (size > (CONSTANT * (1.0 + shift.abs())).square())
+            shifts.append(shift)
+            scales.append(torch.where(varies, size, torch.ones_like(size)).sqrt())
+        return cls(tuple(shifts), tuple(scales))
 
     def __call__(self, features: Sequence[Float[Tensor, "*batch _"]]) -> list[Float[Tensor, "*batch _"]]:
         """Standardised features."""
@@ -104,7 +122,8 @@ class MarginalLikelihood:
     @cached_property
     def standardization(self) -> Standardization:
         """From the features of the training states, at the nominal inertial parameters."""
-        return Standardization.of(self.prior.features(self._nominal_dynamics))
+        scalings = self.prior.scalings(self.system.robot)
+        return Standardization.of(self.prior.features(self._nominal_dynamics), scalings)
 
     @cached_property
     def _nominal_features(self) -> list[Tensor]:
@@ -118,12 +137,12 @@ class MarginalLikelihood:
         """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`."""
         dynamics = self.dynamics(parameters)
         offset = dynamics.acceleration_map(known=self.mean == "analytical").offset
-        noise = Noise.covariance(parameters, dynamics.H)
+        noise = Noise.covariance(parameters, dynamics.H, self.training.noise_factors)
         if dynamics is self._nominal_dynamics:
             return self._nominal_features, self._nominal_mixing, self.training.a - offset, noise
         # shifted and scaled at these parameters, as a posterior does that has them in its system
         given = self.prior.features(dynamics)
-        features = Standardization.of(given)(given)
+        features = Standardization.of(given, self.prior.scalings(self.system.robot))(given)
         return features, dynamics.H @ self.prior.mixing(dynamics), self.training.a - offset, noise
 
     def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
@@ -145,7 +164,8 @@ class MarginalLikelihood:
                 "the model itself"
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
-        return LatentKernels(self.prior.kernels(tuple(z.shape[-1] for z in features), variances))
+        dimensions = tuple(z.shape[-1] for z in features)
+        return LatentKernels(self.prior.kernels(self.system.robot, dimensions, variances))
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood, exact and differentiable in every parameter.

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar, Literal
 
+import torch
 from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from forcegp.mechanics import ConstrainedDynamics
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.robots import Robot
-
-if TYPE_CHECKING:
-    from forcegp.priors.sum_prior import SumPrior
 
 Scaling = Literal["standardize", "scale", "none"]
 """How a model prepares the features of a latent for its kernel, from the training points: shift to mean 0 and divide by
@@ -42,20 +46,24 @@ class ForcePrior(ABC):
         """z_c(x) (..., d_c), one tensor per latent, in physical units; the model standardises them."""
 
     @abstractmethod
-    def kernels(self, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        """Fresh kernels with start values, for standardised features and latents of these variances."""
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        """Fresh kernels with start values, for prepared features of these numbers and latents of these variances."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain JSON values."""
 
-    def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
-        """How the features of each latent are prepared for its kernel."""
+    def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...] | Scaling, ...]:
+        """How the features of each latent are prepared for its kernel: one way for all of them, or one for each."""
         return ("standardize",) * len(self.latent_names(robot))
 
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...] | None:
-        """A readable name for every feature of every latent, for messages and plots; None where it has none."""
+        """A readable name with its unit for every feature of every latent, for messages and plots; None without."""
         return None
+
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        """The unit of each latent."""
+        return ("Nm or N",) * len(self.latent_names(robot))
 
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"] | None:
         """Force in N along the axes of the world that one unit of each latent exerts on a point of the robot.
@@ -64,13 +72,119 @@ class ForcePrior(ABC):
         """
         return None
 
+    def check(self, system: MechanicalSystem) -> None:
+        """Raise InvalidInput where this prior means nothing for this system: a frame or contact that is not there."""
+        return
+
     @property
-    def terms(self) -> tuple[ForcePrior, ...]:
+    def title(self) -> str:
+        """What the prior is called where its forces are listed, for example "joint-friction"."""
+        return re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()
+
+    def summands(self) -> tuple[ForcePrior, ...]:
         """The priors that add up to this one."""
         return (self,)
 
     def __add__(self, other: ForcePrior) -> SumPrior:
         """Q_U is the sum of what both describe."""
-        from forcegp.priors.sum_prior import SumPrior
+        return SumPrior((*self.summands(), *other.summands()))
 
-        return SumPrior((*self.terms, *other.terms))
+
+@dataclass(frozen=True)
+class SumPrior(ForcePrior):
+    """Q_U = sum of what the `terms` describe, independent of each other: `JointFriction() + ContactFriction()`.
+
+    Columns of B, features and kernels stand side by side, so that one fit learns them all and every term can be asked
+    for afterwards. Sums among the terms are taken apart. Raises InvalidInput for fewer than two terms and for two
+    equal ones, which no data could tell apart.
+    """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    terms: tuple[ForcePrior, ...]
+
+    def __post_init__(self) -> None:
+        given = tuple(self.terms) if isinstance(self.terms, Iterable) else (self.terms,)
+        if not all(isinstance(term, ForcePrior) for term in given):
+            kinds = ", ".join(type(term).__name__ for term in given)
+            raise InvalidInput(
+                f"the terms of a SumPrior are {kinds}; give priors, as in JointFriction() + Payload(...)"
+            )
+        terms = tuple(inner for term in given for inner in term.summands())
+        if len(terms) < 2:
+            raise InvalidInput(f"a SumPrior has {len(terms)} terms; give two or more, or use the prior itself")
+        for index, term in enumerate(terms):
+            if term in terms[:index]:
+                raise InvalidInput(f"the sum has {term.title!r} twice, which no data can tell apart; give it once")
+        object.__setattr__(self, "terms", terms)
+
+    @override
+    def summands(self) -> tuple[ForcePrior, ...]:
+        return self.terms
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """The title of every term, numbered where several have the same."""
+        titles = [term.title for term in self.terms]
+        return tuple(
+            title if titles.count(title) == 1 else f"{title}-{titles[: index + 1].count(title)}"
+            for index, title in enumerate(titles)
+        )
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        return tuple(
+            f"{title} {name}"
+            for title, term in zip(self.term_names, self.terms, strict=True)
+            for name in term.latent_names(robot)
+        )
+
+    @override
+    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        return torch.cat([term.mixing(dynamics) for term in self.terms], dim=-1)
+
+    @override
+    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
+        return self._joined(lambda term: term.features(dynamics))
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return tuple(
+            kernel
+            for term, part in zip(self.terms, self.slices(robot), strict=True)
+            for kernel in term.kernels(robot, dimensions[part], variances[part])
+        )
+
+    @override
+    def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...] | Scaling, ...]:
+        return self._joined(lambda term: term.scalings(robot))
+
+    @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...] | None:
+        names = [term.feature_names(robot) for term in self.terms]
+        known = [part for part in names if part is not None]
+        return tuple(entry for part in known for entry in part) if len(known) == len(names) else None
+
+    @override
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        return self._joined(lambda term: term.latent_unit(robot))
+
+    @override
+    def check(self, system: MechanicalSystem) -> None:
+        for term in self.terms:
+            term.check(system)
+
+    @override
+    def to_dict(self) -> dict[str, Any]:
+        return {"terms": [{"type": term.title, **term.to_dict()} for term in self.terms]}
+
+    def slices(self, robot: Robot) -> tuple[slice, ...]:
+        """Which of the latents belong to each term."""
+        ends = [0]
+        for term in self.terms:
+            ends.append(ends[-1] + len(term.latent_names(robot)))
+        return tuple(slice(start, stop) for start, stop in pairwise(ends))
+
+    def _joined(self, of: Callable[[ForcePrior], tuple[Any, ...]]) -> tuple[Any, ...]:
+        return tuple(entry for term in self.terms for entry in of(term))

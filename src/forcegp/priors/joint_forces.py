@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from gpytorch.kernels import Kernel
@@ -15,30 +14,34 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.priors.force_prior import ForcePrior
-from forcegp.priors.kernels import squared_exponential_kernel
+from forcegp.priors.kernels import check_kernel, kernel_of
 from forcegp.robots import Robot
 
 INPUTS = ("q", "v", "u")
+ANGLES = ("plain", "sin-cos")
 
 
 @dataclass(frozen=True)
 class JointForces(ForcePrior):
     """Q_U = f(x) with independent f_j ~ GP(0, k_j), one per joint (Rath et al. 2021, eqs. 5-7).
 
-    The kernels are squared exponentials with one length scale per input. `inputs` chooses which of q, v and u the
-    force may depend on.
+    `inputs` chooses which of q, v and u the force may depend on. With `angles="sin-cos"` the position of every joint
+    that turns enters as its sine and cosine, so that a full turn changes nothing and +pi is beside -pi. `kernel` is an
+    expression of `forcegp.priors.kernel_of`; the default has one length scale per feature.
     """
 
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
     inputs: tuple[str, ...] = INPUTS
+    kernel: str = "squared-exponential"
+    angles: str = "plain"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "inputs", tuple(self.inputs))
-        if (
-            not self.inputs
-            or any(name not in INPUTS for name in self.inputs)
-            or len(set(self.inputs)) < len(self.inputs)
-        ):
-            raise InvalidInput(f"JointForces inputs are {self.inputs!r}; give one or more of 'q', 'v', 'u', each once.")
+        object.__setattr__(self, "inputs", chosen_inputs(type(self).__name__, self.inputs, INPUTS))
+        check_kernel(self.kernel)
+        if self.angles not in ANGLES:
+            raise InvalidInput(f"{type(self).__name__} angles is {self.angles!r}; give 'plain' or 'sin-cos'.")
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
@@ -51,19 +54,51 @@ class JointForces(ForcePrior):
 
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
-        states = {"q": dynamics.state.q, "v": dynamics.state.v, "u": dynamics.state.u}
-        z = torch.cat([states[name] for name in self.inputs], dim=-1)
-        return (z,) * dynamics.state.u.shape[-1]
+        state = dynamics.state
+        columns = {"q": state.q, "v": state.v, "u": state.u}
+        if self.angles == "sin-cos":
+            turns = _turns(state.kinematics.robot)
+            q = state.q
+            columns["q"] = torch.cat([q[..., ~turns], q[..., turns].sin(), q[..., turns].cos()], dim=-1)
+        z = torch.cat([columns[name] for name in self.inputs], dim=-1)
+        return (z,) * state.u.shape[-1]
 
     @override
-    def kernels(self, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        # Standardised points in d dimensions are about sqrt(2 d) apart: shorter length scales start with a vanishing
-        # gradient.
-        return tuple(
-            squared_exponential_kernel(dimension, math.sqrt(dimension), variance)
-            for dimension, variance in zip(dimensions, variances, strict=True)
-        )
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        joints = robot.joint_names
+        named = {name: tuple(f"{name} of {joint}" for joint in joints) for name in INPUTS}
+        if self.angles == "sin-cos":
+            turns = _turns(robot).tolist()
+            turning = [joint for joint, turn in zip(joints, turns, strict=True) if turn]
+            sliding = [f"q of {joint}" for joint, turn in zip(joints, turns, strict=True) if not turn]
+            waves = [f"{wave} q of {joint}" for wave in ("sin", "cos") for joint in turning]
+            named["q"] = (*sliding, *waves)
+        return (tuple(entry for name in self.inputs for entry in named[name]),) * robot.nv
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return kernels_of(self.kernel, dimensions, variances)
 
     @override
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
+
+
+def chosen_inputs(prior: str, given: object, allowed: tuple[str, ...]) -> tuple[str, ...]:
+    """`given` as a tuple of names from `allowed`, each once. Raises InvalidInput for anything else."""
+    inputs = (given,) if isinstance(given, str) else tuple(given)  # type: ignore[arg-type]  # anything is checked below
+    if not inputs or any(name not in allowed for name in inputs) or len(set(inputs)) < len(inputs):
+        names = ", ".join(map(repr, allowed))
+        raise InvalidInput(f"{prior} inputs are {given!r}; give one or more of {names}, each once.")
+    return inputs
+
+
+def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+    """One kernel per latent from the same expression."""
+    return tuple(
+        kernel_of(expression, dimension, variance) for dimension, variance in zip(dimensions, variances, strict=True)
+    )
+
+
+def _turns(robot: Robot) -> Tensor:
+    return torch.tensor([joint.type != "prismatic" for joint in robot.joints], device=robot.device)

@@ -35,7 +35,7 @@ class NoForces(ForcePrior):
         return ()
 
     @override
-    def kernels(self, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
         return ()
 
     @override

@@ -1,0 +1,123 @@
+"""`ContactFriction`: what resists the sliding of a contact along its surface."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import torch
+from gpytorch.kernels import Kernel
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.priors.force_prior import ForcePrior, Scaling
+from forcegp.priors.joint_forces import kernels_of
+from forcegp.priors.kernels import check_kernel
+from forcegp.priors.tool_point import ToolPoint, contact_axes, has_contact, nominal_normal_force, require_contact
+from forcegp.robots import Robot
+
+AXES = ("isotropic", "two-axis")
+SMALLEST_SPEED = 1e-6
+"""m/s; below it the direction of sliding is rounded off, far below any velocity scale of friction."""
+
+
+@dataclass(frozen=True)
+class ContactFriction(ForcePrior):
+    """Q_U = -J_t^T f: tangential friction of contact number `contact`, positive latents resist the motion.
+
+    Isotropic: f = g(|v_t|) v_t / |v_t| with one latent g on the sliding speed. Two-axis: one latent per tangent, each
+    on the velocity along its own. With `load` the friction is proportional to the nominal normal force (what the
+    contact would carry under the known forces alone, `nominal_normal_force`), and the latents are friction coefficients
+    without unit; the closer the known forces are to all forces, the better that load is. The kernel "friction" is
+    Coulomb, Stribeck and viscous friction with a learned velocity scale (see `JointFriction`). Without the contact
+    there is no friction.
+    """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    contact: int = 0
+    axes: str = "isotropic"
+    load: bool = False
+    kernel: str = "friction"
+
+    def __post_init__(self) -> None:
+        if self.axes not in AXES or not isinstance(self.contact, int) or self.contact < 0:
+            raise InvalidInput(
+                f"ContactFriction has axes {self.axes!r} and contact {self.contact!r}; give 'isotropic' or 'two-axis', "
+                "and a contact's number from 0."
+            )
+        check_kernel(self.kernel)
+
+    @override
+    def check(self, system: MechanicalSystem) -> None:
+        require_contact("ContactFriction", self.contact, system)
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        return ("sliding",) if self.axes == "isotropic" else ("tangent-1", "tangent-2")
+
+    @override
+    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        if not has_contact(dynamics, self.contact):
+            return torch.zeros_like(dynamics.H[..., :1]).expand(*dynamics.H.shape[:-1], self._count)
+        where = ToolPoint.of_contact(dynamics, self.contact)
+        return where.jacobian[..., :3, :].mT @ self.point_force(dynamics)
+
+    @override
+    def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
+        if not has_contact(dynamics, self.contact):
+            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, self._count)
+        tangents, sliding = self._sliding(dynamics)
+        if self.axes == "isotropic":
+            speed = (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
+            directions = tangents @ (sliding / speed)[..., None]
+        else:
+            directions = tangents
+        if self.load:
+            directions = nominal_normal_force(dynamics, self.contact)[..., None, None] * directions
+        return -directions
+
+    @override
+    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
+        if not has_contact(dynamics, self.contact):
+            return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], 1),) * self._count
+        _, sliding = self._sliding(dynamics)
+        if self.axes == "two-axis":
+            return sliding[..., :1], sliding[..., 1:]
+        return ((sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt(),)
+
+    @override
+    def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
+        return ("scale",) * self._count
+
+    @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        if self.axes == "isotropic":
+            return (("sliding speed [m/s]",),)
+        return ("velocity along tangent-1 [m/s]",), ("velocity along tangent-2 [m/s]",)
+
+    @override
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        return ("" if self.load else "N",) * self._count
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return kernels_of(self.kernel, dimensions, variances)
+
+    @override
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @property
+    def _count(self) -> int:
+        return 1 if self.axes == "isotropic" else 2
+
+    def _sliding(self, dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor]:
+        """Tangents (..., 3, 2) and the velocity of the contact point along them (..., 2)."""
+        where = ToolPoint.of_contact(dynamics, self.contact)
+        tangents = contact_axes(dynamics, self.contact)[..., :2]
+        return tangents, (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]

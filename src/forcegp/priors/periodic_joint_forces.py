@@ -1,0 +1,92 @@
+"""`PeriodicJointForces`: cogging of motors and ripple of gears, a force per joint that repeats along its position."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import torch
+from gpytorch.kernels import Kernel, PeriodicKernel, ScaleKernel
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.priors.force_prior import ForcePrior, Scaling
+from forcegp.priors.joint_friction import chosen_joints, joint_columns, joint_force_units, joint_indices
+from forcegp.priors.kernel_parameters import log_scale, register_log_normal_prior
+from forcegp.robots import Robot
+
+PERIOD_SPREAD = 0.02
+"""Standard deviation of the prior on the logarithm of a period: likelihoods of periods have many narrow optima."""
+
+
+@dataclass(frozen=True)
+class PeriodicJointForces(ForcePrior):
+    """Q_U,j = f_j(q_j) with f_j of period `period` (rad, or m for joints that slide), one independent function each.
+
+    The kernel is s exp(-2 sin^2(pi (q - q') / period) / l) (MacKay 1998; Rasmussen & Williams 2006, eq. 4.31, with l
+    the square of their length scale). The period is fitted too, near the value given: a motor with 12 pole pairs has
+    2 pi / 12, behind a gear of ratio 100 it is 2 pi / 1200. `joints` restricts the prior to some joints, by name.
+    """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    period: float = 2.0 * math.pi
+    joints: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joints", chosen_joints(type(self).__name__, self.joints))
+        if not isinstance(self.period, int | float) or not 0.0 < self.period < math.inf:
+            raise InvalidInput(f"PeriodicJointForces period is {self.period!r}; give a positive number in rad (or m).")
+        object.__setattr__(self, "period", float(self.period))
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        return robot.joint_names if self.joints is None else self.joints
+
+    @override
+    def check(self, system: MechanicalSystem) -> None:
+        joint_indices(self.joints, system.robot)
+
+    @override
+    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        return joint_columns(self.joints, dynamics)
+
+    @override
+    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
+        q = dynamics.state.q
+        return tuple(q[..., index, None] for index in joint_indices(self.joints, dynamics.state.kinematics.robot))
+
+    @override
+    def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
+        return ("none",) * len(self.latent_names(robot))  # the period is in rad
+
+    @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in robot.joints}
+        return tuple((f"position of {name} [{units[name]}]",) for name in self.latent_names(robot))
+
+    @override
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        return joint_force_units(self.latent_names(robot), robot)
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return tuple(self._kernel(variance) for variance in variances)
+
+    def _kernel(self, variance: Tensor) -> Kernel:
+        base = PeriodicKernel(lengthscale_constraint=log_scale(), period_length_constraint=log_scale())
+        kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
+        register_log_normal_prior(base, "period_length", self.period, PERIOD_SPREAD)
+        base.period_length = torch.tensor(self.period, dtype=torch.float64)
+        base.lengthscale = torch.tensor(1.0, dtype=torch.float64)
+        kernel.outputscale = variance
+        return kernel
+
+    @override
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)

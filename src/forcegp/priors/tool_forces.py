@@ -1,0 +1,209 @@
+"""`ToolForces`: an unknown Cartesian force, and if wanted torque, at one point of the robot."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import torch
+from gpytorch.kernels import Kernel
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.priors.force_prior import ForcePrior, Scaling
+from forcegp.priors.joint_forces import chosen_inputs, kernels_of
+from forcegp.priors.kernels import check_kernel
+from forcegp.priors.tool_point import (
+    AXES,
+    ToolPoint,
+    contact_axes,
+    has_contact,
+    nominal_normal_force,
+    require_contact,
+    require_moving,
+)
+from forcegp.robots import Robot
+
+TOOL_INPUTS = ("velocity", "angular-velocity", "position", "load", "q", "v", "u")
+SMALLEST_SPEED = 1e-6
+"""m/s, below which a direction of motion means nothing."""
+NAMES = {"world": ("x", "y", "z"), "tool": ("tool-x", "tool-y", "tool-z"), "surface": ("tangent-1", "tangent-2")}
+TORQUE_NAMES = {**NAMES, "surface": ("tangent-1", "tangent-2", "normal")}
+
+
+@dataclass(frozen=True)
+class ToolForces(ForcePrior):
+    """Q_U = J_p^T E f(z): a force (N) with components f along the axes E at a point, and a torque (Nm) with `torque`.
+
+    Parameters
+    ----------
+    frame, point: the link and the point in it (m) at which the force acts. Without a frame it acts where contact
+        number `contact` touches, whatever the contact is later (another tool, another surface).
+    axes: "world", "tool" (those of the link) or "surface": the two tangents of the contact's surface. Along its normal
+        an ideal contact takes every force, so accelerations show none of it and there is no such latent.
+    inputs: what the force depends on: "velocity", "angular-velocity" and "position" of the point along the same axes
+        (the position along "tool" axes: along those of the world), "load" (the nominal normal force in N), "q", "v",
+        "u".
+    kernel: an expression of `forcegp.priors.kernel_of`.
+
+    Velocities are only scaled, never shifted, so that a linear kernel is viscous friction. Forces along "surface" axes
+    vanish where the constraint does not have the contact.
+    """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    frame: str | None = None
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axes: str = "surface"
+    inputs: tuple[str, ...] = ("velocity",)
+    torque: bool = False
+    contact: int = 0
+    kernel: str = "linear + squared-exponential"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inputs", chosen_inputs("ToolForces", self.inputs, TOOL_INPUTS))
+        object.__setattr__(self, "point", tuple(float(entry) for entry in self.point))
+        check_kernel(self.kernel)
+        if self.axes not in AXES or len(self.point) != 3 or not isinstance(self.contact, int) or self.contact < 0:
+            raise InvalidInput(
+                f"ToolForces has axes {self.axes!r}, point {self.point!r} and contact {self.contact!r}; give axes "
+                f"{' or '.join(map(repr, AXES))}, a point of three numbers in m, and a contact's number from 0."
+            )
+
+    @property
+    def _needs_contact(self) -> bool:
+        return self.frame is None or self.axes == "surface" or "load" in self.inputs
+
+    @override
+    def check(self, system: MechanicalSystem) -> None:
+        if self._needs_contact:
+            require_contact(f"ToolForces(frame={self.frame!r}, axes={self.axes!r})", self.contact, system)
+        if self.frame is not None:
+            require_moving("ToolForces", self.frame, system.robot)
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        torques = TORQUE_NAMES[self.axes] if self.torque else ()
+        return (*(f"force-{name}" for name in NAMES[self.axes]), *(f"torque-{name}" for name in torques))
+
+    @override
+    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        where = self._point(dynamics)
+        if where is None:
+            return torch.zeros_like(dynamics.H[..., :1]).expand(*dynamics.H.shape[:-1], self._count)
+        axes = self._directions(dynamics, where)
+        forces = where.jacobian[..., :3, :].mT @ axes[..., : len(NAMES[self.axes])]
+        if not self.torque:
+            return forces
+        return torch.cat([forces, where.jacobian[..., 3:, :].mT @ axes], dim=-1)
+
+    @override
+    def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
+        where = self._point(dynamics)
+        if where is None:
+            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, self._count)
+        forces = self._directions(dynamics, where)[..., : len(NAMES[self.axes])]
+        torques = torch.zeros_like(forces[..., :1]).expand(*forces.shape[:-1], self._count - forces.shape[-1])
+        return torch.cat([forces, torques], dim=-1)
+
+    @override
+    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
+        state, where = dynamics.state, self._point(dynamics)
+        if where is None:  # the force is zero whatever its features are
+            nothing = state.q.new_zeros(*state.q.shape[:-1], sum(self._width(name, state.q) for name in self.inputs))
+            return (nothing,) * self._count
+        velocity, axes = where.velocity(state.v), self._directions(dynamics, where)
+        tangents = axes[..., : len(NAMES[self.axes])]
+        # along the normal of a surface the point neither moves nor changes its place
+        columns = {
+            "velocity": lambda: _along(tangents, velocity[..., :3]),
+            "angular-velocity": lambda: _along(axes, velocity[..., 3:]),
+            "position": lambda: _along(tangents, where.position) if self.axes == "surface" else where.position,
+            "load": lambda: nominal_normal_force(dynamics, self.contact)[..., None],
+            "q": lambda: state.q,
+            "v": lambda: state.v,
+            "u": lambda: state.u,
+        }
+        z = torch.cat([columns[name]() for name in self.inputs], dim=-1)
+        return (z,) * self._count
+
+    @override
+    def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...], ...]:
+        origin = ("velocity", "angular-velocity", "v")
+        ways: tuple[Scaling, ...] = tuple(
+            "scale" if name in origin else "standardize"
+            for name in self.inputs
+            for _ in range(self._width(name, robot.armature))
+        )
+        return (ways,) * self._count
+
+    @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        along, turning = NAMES[self.axes], TORQUE_NAMES[self.axes]
+        named = {
+            "velocity": [f"tool velocity along {axis} [m/s]" for axis in along],
+            "angular-velocity": [f"tool angular velocity about {axis} [rad/s]" for axis in turning],
+            "position": [f"tool position along {axis} [m]" for axis in (along if self.axes == "surface" else "xyz")],
+            "load": ["nominal normal force [N]"],
+            **{name: [f"{name} of {joint}" for joint in robot.joint_names] for name in ("q", "v", "u")},
+        }
+        return (tuple(entry for name in self.inputs for entry in named[name]),) * self._count
+
+    @override
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        return tuple("N" if name.startswith("force") else "Nm" for name in self.latent_names(robot))
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return kernels_of(self.kernel, dimensions, variances)
+
+    @override
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @property
+    def _count(self) -> int:
+        return len(NAMES[self.axes]) + (3 if self.torque else 0)
+
+    def _width(self, name: str, per_joint: Tensor) -> int:
+        """Number of features that an input brings."""
+        if name in ("q", "v", "u"):
+            return per_joint.shape[-1]
+        return {"load": 1, "angular-velocity": 3}.get(name, len(NAMES[self.axes]))
+
+    def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint | None:
+        """None where the force belongs to a contact that the constraint does not have."""
+        if self._needs_contact and not has_contact(dynamics, self.contact):
+            return None
+        if self.frame is None:
+            return ToolPoint.of_contact(dynamics, self.contact)
+        return ToolPoint.of(dynamics, self.frame, self.point)
+
+    def _directions(self, dynamics: ConstrainedDynamics, where: ToolPoint) -> Float[Tensor, "*batch 3 3"]:
+        if self.axes == "surface":
+            axes = contact_axes(dynamics, self.contact)
+            return _containing(axes, where.velocity(dynamics.state.v)[..., :3])
+        if self.axes == "tool":
+            return where.orientation
+        identity = torch.eye(3, dtype=where.position.dtype, device=where.position.device)
+        return identity.expand_as(where.orientation)
+
+
+def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The axes with tangents t + n (t v_t) v_n / |v|^2, whose plane contains the velocity to first order in v_n / |v|.
+
+    A simulated or measured point drifts off its surface a little, and what resists its motion resists that part, too.
+    The accelerations show nothing of it, but the normal force does (5e-4 of 7.7 N on `kuka-surface`).
+    """
+    tangents, normal = axes[..., :2], axes[..., 2:]
+    along, off = _along(tangents, velocity), _along(normal, velocity)
+    tilt = along * off / velocity.square().sum(-1, keepdim=True).clamp_min(SMALLEST_SPEED**2)
+    return torch.cat([tangents + normal * tilt[..., None, :], normal], dim=-1)
+
+
+def _along(axes: Float[Tensor, "*batch 3 k"], vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch k"]:
+    return (axes.mT @ vector[..., None])[..., 0]
