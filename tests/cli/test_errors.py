@@ -78,6 +78,12 @@ WRONG = [
     ("fit arm.h5 --model ensemble --points 9 --out run", "needs 10 rows; there are 9"),
     ("fit arm.h5 --model ensemble --iterations 0 --out run", "steps=0 must be a whole number above 0"),
     ("fit no_noise.h5 --model independent-gp --out run", "does not state its noise; add --noise"),
+    ("fit arm.h5 --force-noise 0 --out run", "Noise force is 0.0; give a positive"),
+    ("fit arm.h5 --model ensemble --force-noise 0.1 --out run", "--force-noise means nothing to --model ensemble"),
+    (
+        "fit arm.h5 --model independent-gp --force-noise 0.1 --out run",
+        "choose structured or unconstrained or analytical",
+    ),
     ("fit arm.h5 --mean big --out run", "'big' for argument '--mean'"),
     ("evaluate missing arm.h5", "missing does not exist; give the folder that `forcegp fit --out` wrote"),
     ("evaluate mine arm.h5", "mine holds no model.json"),
@@ -229,6 +235,25 @@ def test_noise_is_learned_or_given(folder, noise, learned, file):
     assert posterior.model.noise.learn is learned
     if not learned:
         np.testing.assert_allclose(posterior.noise_std, 0.2)
+
+
+@pytest.mark.parametrize("noise", ["dataset", "learned", "0.2"])
+def test_noise_of_forces_beside_that_of_every_row(folder, capfd, noise):
+    data = Dataset.load("arm.h5")
+    stated = 0.05 * np.arange(1.0, 61.0).reshape(20, 3)
+    dataclasses.replace(data, noise_std=stated).save("uneven.h5")
+    words = ["fit", "uneven.h5", *QUICK, "--noise", noise, "--force-noise", "0.03", "--out", "run"]
+    assert main(words) == 0
+    assert "noise std of forces" in capfd.readouterr().out
+    posterior = load_posterior("run")
+    level = posterior.training.noise_std.square().mean(0).sqrt()
+    learned = noise == "learned"
+    assert posterior.model.noise.learn is learned
+    force = posterior.parameters["noise.log_force"].exp().numpy()
+    assert np.allclose(force, 0.03, rtol=1e-6) != learned
+    if not learned:
+        np.testing.assert_allclose(posterior.noise_std, 0.2 if noise == "0.2" else level)
+    assert main(["evaluate", "run", "uneven.h5"]) == 0
 
 
 def test_more_points_than_rows_means_all_rows(folder, capfd):

@@ -47,6 +47,10 @@ class FitOptions(Command):
     """The folder to write."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
+    force_noise: Annotated[
+        float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
+    ] = None
+    """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
     restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
     """Starts of the search; the best is kept."""
     seed: Annotated[int, arg(metavar="K")] = 0
@@ -196,6 +200,7 @@ def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fittin
 def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
     result = posterior.result
+    force_noise = posterior.parameters.get("noise.log_force")
     return {
         "model": posterior.description,
         "objective_is": posterior.objective,
@@ -209,6 +214,7 @@ def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
         "converged": result.converged,
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
+        "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
     }
@@ -240,8 +246,7 @@ def _with_known_forces(system: MechanicalSystem, names: tuple[str, ...]) -> Mech
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     from forcegp.cli.tables import facts
 
-    noise = summary["noise_std"]
-    shown = f"{noise[0]:.4g}" if len(set(noise)) == 1 else " ".join(f"{std:.3g}" for std in noise)
+    forces = summary.get("force_noise_std")
     status = summary["status"]  # names failed evaluations, too, and the number of starts
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
@@ -251,11 +256,16 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
             "negative log likelihood": f"{summary['nll']:.1f} nats",
             "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
             "search": status if summary["converged"] else f"not converged: {status}",
-            "noise std": shown,
+            "noise std": _per_joint(summary["noise_std"]),
+            **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
             "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
         },
     )
     return [table, f"Next: forcegp evaluate {run} TEST.h5"]
+
+
+def _per_joint(values: list[float]) -> str:
+    return f"{values[0]:.4g}" if len(set(values)) == 1 else " ".join(f"{value:.3g}" for value in values)
 
 
 def _short(value: float) -> str:

@@ -75,7 +75,7 @@ class Identify(FitOptions):
         dataset = Dataset.load(self.data)
         system, added = with_learned_forces(self._system(dataset), learn)
         prior = NoForces() if self.model == "analytical" else JointForces()
-        model = StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset))
+        model = StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
         posterior = fit(
             terminal,
             model,

@@ -23,6 +23,7 @@ SEARCHED = ("structured", "unconstrained", "independent-gp")
 MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "mean": ("structured",),
     "prior": ("structured",),
+    "force_noise": ("structured", "unconstrained", "analytical"),
     "restarts": SEARCHED,
     "jobs": SEARCHED,
     "adam_steps": (*SEARCHED, "analytical"),
@@ -72,7 +73,7 @@ def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Mode
         noise = _known_noise(command.noise, dataset)
         steps = {} if command.iterations is None else {"steps": command.iterations}
         return (NeuralNetwork if command.model == "neural-network" else NetworkEnsemble)(system, noise, **steps)
-    noise = resolved_noise(command.noise, dataset)
+    noise = resolved_noise(command.noise, dataset, command.force_noise)
     if command.model == "independent-gp":
         return IndependentGP(system, noise=noise)
     if command.model == "unconstrained":
@@ -99,24 +100,26 @@ def search_arguments(command: Fit) -> dict[str, Any]:
     }
 
 
-def resolved_noise(given: str, dataset: Dataset) -> Noise | None:
-    """The model's noise for `learned`, `dataset` or a number. Raises InvalidInput for anything else."""
+def resolved_noise(given: str, dataset: Dataset, force: float | None = None) -> Noise | None:
+    """The model's noise for `learned`, `dataset` or a number, and for the noise of forces.
+
+    Raises InvalidInput for anything else.
+    """
     from forcegp.models import Noise
 
-    stated = None if dataset.noise_std is None else tuple(float(std) for std in dataset.noise_std)
     if given == "learned":
-        return Noise(stated or START_NOISE, learn=True)
+        return Noise(START_NOISE if dataset.noise_std is None else None, force, learn=True)
     if given == "dataset":
-        if stated is None:
+        if dataset.noise_std is None:
             raise InvalidInput(
                 "the dataset does not state its noise; add --noise learned, or --noise SIGMA if it is known."
             )
-        return None
+        return None if force is None else Noise(None, force)
     try:
         sigma = float(given)
     except ValueError:
         raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
-    return Noise(sigma)
+    return Noise(sigma, force)
 
 
 def _known_noise(given: str, dataset: Dataset) -> Noise | None:

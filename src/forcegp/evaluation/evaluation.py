@@ -23,7 +23,8 @@ class Evaluation:
     nlpd: negative log predictive density of a measurement, all joints jointly, nats per row; `nlpd_per_joint` of each
         joint alone, which does not sum to it where joints are correlated.
     coverage_95: share of measurements inside the 95 % interval of a measurement. Here and in `nlpd` the variance is
-        that of the prediction plus that of the noise: the model's, or the Dataset's where it states a larger one.
+        that of the prediction plus that of the noise: the model's, or the Dataset's where it states a larger one. A
+        Dataset that states the noise of every row is scored with that of each.
     mae_noise_free, rmse_noise_free, coverage_95_noise_free: against the true acceleration, with the variance of the
         acceleration itself (no noise added).
     noise_floor: MAE of a perfect prediction, `noise_std sqrt(2/pi)`, from the noise that the Dataset states.

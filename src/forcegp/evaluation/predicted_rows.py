@@ -28,9 +28,9 @@ class PredictedRows:
     """What a model says about every row, and the mechanics there.
 
     `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the model, or of
-    the Dataset where it states a larger one; `negative_log_density` of the measured rows under that noise;
-    `known_physics` the acceleration of the known forces alone; `moving_force` M (mean - known_physics), the part of
-    the unknown force that moves the robot (the other part presses on the surface); `unknown_force` Q_U and
+    the Dataset where it states a larger one or that of every row; `negative_log_density` of the measured rows under
+    that noise; `known_physics` the acceleration of the known forces alone; `moving_force` M (mean - known_physics), the
+    part of the unknown force that moves the robot (the other part presses on the surface); `unknown_force` Q_U and
     `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all
     three None for a model that does not speak of forces; `A`, `b` and the mass matrix `mass`.
     """
@@ -88,7 +88,7 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     dynamics = posterior.dynamics(q, v, u)
     own = dynamics if dataset.system is None else dataset.system.dynamics(q, v, u)
     covariance = _array(_not_none(prediction.covariance))
-    measurement = covariance + _noise_covariance(prediction, dataset)
+    measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
     known = _array(dynamics.acceleration_map(known=True).offset)
     return PredictedRows(
@@ -110,17 +110,37 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     )
 
 
-def _noise_covariance(prediction: Prediction, dataset: Dataset) -> Float[np.ndarray, "*rows nv nv"]:
+def stated_noise_level(posterior: Posterior, dataset: Dataset) -> Float[np.ndarray, " nv"] | None:
+    """What the noise of the model has to be compared with; None where the Dataset does not state its noise.
+
+    Where it states that of every row, rows of a recording may be quieter on the whole than those of another: the level
+    is then that of the training rows, if they stated theirs as well.
+    """
+    trained = posterior.training.noise_std
+    if dataset.noise_std is None or dataset.noise_std.ndim == 1 or trained is None:
+        return dataset.noise_level
+    return _array(trained.square().mean(0).sqrt())
+
+
+def _noise_covariance(
+    posterior: Posterior, prediction: Prediction, dataset: Dataset, block: slice
+) -> Float[np.ndarray, "*rows nv nv"]:
     """Of the measurements compared with: the model's, or the Dataset's where that is larger.
 
     The measurements may be noisier than those learned from; and a model that has learned a level of noise counts to it
-    what it cannot explain otherwise.
+    what it cannot explain otherwise. Where the Dataset states the noise of every row, that is the noise of the
+    acceleration, times what the model's level exceeds the stated one by.
     """
     noise = _array(prediction.noise_covariance)
     if dataset.noise_std is None:
         return noise
-    missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
-    return noise + np.maximum(missing, 0.0)[..., None] * np.eye(noise.shape[-1])
+    identity = np.eye(noise.shape[-1])
+    if dataset.noise_std.ndim == 1:
+        missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
+        return noise + np.maximum(missing, 0.0)[..., None] * identity
+    stated, model = stated_noise_level(posterior, dataset), _array(posterior.noise_std)
+    rows = np.maximum(model / stated, 1.0) * dataset.noise_std[block]
+    return noise + (np.square(rows) - np.square(model))[..., None] * identity
 
 
 def _carried_known_force(posterior: Posterior, dynamics: ConstrainedDynamics) -> Float[np.ndarray, "rows nv"]:

@@ -12,7 +12,7 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Evaluation, Numbers
 from forcegp.evaluation.overlap import overlap_warnings
-from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
+from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows, stated_noise_level
 from forcegp.models.protocol import Posterior
 
 NOISE_FACTOR = 1.5
@@ -38,7 +38,7 @@ def evaluate(
         noise_std_per_joint=_numbers(posterior.noise_std.detach().cpu().numpy()),
         noise_floor_per_joint=None
         if dataset.noise_std is None
-        else _numbers(metrics.noise_floor(np.asarray(dataset.noise_std))),
+        else _numbers(metrics.noise_floor(np.atleast_2d(dataset.noise_std).mean(axis=0))),
         known_physics_mae_per_joint=_numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
         warnings=(*overlap_warnings(posterior, dataset), *_noise_warnings(posterior, dataset)),
         **_against_measurements(predicted, dataset),
@@ -49,9 +49,10 @@ def evaluate(
 
 def _noise_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
     """A sentence if model and Dataset disagree about the noise of some joint by more than NOISE_FACTOR."""
-    if dataset.noise_std is None:
+    stated = stated_noise_level(posterior, dataset)
+    if stated is None:
         return ()
-    model, stated = posterior.noise_std.detach().cpu().numpy(), np.asarray(dataset.noise_std)
+    model = posterior.noise_std.detach().cpu().numpy()
     ratio = np.maximum(model / stated, stated / model)
     joint = int(ratio.argmax())
     if ratio[joint] <= NOISE_FACTOR:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -37,17 +38,18 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
     return farthest_rows(dataset, points)
 
 
-def resolved_noise(noise: Noise | None, dataset: Dataset) -> Noise:
-    """The noise given, else that which the dataset states. Raises InvalidInput where neither is known."""
-    if noise is not None:
+def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
+    """The noise given, else the level that the training rows state. Raises InvalidInput where neither is known."""
+    if noise is not None and noise.acceleration is not None:
         return noise
-    if dataset.noise_std is None:
+    level = rows.noise_level
+    if level is None:
         raise InvalidInput(
             "the dataset does not know its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
             "noise=Noise(0.1, learn=True) "
             "to learn it from there"
         )
-    return Noise(tuple(float(std) for std in dataset.noise_std))
+    return replace(noise or Noise(), acceleration=tuple(float(std) for std in level))
 
 
 def check_search_numbers(restarts: int, jobs: int, seed: int) -> None:

@@ -90,7 +90,7 @@ class IndependentGP(Model):
         FitError: no restart could be evaluated for some joint; the message names it and the cause.
         """
         rows = training_rows(self.system.robot.joint_names, dataset, points)
-        noise = resolved_noise(self.noise, dataset)
+        noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, jobs, seed)
         training = TrainingData.of(rows, self.system.robot.device)

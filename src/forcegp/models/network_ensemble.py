@@ -44,7 +44,7 @@ class NetworkEnsemble(NetworkModel):
     ----------
     system: what the robot is; contacts are those that predictions are checked on.
     noise: standard deviation of the measured acceleration if it is known; None takes `dataset.noise_std`, and where
-        the Dataset does not know either, the members' variances count as noise.
+        the Dataset does not know either, the members' variances count as noise. Rows that differ in noise weigh alike.
     members, width, depth: networks, units of a layer, residual layers.
     steps, batch, rate, weight_decay: AdamW steps at most, rows of each, its first rate and weight decay.
     beta: 0 is the plain Gaussian likelihood, 1 weighs all errors equally; 0.5 as Seitzer et al. advise.
@@ -105,7 +105,7 @@ class NetworkEnsemble(NetworkModel):
             evaluations=search.step,
             cpu_seconds=time.process_time() - start_time,
         )
-        fitted = replace(self, noise=self.resolved_noise(dataset))
+        fitted = replace(self, noise=self.resolved_noise(rows))
         numbers = {name: getattr(self, name) for name in fitted.numbers}
         return fitted.condition(
             training, parameters, result, fit_settings(rows, dataset, seed, fitted.noise, **numbers)

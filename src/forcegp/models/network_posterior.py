@@ -18,7 +18,7 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.fit_arguments import check_search_numbers, described_rows, training_rows
+from forcegp.models.fit_arguments import check_search_numbers, described_rows, resolved_noise, training_rows
 from forcegp.models.marginal_likelihood import Standardization, TrainingData
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Prediction
@@ -26,7 +26,11 @@ from forcegp.models.protocol import Model, Posterior
 
 
 class NetworkModel(Model):
-    """A network from (q, v, u) to the acceleration. Subclasses are frozen dataclasses with `system` and `noise`."""
+    """A network from (q, v, u) to the acceleration. Subclasses are frozen dataclasses with `system` and `noise`.
+
+    Training weighs all rows alike: of data that state the noise of every row, a network takes only the level, its root
+    mean square over the training rows.
+    """
 
     # These constructors are the checks, with messages for people; checks of annotations must not come before them.
     __no_type_check__: ClassVar[bool] = True
@@ -62,11 +66,11 @@ class NetworkModel(Model):
     ) -> NetworkPosterior:
         return NetworkPosterior(self, training, dict(parameters), result, dict(settings))
 
-    def resolved_noise(self, dataset: Dataset) -> Noise | None:
-        """The noise given, else that which the dataset states, else None: it is estimated."""
-        if self.noise is not None or dataset.noise_std is None:
-            return self.noise
-        return Noise(tuple(float(std) for std in dataset.noise_std))
+    def resolved_noise(self, rows: Dataset) -> Noise | None:
+        """The noise given, else the level that the training rows state, else None: it is estimated."""
+        if self.noise is None and rows.noise_std is None:
+            return None
+        return resolved_noise(self.noise, rows)
 
     def prepared(self, dataset: Dataset, points: int | None, seed: int) -> tuple[Dataset, TrainingData]:
         """The rows to train on, as a Dataset and as tensors."""

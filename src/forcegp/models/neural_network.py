@@ -41,7 +41,7 @@ class NeuralNetwork(NetworkModel):
     ----------
     system: what the robot is; contacts are those that predictions are checked on.
     noise: standard deviation of the measured acceleration if it is known; None takes `dataset.noise_std`, and where
-        the Dataset does not know either, all of the residual counts as noise.
+        the Dataset does not know either, all of the residual counts as noise. Rows that differ in noise weigh alike.
     width: hidden units.
     steps, batch, rate: Adam steps, rows of each, and its rate.
     """
@@ -86,7 +86,7 @@ class NeuralNetwork(NetworkModel):
             evaluations=self.steps,
             cpu_seconds=time.process_time() - start_time,
         )
-        fitted = replace(self, noise=self.resolved_noise(dataset))
+        fitted = replace(self, noise=self.resolved_noise(rows))
         numbers = {name: getattr(self, name) for name in ("width", "steps", "batch", "rate")}
         return fitted.condition(
             training, parameters, result, fit_settings(rows, dataset, seed, fitted.noise, **numbers)

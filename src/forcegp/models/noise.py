@@ -20,25 +20,38 @@ FORCE = "noise.log_force"
 class Noise:
     """Standard deviations: `acceleration` in rad/s^2 or m/s^2, `force` in Nm or N (None: no force-level noise).
 
-    Each is one number or one per joint. With `learn` they are start values of the optimisation, else they stay fixed;
-    the hyperprior of a learned one is log-normal around its start value, with a factor of e as one standard deviation.
-    The covariance of one row is diag(acceleration^2) + H diag(force^2) H^T.
+    Each is one number or one per joint; None for `acceleration` takes what the dataset states. With `learn` they are
+    start values of the optimisation, else they stay fixed; the hyperprior of a learned one is log-normal around its
+    start value, with a factor of e as one standard deviation. The covariance of one row is
+
+        diag((acceleration factor)^2) + H diag(force^2) H^T,
+
+    where the factor is 1, or, for data that state the noise of every row, that noise over its root mean square: then
+    `acceleration` is the level, and which rows are noisier is as stated.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
     __no_type_check__: ClassVar[bool] = True
 
-    acceleration: float | tuple[float, ...] = 0.1
+    acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None
     learn: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "acceleration", _positive("acceleration", self.acceleration))
+        if self.acceleration is not None:
+            object.__setattr__(self, "acceleration", _positive("acceleration", self.acceleration))
         if self.force is not None:
             object.__setattr__(self, "force", _positive("force", self.force))
 
     def parameters(self, nv: int) -> dict[str, Float[Tensor, "nv"]]:
-        """Logarithms of the standard deviations, one per joint. Raises InvalidInput for a wrong number of values."""
+        """Logarithms of the standard deviations, one per joint.
+
+        Raises InvalidInput for a wrong number of values, and where only a dataset can tell the level.
+        """
+        if self.acceleration is None:
+            raise InvalidInput(
+                "Noise(None) takes the noise of the acceleration from the dataset of a fit; give a number here."
+            )
         named = {ACCELERATION: self.acceleration} | ({} if self.force is None else {FORCE: self.force})
         out = {}
         for name, value in named.items():
@@ -50,12 +63,18 @@ class Noise:
 
     @staticmethod
     def covariance(
-        parameters: Mapping[str, Tensor], H: Float[Tensor, "*batch nv nv"]
+        parameters: Mapping[str, Tensor],
+        H: Float[Tensor, "*batch nv nv"],
+        factors: Float[Tensor, "*batch nv"] | None = None,
     ) -> Float[Tensor, "#N nv"] | Float[Tensor, "N nv nv"]:
-        """Variances (1, nv) of the rows, or their covariances (..., nv, nv) when there is force-level noise."""
+        """Variances (1 or N, nv) of the rows, or their covariances (N, nv, nv) when there is force-level noise.
+
+        `factors` (N, nv) multiply the standard deviations of the acceleration.
+        """
         acceleration = (2.0 * parameters[ACCELERATION]).exp()
+        acceleration = acceleration[None] if factors is None else acceleration * factors.square()
         if FORCE not in parameters:
-            return acceleration[None]
+            return acceleration
         force = (2.0 * parameters[FORCE]).exp()
         return torch.diag_embed(acceleration) + (H * force) @ H.mT
 

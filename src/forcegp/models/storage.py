@@ -30,6 +30,7 @@ from forcegp.models.stored_models import KINDS, kind_of
 
 FORMAT_VERSION = 1
 STATES = ("q", "v", "u", "a")
+NOISE = "training.noise_std"
 
 
 def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = False) -> None:
@@ -72,6 +73,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     }
     training = posterior.training
     tensors = {f"training.{name}": getattr(training, name).detach().cpu().contiguous() for name in STATES}
+    if training.noise_std is not None:
+        tensors[NOISE] = training.noise_std.detach().cpu().contiguous()
     tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +115,8 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
         model = KINDS[document["kind"]].from_dict(system, document["model"])
-        training = TrainingData(*(tensors[f"training.{name}"] for name in STATES))
+        states = {name: tensors[f"training.{name}"] for name in STATES}
+        training = TrainingData(**states, noise_std=tensors.get(NOISE))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
         result = document["result"]
@@ -141,6 +145,10 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
 
 def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
     states = {name: getattr(training, name) for name in STATES}
+    if training.noise_std is not None:
+        states["noise_std"] = training.noise_std
+        if not bool((training.noise_std > 0).all()):
+            raise FileFormatError(f"{file} is damaged: training noise_std has values that are not positive")
     shape = (training.q.shape[0], model.system.robot.nv) if training.q.dim() == 2 else None
     for name, value in {**states, **parameters}.items():
         if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):

@@ -59,7 +59,8 @@ class StructuredGP(Model):
     prior: the unknown force Q_U = B f; the default is one Gaussian process per joint on (q, v, u).
     mean: "analytical" keeps the known forces Q_K in the mean; "zero" drops them, so that the processes carry Q_K + Q_U.
     noise: measurement noise, a `Noise` or just its standard deviation. None takes `dataset.noise_std`, and raises if
-        the dataset does not know it: then pass `Noise(0.1, learn=True)` to learn it.
+        the dataset does not know it: then pass `Noise(0.1, learn=True)` to learn it. Where the dataset states the noise
+        of every row, the level given or learned here is its root mean square over the training rows.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -128,7 +129,7 @@ class StructuredGP(Model):
         FitError: no restart could be evaluated; the message names the cause.
         """
         rows = training_rows(self.system.robot.joint_names, dataset, points)
-        noise = resolved_noise(self.noise, dataset)
+        noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, jobs, seed)
         if not 0.0 <= prior_strength < float("inf"):
