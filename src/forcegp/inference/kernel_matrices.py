@@ -18,7 +18,8 @@ both differentiable in z and in the kernel's parameters.
 from __future__ import annotations
 
 import math
-from functools import reduce
+from collections.abc import Callable
+from functools import partial, reduce
 from operator import add, mul
 from typing import cast
 
@@ -29,6 +30,7 @@ from gpytorch.kernels import (
     Kernel,
     LinearKernel,
     MaternKernel,
+    PeriodicKernel,
     ProductKernel,
     RBFKernel,
     ScaleKernel,
@@ -38,10 +40,22 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
+PointMap = Callable[[Tensor], Tensor]
+"""Features (n, d) -> something (n, _) of every point."""
+
 NO_DISTANCE = 1e-8
 """Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
 
-KNOWN = (AdditiveKernel, ProductKernel, ScaleKernel, RBFKernel, MaternKernel, LinearKernel, ConstantKernel)
+KNOWN = (
+    AdditiveKernel,
+    ProductKernel,
+    ScaleKernel,
+    RBFKernel,
+    MaternKernel,
+    PeriodicKernel,
+    LinearKernel,
+    ConstantKernel,
+)
 """GPyTorch classes whose formulas are evaluated here; subclasses may have other formulas and are called."""
 
 
@@ -66,9 +80,35 @@ def dense_matrix(
         return _of_distance(kernel, z, other, torch.ones((), dtype=z.dtype, device=z.device))
     if type(kernel) is ConstantKernel:
         return kernel.constant.reshape(1, 1).expand(len(z), len(z if other is None else other)).contiguous()
+    embed = squared_exponential_embedding(kernel)
+    if embed is not None:
+        return _of_embedding(embed(z), None if other is None else embed(other))
+    feature = weight_features(kernel)
+    assert feature is not None  # _is_known said so
+    left = feature(z)
+    return left @ (left if other is None else feature(other)).mT
+
+
+def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
+    """e(z) with k = exp(-1/2 |e(z) - e(z')|^2); None for kernels that are not of that form, or not known to be."""
+    if type(kernel) is PeriodicKernel:
+        return partial(_circles, kernel)
+    return getattr(kernel, "squared_exponential_embedding", None)
+
+
+def weight_features(kernel: Kernel) -> PointMap | None:
+    """phi(z) with k = phi(z) . phi(z'), one entry per weight; None for kernels that are not known to be so."""
     if type(kernel) is LinearKernel:
-        return (z * kernel.variance.reshape(-1)) @ (z if other is None else other).mT
-    return _from_method(kernel, z, other)
+        return lambda z: z * kernel.variance.reshape(-1).sqrt()
+    if type(kernel) is ConstantKernel:
+        return lambda z: kernel.constant.sqrt().reshape(1, 1).expand(len(z), 1)
+    return getattr(kernel, "weight_features", None)
+
+
+def _circles(kernel: PeriodicKernel, z: Tensor) -> Tensor:
+    """e(x) = (cos, sin)(2 pi x / p) / sqrt l, for which 1/2 |e(x) - e(y)|^2 = 2 sin^2(pi (x - y) / p) / l."""
+    angle = (2.0 * math.pi) * z / kernel.period_length.reshape(-1)
+    return torch.cat([angle.cos(), angle.sin()], dim=-1) / _lengthscale(kernel).sqrt().expand(z.shape[-1]).repeat(2)
 
 
 def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
@@ -96,8 +136,11 @@ def _is_known(kernel: Kernel) -> bool:
         # It takes over the `active_dims` of its base, which then does not select again.
         base = kernel.base_kernel
         return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
-    methods = ("squared_exponential_embedding", "weight_features")
-    return type(kernel) in KNOWN or any(hasattr(kernel, method) for method in methods)
+    return (
+        type(kernel) in KNOWN
+        or squared_exponential_embedding(kernel) is not None
+        or weight_features(kernel) is not None
+    )
 
 
 def _selected(kernel: Kernel, z: Tensor) -> Tensor:
@@ -120,15 +163,10 @@ def _of_distance(kernel: Kernel, z: Tensor, other: Tensor | None, outputscale: T
     return outputscale * _matern(distance(z, other), smoothness)
 
 
-def _from_method(kernel: Kernel, z: Tensor, other: Tensor | None) -> Tensor:
-    embedding = getattr(kernel, "squared_exponential_embedding", None)
-    function = getattr(kernel, "weight_features") if embedding is None else embedding  # noqa: B009
-    left, right = function(z), None if other is None else function(other)
-    if embedding is None:
-        return left @ (left if right is None else right).mT
+def _of_embedding(left: Tensor, right: Tensor | None) -> Tensor:
     if right is not None:
         return torch.exp(-0.5 * squared_distance(left, right))
-    one = torch.ones(1, dtype=z.dtype, device=z.device)
+    one = torch.ones(1, dtype=left.dtype, device=left.device)
     return cast(Tensor, _Stationary.apply(left, one, one[0], math.inf))
 
 
