@@ -63,6 +63,14 @@ class LatentPosterior:
         ]
         return torch.cat(blocks) if blocks else C.new_zeros(0, latents, latents)
 
+    def one(self, index: int, z: Float[Tensor, "n _"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Mean and variance of one latent at points of its own features."""
+        kernel, C = list(self.kernels)[index], self.system.deflation.C
+        cross = kernel_cross(kernel, z, self.features[index])
+        V = (cross.mT[:, None, :] * C[:, :, index, None]).flatten(0, 1)
+        explained = self.system.factor.solve_lower(V).square().sum(0)
+        return cross @ self.system.beta[:, index], kernel_diagonal(kernel, z) - explained
+
     def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         C = self.system.deflation.C
         count, rank, latents = C.shape

@@ -69,8 +69,8 @@ class Standardization:
         shifts, scales = [], []
         for z, given in zip(features, scalings, strict=True):
             ways = (given,) * z.shape[-1] if isinstance(given, str) else given
-            shifted = torch.tensor([way == "standardize" for way in ways], device=z.device)
-            scaled = torch.tensor([way != "none" for way in ways], device=z.device)
+            shifted = torch.tensor([way == "standardize" for way in ways], dtype=torch.bool, device=z.device)
+            scaled = torch.tensor([way != "none" for way in ways], dtype=torch.bool, device=z.device)
             shift = torch.where(shifted, z.mean(0), torch.zeros_like(z[0]))
             size = (z - shift).square().mean(0)
             # below rounding of the values themselves a feature counts as constant; the root comes after that choice,

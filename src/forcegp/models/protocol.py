@@ -111,17 +111,24 @@ class Posterior(ABC):
         in q, v and u where these are tensors that require gradients.
         Raises InvalidInput for wrong shapes or values that are not finite.
         """
-        nv = self.system.robot.nv
-        device = self.system.robot.device
-        states = _broadcast(_tensor("q", q, nv, device), _tensor("v", v, nv, device), _tensor("u", u, nv, device))
-        batch = states[0].shape[:-1]
-        q, v, u = (x.reshape(-1, nv) for x in states)
+        states, batch = self.checked_states(q, v, u)
+        q, v, u = states
         blocks = [
             self.predict_rows(q[block], v[block], u[block], covariance)
-            for start in range(0, max(q.shape[0], 1), ROWS_PER_BLOCK)
+            for start in range(0, max(len(q), 1), ROWS_PER_BLOCK)
             for block in [slice(start, start + ROWS_PER_BLOCK)]
         ]
         return join_predictions(blocks, batch)
+
+    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Float[Tensor, "rows nv"]], torch.Size]:
+        """States as rows of float64 tensors on the model's device, and their batch dimensions.
+
+        Raises InvalidInput for wrong shapes or values that are not finite.
+        """
+        nv = self.system.robot.nv
+        device = self.system.robot.device
+        states = _broadcast(_tensor("q", q, nv, device), _tensor("v", v, nv, device), _tensor("u", u, nv, device))
+        return [x.reshape(-1, nv) for x in states], states[0].shape[:-1]
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
         """What `rollout` integrates, under this stabilisation; for models that know no constraint it must be None."""

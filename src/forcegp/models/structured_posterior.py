@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,17 +12,19 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
-from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics
+from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
+from forcegp.models.components import Components, Curve, Latents, components_of
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
-from forcegp.models.protocol import Posterior
+from forcegp.models.protocol import Array, Posterior
 from forcegp.priors import JointAccelerations, NoForces
+from forcegp.robots import Robot
 
 if TYPE_CHECKING:
     from forcegp.models.structured_gp import StructuredGP
@@ -34,6 +36,8 @@ class StructuredPosterior(Posterior):
 
     `result` holds the history of the optimisation, `settings` the resolved configuration of the fit (plain JSON
     values), `identification` what was learned of the system itself, after a fit with `learn` (not after loading).
+    `target` is the system that predictions are for, where it is not the one that the model was trained on
+    (`with_contacts`, `with_robot`).
     """
 
     model: StructuredGP
@@ -43,11 +47,17 @@ class StructuredPosterior(Posterior):
     result: OptimizationResult
     settings: Mapping[str, Any]
     identification: Identification | None = None
+    target: MechanicalSystem | None = None
 
     @cached_property
     def latent(self) -> LatentPosterior:
         """The posterior of the latent functions."""
         return self.likelihood.condition(self.kernels, self.parameters)
+
+    @property
+    @override
+    def system(self) -> MechanicalSystem:
+        return self.model.system if self.target is None else self.target
 
     @property
     @override
@@ -79,18 +89,11 @@ class StructuredPosterior(Posterior):
     ) -> Prediction:
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
-        features = self.likelihood.standardization(self.model.prior.features(dynamics))
         B = self.model.prior.mixing(dynamics)
-        rows, latents = len(q), B.shape[-1]
-        mean = self.latent.mean(features) if latents else q.new_zeros(rows, 0)
-        cov = None
-        if covariance:
-            cov = self.latent.covariance(features) if latents else q.new_zeros(rows, 0, 0)
+        latents = self._latents(dynamics, covariance)
 
         def through(affine: AffineMap) -> Gaussian:
-            W = affine.matrix @ B
-            value = affine.offset + (W @ mean[..., None])[..., 0]
-            return Gaussian(value, None if cov is None else _symmetric(W @ cov @ W.mT))
+            return latents.through(affine.matrix @ B, affine.offset)
 
         acceleration = through(dynamics.acceleration_map(known))
         return Prediction(
@@ -98,9 +101,111 @@ class StructuredPosterior(Posterior):
             acceleration.covariance,
             multiplier=through(dynamics.multiplier_map(known)),
             contact_force=through(dynamics.contact_force_map(known)),
-            unknown_force=through(_identity_map(dynamics)),
+            unknown_force=latents.through(B),
             noise_covariance=_noise_covariance(self.parameters, dynamics),
         )
+
+    def _latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
+        """All processes at a batch of states."""
+        batch = dynamics.state.q.shape[:-1]
+        given = self.likelihood.standardization(self.model.prior.features(dynamics))
+        features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
+        latents = len(features)
+        if not latents:
+            nothing = dynamics.state.q.new_zeros(*batch, 0)
+            return Latents(nothing, nothing[..., None] if covariance else None)
+        mean = self.latent.mean(features).reshape(*batch, latents)
+        return Latents(mean, self.latent.covariance(features).reshape(*batch, latents, latents) if covariance else None)
+
+    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
+        """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
+
+        States as for `predict`, as many as fit into memory at once. `components(q, v, u)["joint-friction"].joint_force`
+        is a `Gaussian` (..., nv) in Nm or N. Raises InvalidInput for wrong shapes or values that are not finite.
+        """
+        states, batch = self.checked_states(q, v, u)
+        dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
+        latents = self._latents(dynamics, covariance)
+        return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
+
+    def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
+        """One process of the prior over its features: a friction curve, for example.
+
+        Parameters
+        ----------
+        latent: its name, one of `latent_names`.
+        features: (n, d), or (n,) where the process has one feature, in the units of `prior.feature_names`. None takes
+            `points` values over the range that the training data visited, for processes of one feature.
+
+        Raises InvalidInput for another name, wrong shapes, and None for processes of several features.
+        """
+        names = self.latent_names
+        if latent not in names:
+            raise InvalidInput(unknown_name_message("latent", latent, "this model", names))
+        index = names.index(latent)
+        prior, robot = self.model.prior, self.model.system.robot
+        with torch.no_grad():
+            given = prior.features(self.likelihood.dynamics(self.parameters))[index]
+            visited = torch.stack([given.amin(0), given.amax(0)]) if given.shape[-1] else given[:2]
+            z = _curve_features(latent, features, visited, points)
+            shift, scale = (part[index] for part in (self.likelihood.standardization.shift, self._scales))
+            mean, variance = self.latent.one(index, (z - shift) / scale)
+        labels = prior.feature_names(robot)
+        plain = tuple(f"feature {k}" for k in range(z.shape[-1]))
+        return Curve(
+            latent,
+            prior.latent_unit(robot)[index],
+            plain if labels is None else labels[index],
+            z,
+            mean,
+            variance.clamp_min(0.0).sqrt(),
+            visited,
+        )
+
+    @property
+    def latent_names(self) -> tuple[str, ...]:
+        """The processes that the prior is made of."""
+        return self.model.prior.latent_names(self.model.system.robot)
+
+    @property
+    def _scales(self) -> tuple[Tensor, ...]:
+        return self.likelihood.standardization.scale
+
+    def with_contacts(self, contacts: Sequence[Contact]) -> StructuredPosterior:
+        """The same forces under other contacts, without another fit: another surface, or none at all, `[]`.
+
+        What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
+        are zero without it.
+        """
+        return self.with_system(self.system.with_contacts(contacts))
+
+    def with_robot(self, robot: Robot) -> StructuredPosterior:
+        """The same forces on another robot with the same joints, for example with another known tool.
+
+        Raises InvalidInput for other joints, and for a model without analytical mean, whose processes hold the weight
+        and inertia of the robot that it was trained on.
+        """
+        return self.with_system(self.system.with_robot(robot))
+
+    def with_system(self, system: MechanicalSystem) -> StructuredPosterior:
+        """The same forces in another system (robot, contacts, known forces, stabilisation) with the same joints.
+
+        Raises InvalidInput as `with_robot`, and UnknownFrame where a force acts on a frame that the robot lacks.
+        """
+        trained = self.model.system
+        if system.robot.joint_names != trained.robot.joint_names:
+            raise InvalidInput(
+                f"the model was trained on joints {', '.join(trained.robot.joint_names)}; the other robot has "
+                f"{', '.join(system.robot.joint_names)}. Forces can move to robots with the same joints only."
+            )
+        if self.carries_known_forces and system.robot is not trained.robot:
+            raise InvalidInput(
+                "the model has no analytical mean, so its processes hold gravity and inertia of the robot that it was "
+                "trained on and cannot move to another; fit with mean='analytical' (--mean analytical)."
+            )
+        rest = torch.zeros(1, system.robot.nv, dtype=torch.float64, device=system.robot.device)
+        self.model.prior.mixing(system.dynamics(rest, rest, rest, inertials_of(self.parameters) or None))
+        return replace(self, target=system)
 
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
@@ -122,7 +227,7 @@ class StructuredPosterior(Posterior):
         model = self.model
         if z is not None and self.identification is not None:
             model = replace(model, system=self.identification.physical.system_at(z))
-        return model.condition(self.likelihood.training, point, self.result, self.settings)
+        return replace(model.condition(self.training, point, self.result, self.settings), target=self.target)
 
     @cached_property
     def negative_log_likelihood(self) -> float:
@@ -136,16 +241,21 @@ class StructuredPosterior(Posterior):
         return self.parameters[ACCELERATION].exp()
 
 
-def _identity_map(dynamics: ConstrainedDynamics) -> AffineMap:
-    nv = dynamics.state.u.shape[-1]
-    identity = torch.eye(nv, dtype=dynamics.state.u.dtype, device=dynamics.state.u.device)
-    return AffineMap(torch.zeros_like(dynamics.state.u), identity.expand_as(dynamics.H))
-
-
 def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDynamics) -> Tensor:
     noise = Noise.covariance(parameters, dynamics.H)
     return torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise
 
 
-def _symmetric(matrix: Tensor) -> Tensor:
-    return 0.5 * (matrix + matrix.mT)
+def _curve_features(latent: str, given: Array | None, visited: Tensor, points: int) -> Tensor:
+    """Features (n, d) of a curve, checked."""
+    count = visited.shape[-1]
+    if given is None:
+        if count != 1:
+            raise InvalidInput(f"{latent!r} is a function of {count} features; give features (n, {count})")
+        steps = torch.linspace(0.0, 1.0, points, dtype=torch.float64, device=visited.device)
+        return visited[0] + steps[:, None] * (visited[1] - visited[0])
+    z = torch.as_tensor(given, dtype=torch.float64, device=visited.device)
+    z = z[:, None] if z.dim() == 1 and count == 1 else z
+    if z.dim() != 2 or z.shape[-1] != count or not bool(torch.isfinite(z).all()):
+        raise InvalidInput(f"features of {latent!r} have shape {tuple(z.shape)}; give finite numbers (n, {count})")
+    return z
