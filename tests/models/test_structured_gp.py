@@ -237,10 +237,19 @@ def test_wrong_mean_and_contradictory_contacts_are_refused(train):
         StructuredGP(system).fit(train)
 
 
-def test_a_surface_far_from_the_data_is_pointed_out(train):
+def test_a_surface_that_no_row_touches_is_refused(train):
     raised = train.system.with_contacts((Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9)),))
-    with pytest.warns(DataWarning, match=r"more than 0\.49 m from the surface of contact 0 \(frame 'hand'\)"):
+    with pytest.raises(ContactError, match=r"no training point touches .* contact 0 \(frame 'hand'\).* 0\.49 m away"):
         StructuredGP(raised).fit(train, points=10, restarts=1, options=OptimizerOptions(iterations=1))
+
+
+def test_a_surface_that_most_rows_miss_is_pointed_out(train):
+    low = arm_data(20, 5, train.system)
+    high = arm_data(40, 6, arm_system(contacts=0))
+    mixed = {name: np.concatenate([getattr(low, name), getattr(high, name)]) for name in ("q", "v", "u", "a")}
+    data = Dataset(**mixed, time=np.arange(60.0), system=train.system, noise_std=train.noise_std)
+    with pytest.warns(DataWarning, match=r"half of the training points .* rows in contact only"):
+        StructuredGP(train.system).fit(data, restarts=1, options=OptimizerOptions(iterations=1))
 
 
 def test_parts_of_the_wrong_kind_are_named(train):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import DataWarning, FitError, InvalidInput
+from forcegp.errors import ContactError, DataWarning, FitError, InvalidInput
 from forcegp.inference import (
     LatentKernels,
     OptimizationResult,
@@ -33,6 +33,7 @@ from forcegp.models.noise import Noise
 from forcegp.models.objective import LOG_VARIANCE_SPREAD, FitObjective, with_variance_priors
 from forcegp.models.physical_parameters import PHYSICAL, Learned, learn_to_list
 from forcegp.models.physical_start import PhysicalStart
+from forcegp.models.prior_checks import check_prior
 from forcegp.models.protocol import Model
 from forcegp.models.search import (
     FitProgress,
@@ -80,6 +81,7 @@ class StructuredGP(Model):
             object.__setattr__(self, "noise", Noise(self.noise))
         if self.mean not in get_args(Mean):
             raise InvalidInput(f"mean is {self.mean!r}; allowed: {', '.join(map(repr, get_args(Mean)))}")
+        self.prior.check(self.system)
 
     def fit(
         self,
@@ -125,7 +127,7 @@ class StructuredGP(Model):
         Raises
         ------
         InvalidInput: the dataset does not fit the system, or an argument is out of range.
-        ContactError: a contact cannot hold at some row.
+        ContactError: a contact cannot hold at some row, or no row touches its surface.
         FitError: no restart could be evaluated; the message names the cause.
         """
         rows = training_rows(self.system.robot.joint_names, dataset, points)
@@ -137,7 +139,8 @@ class StructuredGP(Model):
         training = TrainingData.of(rows, self.system.robot.device)
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
-        _warn_of_distance(self.system, training)
+        _check_distance(self.system, training)
+        check_prior(likelihood)
         noise_parameters = noise.parameters(self.system.robot.nv)
         learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
         begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters, prior_strength)
@@ -247,18 +250,25 @@ class _Search:
             return error
 
 
-def _warn_of_distance(system: MechanicalSystem, training: TrainingData) -> None:
-    """Warn where most training states are far from a surface that is said to hold them."""
+def _check_distance(system: MechanicalSystem, training: TrainingData) -> None:
+    """Refuse a surface that no training state touches, and warn where half of them are far from it."""
     kinematics = system.robot.kinematics(training.q)
     for index, contact in enumerate(system.contacts):
         # divided by |s_p|, which is 1 for signed distances, the value of any surface is a distance near it
         size = torch.linalg.vector_norm(contact.surface.gradient(contact.position(kinematics)), dim=-1)
-        distance = float((contact.distance(kinematics) / size).abs().median())
+        distances = (contact.distance(kinematics) / size).abs()
+        distance = float(distances.median())
+        what = f"the surface of contact {index} (frame {contact.frame!r})"
+        remedy = "check its surface, point and units (m), or leave the contact out"
+        if float(distances.min()) > FAR_FROM_SURFACE:
+            raise ContactError(
+                f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away, half of them "
+                f"more than {distance:.3g} m; {remedy}"
+            )
         if distance > FAR_FROM_SURFACE:
             warnings.warn(
-                f"half of the training points lie more than {distance:.3g} m from the surface of contact {index} "
-                "(frame "
-                f"{contact.frame!r}); check its surface, point and units (m), or leave the contact out",
+                f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
+                "rows in contact only (forcegp.data.rows_in_contact)",
                 DataWarning,
                 stacklevel=3,
             )

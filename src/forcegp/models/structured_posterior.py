@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message
-from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult
+from forcegp.inference import LatentKernels, LatentPosterior, LeaveOut, OptimizationResult, leave_blocks_out
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
 from forcegp.models.components import Components, Curve, Latents, components_of
@@ -112,8 +112,8 @@ class StructuredPosterior(Posterior):
         features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
         latents = len(features)
         if not latents:
-            nothing = dynamics.state.q.new_zeros(*batch, 0)
-            return Latents(nothing, nothing[..., None] if covariance else None)
+            nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
+            return Latents(nothing.flatten(-2), nothing if covariance else None)
         mean = self.latent.mean(features).reshape(*batch, latents)
         return Latents(mean, self.latent.covariance(features).reshape(*batch, latents, latents) if covariance else None)
 
@@ -228,6 +228,12 @@ class StructuredPosterior(Posterior):
         if z is not None and self.identification is not None:
             model = replace(model, system=self.identification.physical.system_at(z))
         return replace(model.condition(self.training, point, self.result, self.settings), target=self.target)
+
+    @override
+    def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
+        with torch.no_grad():
+            *_, noise = self.likelihood.terms(self.parameters)
+        return leave_blocks_out(self.latent.system, noise, blocks)
 
     @cached_property
     def negative_log_likelihood(self) -> float:

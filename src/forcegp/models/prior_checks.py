@@ -1,0 +1,127 @@
+"""What data cannot teach a prior, said before anything is fitted."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import DataWarning, InvalidInput
+from forcegp.models.components import term_slices
+from forcegp.models.marginal_likelihood import CONSTANT, MarginalLikelihood
+from forcegp.priors import ForcePrior
+
+INVISIBLE = 1e-9
+"""|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
+EQUAL = 1e-9
+"""Relative difference of two latents' effects and features below which they are the same."""
+
+
+def check_prior(likelihood: MarginalLikelihood) -> None:
+    """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
+
+    Raises InvalidInput if no latent changes the acceleration at any training point, if all features of a latent are
+    constant (a tool or joint that never moves), and if latents of two terms do the same in every row. Warns
+    (DataWarning) of single features that are constant, and of latents that the constraint hides while others show.
+    """
+    names = likelihood.prior.latent_names(likelihood.system.robot)
+    if not names:
+        return
+    dynamics = likelihood.dynamics()
+    B = likelihood.prior.mixing(dynamics)
+    features = likelihood.prior.features(dynamics)
+    _check_features(likelihood, names, features)
+    effect = dynamics.H @ B
+    _check_visible(names, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
+    terms = [number for number, (*_, which) in enumerate(_terms(likelihood)) for _ in range(which.stop - which.start)]
+    _check_distinct(names, terms, effect, likelihood.standardization(features))
+
+
+def _terms(likelihood: MarginalLikelihood) -> list[tuple[str, ForcePrior, slice]]:
+    return term_slices(likelihood.prior, likelihood.system.robot)
+
+
+def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
+    robot = likelihood.system.robot
+    labels = likelihood.prior.feature_names(robot)
+    scalings = likelihood.prior.scalings(robot)
+    idle: dict[tuple[str, ...], list[str]] = {}
+    for index, (name, z) in enumerate(zip(names, features, strict=True)):
+        if not z.shape[-1]:
+            continue
+        spread = z.var(0, correction=0).sqrt()
+        constant = spread <= CONSTANT * (1.0 + z.mean(0).abs())
+        known = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
+        which = tuple(label for label, flat in zip(known, constant.tolist(), strict=True) if flat)
+        if bool(constant.all()):
+            raise InvalidInput(
+                f"latent {name!r} depends on {', '.join(which)}, which is the same in all {len(z)} training rows "
+                f"({_values(z[0])}), so its function cannot be learned; give data in which it changes, or leave this "
+                "prior (or this joint) out"
+            )
+        if which and any(way != "none" for way in _ways(scalings[index], z)):
+            idle.setdefault(which, []).append(name)
+    for which, latents in idle.items():
+        some = f"{', '.join(which[:4])}{' ...' if len(which) > 4 else ''}"
+        warnings.warn(
+            f"{some} never changes in the training rows, so nothing is learned of how {_few(latents)} depends on it; "
+            "leave that input out (inputs=...), or give data in which it changes",
+            DataWarning,
+            stacklevel=4,
+        )
+
+
+def _check_visible(names: Sequence[str], free: Tensor, effect: Tensor) -> None:
+    """`free` is what each latent would do without the contacts, `effect` what it does with them (N, nv, C)."""
+    size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
+    none = [name for name, value in zip(names, size.tolist(), strict=True) if value == 0.0]
+    if none:
+        raise InvalidInput(
+            f"{_few(none)} exerts no force at any training row; check frame, point and contact of the prior, or leave "
+            "it out"
+        )
+    hidden = shown <= INVISIBLE * size
+    blind = [name for name, flat in zip(names, hidden.tolist(), strict=True) if flat]
+    remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
+    if len(blind) == len(names):
+        raise InvalidInput(
+            f"no data can identify {_few(blind)}: the contacts take the whole force, and the acceleration shows none "
+            f"of it; {remedy}"
+        )
+    if blind:
+        warnings.warn(
+            f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
+            f"what the model says about it and about the normal force is its prior; {remedy}",
+            DataWarning,
+            stacklevel=4,
+        )
+
+
+def _check_distinct(names: Sequence[str], terms: Sequence[int], effect: Tensor, features: Sequence[Tensor]) -> None:
+    """Latents of two terms with the same effect on the same features are one function; data see only their sum."""
+    columns = effect.flatten(0, 1)
+    norms = torch.linalg.vector_norm(columns, dim=0)
+    cosines = (columns.mT @ columns) / torch.outer(norms, norms).clamp_min(torch.finfo(columns.dtype).tiny)
+    for first, second in torch.nonzero(torch.triu(cosines.abs() > 1.0 - EQUAL, diagonal=1)).tolist():
+        one, other = features[first], features[second]
+        if terms[first] == terms[second]:
+            continue  # joints that the constraint couples; one prior knows that its latents are independent
+        if one.shape == other.shape and bool(((one - other).abs() <= EQUAL * (1.0 + one.abs())).all()):
+            raise InvalidInput(
+                f"no data can tell {names[first]!r} and {names[second]!r} apart: both act in the same direction and "
+                "depend on the same inputs; leave one of them out"
+            )
+
+
+def _ways(scaling: Sequence[str] | str, z: Tensor) -> Sequence[str]:
+    return (scaling,) * z.shape[-1] if isinstance(scaling, str) else scaling
+
+
+def _values(row: Tensor) -> str:
+    return ", ".join(f"{value:.4g}" for value in row.tolist()[:4])
+
+
+def _few(names: Sequence[str]) -> str:
+    return f"{', '.join(map(repr, names[:4]))}{f' and {len(names) - 4} more' if len(names) > 4 else ''}"
