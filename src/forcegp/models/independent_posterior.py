@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,14 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.inference import LatentKernels, LatentPosterior, OptimizationResult, negative_log_likelihood
+from forcegp.inference import (
+    LatentKernels,
+    LatentPosterior,
+    LeaveOut,
+    OptimizationResult,
+    leave_blocks_out,
+    negative_log_likelihood,
+)
 from forcegp.mechanics import Baumgarte
 from forcegp.models.accelerations import AccelerationModel, IndependentAccelerations
 from forcegp.models.marginal_likelihood import RESIDUAL_FLOOR, Standardization, TrainingData
@@ -80,6 +87,17 @@ class IndependentLikelihood:
         """The posterior of one joint's function at fixed parameters."""
         terms = self._terms(joint, parameters)
         return LatentPosterior.condition(kernels.at(parameters), [self._training_features], *terms)
+
+    def leave_out(
+        self,
+        joint: int,
+        latent: LatentPosterior,
+        parameters: Mapping[str, Tensor],
+        blocks: Sequence[Sequence[int]] | None,
+    ) -> LeaveOut:
+        """Left-out accelerations of one joint; `latent` is its posterior at `parameters`."""
+        *_, noise = self._terms(joint, parameters)
+        return leave_blocks_out(latent.system, noise, blocks)
 
     @cached_property
     def _training_features(self) -> Tensor:
@@ -155,6 +173,15 @@ class IndependentPosterior(Posterior):
                 float(self.likelihood(joint, one_joint(kernels, joint), joint_part(self.parameters, joint)))
                 for joint in range(self.system.robot.nv)
             )
+
+    @override
+    def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
+        return LeaveOut.of_independent_outputs(
+            [
+                self.likelihood.leave_out(joint, latent, joint_part(self.parameters, joint), blocks)
+                for joint, latent in enumerate(self.latents)
+            ]
+        )
 
     @override
     def predict_rows(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.inference import OptimizationResult
+from forcegp.inference import LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
@@ -172,6 +172,19 @@ class Posterior(ABC):
         model = self.accelerations(baumgarte)
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed}
         return roll_out(model, q0, v0, u, dt, **how, progress=progress)
+
+    def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
+        """How well training rows are predicted from those outside their block: in closed form, without another fit.
+
+        `blocks` holds numbers of training rows; None leaves one row out at a time. Rows that follow each other in time
+        tell nearly the same, so leave them out together: `forcegp.data.time_blocks`. The parameters stay those that
+        were fitted to all rows, so the scores flatter a model with many of them a little.
+        Raises InvalidInput for blocks that overlap, and for models that would have to be trained again.
+        """
+        raise InvalidInput(
+            f"a {self.description} would have to be trained again for every block that is left out; evaluate it on "
+            "another recording instead, or use a Gaussian process."
+        )
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""
