@@ -129,6 +129,7 @@ class Fit(FitOptions):
 
     For instance:
       forcegp fit train.h5 --points 100 --out run
+      forcegp fit train.h5 --prior tool-friction --prior joint-friction --points 100 --out run
       forcegp fit train.h5 --model independent-gp --points 100 --out baseline
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
     """
@@ -148,8 +149,13 @@ class Fit(FitOptions):
         Literal["analytical", "zero"] | None, arg(metavar="analytical|zero", help_behavior_hint="(default: analytical)")
     ] = None
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
-    prior: Annotated[Literal["joint"] | None, arg(metavar="joint", help_behavior_hint="(default: joint)")] = None
-    """joint: one Gaussian process per joint force, on (q, v, u)."""
+    prior: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(repeatable, they add up; default: joint)"),
+    ] = ()
+    """What the unknown forces may be. joint: a force at every joint, on (q, v, u). joint-friction: on its own velocity.
+    tool-friction: tangential forces at the contact, on its velocity. contact-friction: isotropic; load-friction:
+    the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md."""
     iterations: Annotated[
         int | None,
         arg(metavar="N", constructor=int, help_behavior_hint=ITERATIONS_HINT),

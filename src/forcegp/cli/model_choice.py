@@ -60,14 +60,14 @@ def resolved(command: Fit) -> Fit:
     if command.iterations is None and not network:
         changes["iterations"] = ITERATIONS
     if command.model == "structured":
-        changes |= {"mean": command.mean or "analytical", "prior": command.prior or "joint"}
+        changes |= {"mean": command.mean or "analytical", "prior": command.prior or ("joint",)}
     return replace(command, **changes)
 
 
 def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Model:
     """The model of a resolved command."""
     from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, StructuredGP
-    from forcegp.priors import JointAccelerations, NoForces
+    from forcegp.priors import JointAccelerations, NoForces, named_prior
 
     if command.model in NETWORKS:
         noise = _known_noise(command.noise, dataset)
@@ -81,7 +81,8 @@ def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Mode
     if command.model == "analytical":
         return StructuredGP(system, NoForces(), "analytical", noise)
     assert command.mean is not None, "a resolved command has a mean"
-    return StructuredGP(system, mean=command.mean, noise=noise)
+    prior = named_prior(" + ".join(command.prior), system)
+    return StructuredGP(system, prior, command.mean, noise)
 
 
 def search_arguments(command: Fit) -> dict[str, Any]:

@@ -16,14 +16,14 @@ from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.inference import LatentKernels, LatentPosterior, LeaveOut, OptimizationResult, leave_blocks_out
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
-from forcegp.models.components import Components, Curve, Latents, components_of
+from forcegp.models.components import Components, Curve, Latents, components_of, term_slices
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Array, Posterior
-from forcegp.priors import JointAccelerations, NoForces
+from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots import Robot
 
 if TYPE_CHECKING:
@@ -67,10 +67,14 @@ class StructuredPosterior(Posterior):
     @property
     @override
     def description(self) -> str:
-        if isinstance(self.model.prior, NoForces):
+        prior = self.model.prior
+        if isinstance(prior, NoForces):
             return "analytical model"
-        unconstrained = isinstance(self.model.prior, JointAccelerations)
-        return f"{'unconstrained accelerations, ' if unconstrained else ''}{self.model.mean} mean"
+        if isinstance(prior, JointAccelerations):
+            return f"unconstrained accelerations, {self.model.mean} mean"
+        names = [name for name, *_ in term_slices(prior, self.model.system.robot)]
+        shown = "" if names == [JointForces().title] else f"{' + '.join(names)}, "
+        return f"{shown}{self.model.mean} mean"
 
     @property
     @override

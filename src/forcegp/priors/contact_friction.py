@@ -52,6 +52,11 @@ class ContactFriction(ForcePrior):
             )
         check_kernel(self.kernel)
 
+    @property
+    @override
+    def title(self) -> str:
+        return "load-friction" if self.load else "contact-friction"
+
     @override
     def check(self, system: MechanicalSystem) -> None:
         require_contact("ContactFriction", self.contact, system)

@@ -75,6 +75,11 @@ class ToolForces(ForcePrior):
             )
 
     @property
+    @override
+    def title(self) -> str:
+        return "tool-friction" if set(self.inputs) <= {"velocity", "angular-velocity"} else "tool-forces"
+
+    @property
     def _needs_contact(self) -> bool:
         return self.frame is None or self.axes == "surface" or "load" in self.inputs
 
