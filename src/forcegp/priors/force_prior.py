@@ -177,7 +177,7 @@ class SumPrior(ForcePrior):
 
     @override
     def to_dict(self) -> dict[str, Any]:
-        return {"terms": [{"type": term.title, **term.to_dict()} for term in self.terms]}
+        return {"terms": [{"prior": type(term).__name__, **term.to_dict()} for term in self.terms]}
 
     def slices(self, robot: Robot) -> tuple[slice, ...]:
         """Which of the latents belong to each term."""
