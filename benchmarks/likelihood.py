@@ -2,9 +2,10 @@
 
 The dense side forms the DN x DN covariance and lets autograd differentiate `torch.linalg.solve` and `torch.logdet` (two
 LU factorisations), as the paper's formulation does. Both sides get the same kernels, mixing vectors and residuals and
-return the same 154 + 7 gradients (7 x (21 length scales + 1 output scale) + 7 noise levels). One process, one thread,
-CPU seconds, medians; each side's peak memory is measured in a child process of its own, above the memory that process
-had before the first evaluation.
+return the same 154 + 7 gradients (7 x (21 length scales + 1 output scale) + 7 noise levels). With the prior
+"tool-friction" (two latents on the two velocities of the tool along its surface, kernels linear + squared exponential)
+the dense side stays DN x DN, the deflated one has 2 N. One process, one thread, CPU seconds, medians; each side's peak
+memory is measured in a child process of its own, above the memory that process had before the first evaluation.
 
     python -m benchmarks.likelihood
 """
@@ -20,19 +21,21 @@ import time
 from pathlib import Path
 
 import torch
+from gpytorch.kernels import Kernel, ScaleKernel
 from threadpoolctl import threadpool_limits
 
 from forcegp.inference.kernels import kernel_matrix
 from forcegp.inference.likelihood import negative_log_likelihood
-from forcegp.priors.kernels import squared_exponential_kernel
+from forcegp.priors import ToolForces
+from forcegp.priors.kernels import kernel_of, squared_exponential_kernel
 
-JOINTS, INPUTS = 7, 21
+JOINTS, INPUTS, TANGENTS = 7, 21, 2
 
 
 class Problem:
     """A random well-posed problem with the shapes of the iiwa: 7 joints, 21 inputs, m constraints."""
 
-    def __init__(self, count: int, constraints: int) -> None:
+    def __init__(self, count: int, constraints: int, prior: str = "joint") -> None:
         generator = torch.Generator().manual_seed(0)
 
         def normal(*shape: int) -> torch.Tensor:
@@ -45,30 +48,39 @@ class Problem:
         self.H = M_inv - M_inv @ A.mT @ torch.linalg.solve(A @ M_inv @ A.mT, A @ M_inv)
         self.inputs = normal(count, INPUTS)
         self.residual = normal(count, JOINTS)
-        self.kernels = [squared_exponential_kernel(INPUTS, 4.0, 1.0 + joint) for joint in range(JOINTS)]
+        if prior == "tool-friction":
+            self.W, self.features = self.H @ normal(count, JOINTS, TANGENTS), self.inputs[:, :TANGENTS]
+            self.kernels = [kernel_of(ToolForces().kernel, TANGENTS, 1.0 + axis) for axis in range(TANGENTS)]
+        else:
+            self.W, self.features = self.H, self.inputs
+            self.kernels = [squared_exponential_kernel(INPUTS, 4.0, 1.0 + joint) for joint in range(JOINTS)]
         self.log_noise = torch.full((JOINTS,), math.log(0.1), dtype=torch.float64, requires_grad=True)
         self.parameters = [parameter for kernel in self.kernels for parameter in kernel.parameters()] + [self.log_noise]
 
     def deflated(self) -> tuple[torch.Tensor, ...]:
-        matrices = [kernel_matrix(kernel, self.inputs) for kernel in self.kernels]
-        value = negative_log_likelihood(self.H, self.residual, (2.0 * self.log_noise).exp()[None], matrices)
+        matrices = [kernel_matrix(kernel, self.features) for kernel in self.kernels]
+        value = negative_log_likelihood(self.W, self.residual, (2.0 * self.log_noise).exp()[None], matrices)
         return (value.detach(), *torch.autograd.grad(value, self.parameters))
 
     def dense(self) -> tuple[torch.Tensor, ...]:
         count = self.inputs.shape[0]
-        matrices = []
-        for kernel in self.kernels:
-            scaled = self.inputs / kernel.base_kernel.lengthscale
-            squared = scaled.square().sum(-1)
-            distance = squared[:, None] + squared[None, :] - 2.0 * scaled @ scaled.mT
-            matrices.append(kernel.outputscale * torch.exp(-0.5 * distance))
-        weighted = torch.stack(matrices, dim=1)[..., None] * self.H.permute(2, 0, 1)  # (i, c, j, e)
-        S = torch.bmm(self.H, weighted.reshape(count, JOINTS, count * JOINTS))
+        matrices = [self._dense_kernel(kernel) for kernel in self.kernels]
+        weighted = torch.stack(matrices, dim=1)[..., None] * self.W.permute(2, 0, 1)  # (i, c, j, e)
+        S = torch.bmm(self.W, weighted.reshape(count, len(matrices), count * JOINTS))
         S = S.reshape(count * JOINTS, count * JOINTS)
         S = S + torch.diag_embed((2.0 * self.log_noise).exp().repeat(count))
         y = self.residual.reshape(-1)
         value = 0.5 * (y @ torch.linalg.solve(S, y) + torch.logdet(S) + y.numel() * math.log(2.0 * math.pi))
         return (value.detach(), *torch.autograd.grad(value, self.parameters))
+
+    def _dense_kernel(self, kernel: Kernel) -> torch.Tensor:
+        """Plain operations on the whole matrix, which autograd differentiates."""
+        if not isinstance(kernel, ScaleKernel):
+            return kernel(self.features, self.features).to_dense()
+        scaled = self.features / kernel.base_kernel.lengthscale
+        squared = scaled.square().sum(-1)
+        distance = squared[:, None] + squared[None, :] - 2.0 * scaled @ scaled.mT
+        return kernel.outputscale * torch.exp(-0.5 * distance)
 
 
 def median_cpu_seconds(problem: Problem, rounds: int) -> tuple[float, float]:
@@ -98,15 +110,16 @@ def run() -> dict[str, float]:
     """Measure and print; returns the keys of results.json that this question answers."""
     results: dict[str, float] = {}
     print(
-        f"{'N':>5} {'constraints':>11} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} {'value diff':>10} "
-        f"{'gradient diff':>13}"
+        f"{'N':>5} {'constraints':>11} {'prior':>13} {'dense [s]':>10} {'deflated [s]':>13} {'ratio':>6} "
+        f"{'value diff':>10} {'gradient diff':>13}"
     )
-    for count, constraints, rounds, key in (
-        (400, 1, 5, "nll_speedup_n400"),
-        (400, 3, 5, "nll_speedup_n400_three_constraints"),
-        (1000, 1, 3, "nll_speedup_n1000"),
+    for count, constraints, prior, rounds, key in (
+        (400, 1, "joint", 5, "nll_speedup_n400"),
+        (400, 3, "joint", 5, "nll_speedup_n400_three_constraints"),
+        (1000, 1, "joint", 3, "nll_speedup_n1000"),
+        (400, 1, "tool-friction", 5, "nll_speedup_n400_tool_friction"),
     ):
-        problem = Problem(count, constraints)
+        problem = Problem(count, constraints, prior)
         expected, given = problem.dense(), problem.deflated()
         value_error = float((expected[0] - given[0]).abs())
         gradient_error = max(
@@ -115,7 +128,7 @@ def run() -> dict[str, float]:
         dense, deflated = median_cpu_seconds(problem, rounds)
         results[key] = dense / deflated
         print(
-            f"{count:5d} {constraints:11d} {dense:10.3f} {deflated:13.3f} {dense / deflated:6.2f} "
+            f"{count:5d} {constraints:11d} {prior:>13} {dense:10.3f} {deflated:13.3f} {dense / deflated:6.2f} "
             f"{value_error:10.1e} {gradient_error:13.1e}"
         )
     dense_peak, deflated_peak = (peak_mebibytes(side, 1000, 1) for side in ("dense", "deflated"))
