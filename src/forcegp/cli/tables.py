@@ -27,8 +27,18 @@ def facts(title: str, values: Mapping[str, str]) -> Table:
     return table
 
 
-def columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, last: Sequence[str] = ()) -> Table:
-    """A table whose first column is text and whose others are numbers; `last` is set apart below."""
+def columns(
+    title: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    last: Sequence[str] = (),
+    long_names: bool = False,
+) -> Table:
+    """A table whose first column is text and whose others are numbers; `last` is set apart below.
+
+    Texts of the first column are folded where they are `long_names`, all other cells never.
+    """
     table = Table(
         title=title,
         title_justify="left",
@@ -38,7 +48,8 @@ def columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *,
         collapse_padding=True,
     )
     for place, name in enumerate(header):
-        table.add_column(name, justify="right" if place else "left", no_wrap=True)
+        folded = long_names and not place
+        table.add_column(name, justify="right" if place else "left", no_wrap=not folded, overflow="fold")
     for row in rows:
         table.add_row(*row)
     if last:

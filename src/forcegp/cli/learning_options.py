@@ -1,0 +1,122 @@
+"""What every command asks that learns from a dataset: the data, what is known about the robot, and how to search."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from forcegp.cli.command import Command
+from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.mechanics import MechanicalSystem
+    from forcegp.robots import Robot
+
+KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningOptions(Command):
+    """What every command asks that learns from a dataset."""
+
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """The dataset to learn from (HDF5)."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
+    """The folder to write."""
+    noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
+    """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
+    force_noise: Annotated[
+        float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
+    ] = None
+    """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
+    restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
+    """Starts of the search; the best is kept."""
+    seed: Annotated[int, arg(metavar="K")] = 0
+    """Draws the starts of the search after the first."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """Processes for the restarts."""
+    adam_steps: Annotated[int, arg(metavar="N")] = 0
+    """Adam steps before them."""
+    hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
+    robot: Annotated[Path | None, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
+    """Use this robot instead of the dataset's."""
+    contact: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: the dataset's)"),
+    ] = ()
+    """A point that stays on a surface, instead of the dataset's contacts; m, in the axes of the link FRAME.
+    SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
+    none is no contact at all."""
+    known_force: Annotated[
+        UseAppendAction[tuple[KnownForceName, ...]],
+        arg(metavar="NAME", help_behavior_hint="(repeatable; default: the dataset's)"),
+    ] = ()
+    """The complete list of known forces, instead of the dataset's: actuation, rigid-body-bias,
+    viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+
+    def _system(self, dataset: Dataset) -> MechanicalSystem:
+        """What is known: the dataset's own system, with what the options replace."""
+        from forcegp.mechanics import MechanicalSystem
+        from forcegp.robots import Robot
+
+        contacts = parse_contacts(self.contact)
+        system = dataset.system
+        if self.robot is not None:
+            robot = Robot.from_urdf(self.robot) if system is None else _robot_like(system.robot, self.robot)
+            if robot.joint_names != tuple(dataset.joint_names):
+                raise InvalidInput(
+                    f"{self.robot} has joints {', '.join(robot.joint_names)}; {self.data} has "
+                    f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
+                )
+            system = MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        if system is None:
+            raise InvalidInput(
+                f"{self.data} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
+            )
+        if self.contact:
+            system = system.with_contacts(contacts)
+        if self.known_force:
+            system = _with_known_forces(system, self.known_force)
+        return system
+
+    def _given(self) -> dict[str, Any]:
+        """Options and data, as a folder remembers them."""
+        options = {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+            if name not in ("json", "debug", "overwrite")
+        }
+        data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
+        return {"options": options, "data": data}
+
+
+def _robot_like(recorded: Robot, urdf: Path) -> Robot:
+    """The robot of that URDF; what no URDF holds is as recorded: gravity, armature, locked joints."""
+    from forcegp.robots import Robot
+
+    robot = Robot.from_urdf(urdf, gravity=recorded.gravity.tolist(), locked=recorded.locked)
+    # Robots with other joints are refused by their names, which says more than the length of the armature.
+    return robot if robot.joint_names != recorded.joint_names else robot.with_armature(recorded.armature.tolist())
+
+
+def _with_known_forces(system: MechanicalSystem, names: tuple[str, ...]) -> MechanicalSystem:
+    from dataclasses import replace
+
+    from forcegp.mechanics import Actuation, CoulombJointFriction, RigidBodyBias, ViscousJointFriction
+
+    made = {
+        "actuation": lambda: Actuation(),
+        "rigid-body-bias": lambda: RigidBodyBias(),
+        "viscous-joint-friction": lambda: ViscousJointFriction.from_robot(system.robot),
+        "coulomb-joint-friction": lambda: CoulombJointFriction.from_robot(system.robot),
+    }
+    return replace(system, known_forces=tuple(made[name]() for name in dict.fromkeys(names)))
