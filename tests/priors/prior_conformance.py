@@ -1,0 +1,254 @@
+"""What every prior on an unknown force must do. A new prior is tested by one subclass whose name begins with `Test`:
+
+class TestAirDrag(PriorConformance):
+    prior = AirDrag("hand")
+    acts_at = ("hand", (0.0, 0.0, 0.0))
+"""
+
+import json
+import pickle
+from functools import cache
+from typing import Any, ClassVar, get_args
+
+import pytest
+import torch
+from tests.mechanics.systems import assert_close
+from tests.models.arm import URDF, arm_data, arm_system
+
+from forcegp.data import Dataset
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import StructuredGP, load_posterior, save_posterior
+from forcegp.priors import (
+    ForcePrior,
+    JointFriction,
+    PeriodicJointForces,
+    Scaling,
+    SumPrior,
+    prior_from_dict,
+    prior_to_dict,
+)
+from forcegp.robots import Robot
+
+BATCHES = [(), (4,), (2, 4)]
+STEP = 1e-5
+
+
+@cache
+def bent_arm() -> MechanicalSystem:
+    """The arm on its plane, with a crooked shoulder, so that every force shows, and a last joint that slides."""
+    text = URDF.replace('<joint name="bend" type="revolute">', '<joint name="bend" type="prismatic">')
+    straight = '<origin xyz="0 0 0.3" rpy="0 0 0"/><parent link="upper"/>'
+    crooked = straight.replace('rpy="0 0 0"', 'rpy="0.3 0.2 0"')
+    assert straight in text
+    return arm_system().with_robot(Robot.from_urdf_text(text.replace(straight, crooked)))
+
+
+@cache
+def some_data(system: MechanicalSystem, rows: int, seed: int) -> Dataset:
+    return arm_data(rows, seed, system)
+
+
+def some_states(*batch: int) -> list[torch.Tensor]:
+    return [
+        torch.randn(*batch, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2, 3)
+    ]
+
+
+class PriorConformance:
+    """Shapes, names, derivatives, kernels, storage, sums and a fit of `prior`, on an arm with one contact."""
+
+    prior: ClassVar[ForcePrior]
+    acts_at: ClassVar[tuple[str, tuple[float, float, float]] | None] = None
+    """Link and point (m) at which `point_force` acts; None for priors of joint forces."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def system(cls) -> MechanicalSystem:
+        """Override for a prior that needs another robot."""
+        return bent_arm()
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def data(cls, system):
+        return some_data(system, 14, 1)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def fitted(cls, data):
+        model = StructuredGP(data.system, cls.prior)
+        return model.fit(data, restarts=1, options=OptimizerOptions(iterations=3, adam_steps=0))
+
+    def values(self, system, *states) -> torch.Tensor:
+        """Mixing and features of one state as one vector."""
+        dynamics = system.dynamics(*states)
+        return torch.cat([self.prior.mixing(dynamics).flatten(), *self.prior.features(dynamics)])
+
+    def rows(self, system, *states) -> torch.Tensor:
+        """The same, one row for each of several states."""
+        dynamics = system.dynamics(*states)
+        return torch.cat([self.prior.mixing(dynamics).flatten(1), *self.prior.features(dynamics)], dim=-1)
+
+    @pytest.mark.parametrize("batch", BATCHES, ids=str)
+    def test_shapes_names_and_units_agree(self, system, batch):
+        robot, dynamics = system.robot, system.dynamics(*some_states(*batch))
+        names = self.prior.latent_names(robot)
+        B, features, point_force = (
+            self.prior.mixing(dynamics),
+            self.prior.features(dynamics),
+            self.prior.point_force(dynamics),
+        )
+        assert len(set(names)) == len(names)
+        assert B.shape == (*batch, robot.nv, len(names))
+        assert all(z.shape[:-1] == batch and z.dim() == len(batch) + 1 for z in features)
+        assert point_force is None or point_force.shape == (*batch, 3, len(names))
+        assert all(value.dtype == torch.float64 for value in (B, *features))
+        assert all(bool(torch.isfinite(value).all()) for value in (B, *features))
+        scalings, labels, units = (
+            self.prior.scalings(robot),
+            self.prior.feature_names(robot),
+            self.prior.latent_unit(robot),
+        )
+        assert len(features) == len(scalings) == len(units) == len(names)
+        assert all(isinstance(text, str) for text in (*names, *units))
+        for scaling, z in zip(scalings, features, strict=True):
+            ways = (scaling,) * z.shape[-1] if isinstance(scaling, str) else scaling
+            assert len(ways) == z.shape[-1]
+            assert all(way in get_args(Scaling) for way in ways)
+        if labels is not None:
+            assert [len(label) for label in labels] == [z.shape[-1] for z in features]
+            assert all(len(set(label)) == len(label) for label in labels)
+
+    def test_it_fits_the_system_and_has_a_title(self, system):
+        self.prior.check(system)
+        assert self.prior.title
+        assert self.prior.summands()
+
+    def test_the_same_states_give_the_same_answer_and_stay_as_they_are(self, system):
+        states = some_states(4)
+        once, again = (system.dynamics(*states) for _ in range(2))
+        assert torch.equal(self.prior.mixing(once), self.prior.mixing(again))
+        assert torch.equal(self.prior.mixing(once), self.prior.mixing(once))
+        assert all(map(torch.equal, self.prior.features(once), self.prior.features(again)))
+        assert all(map(torch.equal, states, some_states(4)))
+
+    def test_every_state_stands_for_itself_under_vmap_too(self, system):
+        states = some_states(4)
+        single = torch.stack([self.values(system, *(x[row] for x in states)) for row in range(4)])
+        assert_close(self.rows(system, *states), single, 1e-12)
+        mapped = torch.func.vmap(lambda *given: self.values(system, *given))(*states)
+        assert_close(mapped, single, 1e-12)
+
+    def test_derivatives_in_the_state(self, system):
+        states = some_states()
+        jacobians = torch.func.jacrev(lambda *given: self.values(system, *given), (0, 1, 2))(*states)
+        steps = STEP * torch.eye(9, dtype=torch.float64)
+        ahead, behind = (
+            self.rows(system, *(torch.cat(states) + sign * steps).split(3, dim=-1)) for sign in (1.0, -1.0)
+        )
+        assert_close(torch.cat(jacobians, dim=-1), (ahead - behind).mT / (2.0 * STEP), 1e-6)
+
+    def test_values_and_derivatives_are_finite_at_rest(self, system):
+        q, v, u = some_states()
+        values = self.values(system, q, 0.0 * v, u)
+        assert bool(torch.isfinite(values).all())
+        jacobians = torch.func.jacrev(lambda *given: self.values(system, *given), (0, 1, 2))(q, 0.0 * v, u)
+        assert all(bool(torch.isfinite(jacobian).all()) for jacobian in jacobians)
+
+    def test_kernels_take_the_features_and_start_with_the_variances(self, system):
+        features = self.prior.features(system.dynamics(*some_states(5)))
+        dimensions = tuple(z.shape[-1] for z in features)
+        variances = torch.arange(1.0, 1.0 + len(features), dtype=torch.float64)
+        kernels, wider = (self.prior.kernels(system.robot, dimensions, scale * variances) for scale in (1.0, 4.0))
+        assert len(kernels) == len(wider) == len(features)
+        assert not {id(kernel) for kernel in kernels} & {id(kernel) for kernel in wider}
+        for kernel, wide, z in zip(kernels, wider, features, strict=True):
+            assert all(value.dtype == torch.float64 for value in kernel.parameters())
+            with torch.no_grad():
+                K, larger = kernel(z).to_dense(), wide(z).to_dense()
+            assert K.shape == (5, 5)
+            assert_close(larger, 4.0 * K, 1e-9)
+            assert float(torch.linalg.eigvalsh(K)[0]) > -1e-9 * float(K.abs().max())
+
+    def test_it_survives_a_file_and_another_process(self):
+        again = prior_from_dict(json.loads(json.dumps(prior_to_dict(self.prior))))
+        assert again == self.prior
+        assert type(again) is type(self.prior)
+        assert prior_to_dict(again) == prior_to_dict(self.prior)
+        assert pickle.loads(pickle.dumps(self.prior)) == self.prior
+
+    def test_the_point_force_makes_the_joint_force(self, system):
+        dynamics = system.dynamics(*some_states(4))
+        force = self.prior.point_force(dynamics)
+        assert (force is None) == (self.acts_at is None)
+        if force is None:
+            return
+        J = dynamics.state.kinematics.frame_jacobian(*self.acts_at)[..., :3, :]
+        pushes = force.abs().amax((0, 1)) > 0.0  # the others are torques
+        assert bool(pushes.any())
+        assert_close(J.mT @ force[..., pushes], self.prior.mixing(dynamics)[..., pushes], 1e-12)
+
+    def test_sums_with_another_prior(self, system):
+        other = PeriodicJointForces(0.7)
+        total = self.prior + other
+        dynamics = system.dynamics(*some_states(4))
+        assert isinstance(total, SumPrior)
+        assert total.terms == (*self.prior.summands(), other)
+        assert total + JointFriction(("bend",)) == self.prior + (other + JointFriction(("bend",)))
+        parts = (self.prior, other)
+        assert torch.equal(total.mixing(dynamics), torch.cat([part.mixing(dynamics) for part in parts], -1))
+        given = [z for part in parts for z in part.features(dynamics)]
+        assert all(map(torch.equal, total.features(dynamics), given))
+        count = len(self.prior.latent_names(system.robot))
+        assert total.slices(system.robot)[-1] == slice(count, count + 3)
+        assert [which.start for which in total.slices(system.robot)[1:]] == [
+            which.stop for which in total.slices(system.robot)[:-1]
+        ]
+        names = total.latent_names(system.robot)
+        assert len(set(names)) == len(names) == count + 3
+        assert names[count].startswith("periodic-joint-forces")
+        assert names[count].endswith(" pan")
+        assert len(set(total.term_names)) == len(total.terms)
+        assert total.latent_unit(system.robot)[:count] == self.prior.latent_unit(system.robot)
+        assert total.scalings(system.robot) == self.prior.scalings(system.robot) + other.scalings(system.robot)
+        kernels = total.kernels(system.robot, tuple(z.shape[-1] for z in given), torch.ones(count + 3).double())
+        assert len(kernels) == count + 3
+        assert prior_from_dict(json.loads(json.dumps(prior_to_dict(total)))) == total
+
+    def test_a_fit_predicts_and_comes_back_from_a_folder(self, fitted, data, tmp_path):
+        test = some_data(data.system, 6, 2)
+        states = test.q, test.v, test.u
+        prediction = fitted.predict(*states)
+        dynamics = data.system.dynamics(*map(torch.tensor, states))
+        violation = (dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b
+        assert float(violation.abs().max()) < 1e-8
+        for gaussian in (prediction.acceleration, prediction.unknown_force):
+            smallest = torch.linalg.eigvalsh(gaussian.covariance)[..., 0]
+            assert bool((smallest > -1e-9 * (1.0 + gaussian.covariance.abs().amax((-2, -1)))).all())
+        save_posterior(fitted, tmp_path / "run")
+        again = load_posterior(tmp_path / "run")
+        assert again.model.prior == self.prior
+        theirs = again.predict(*states)
+        assert torch.equal(theirs.mean, prediction.mean)
+        assert torch.equal(theirs.covariance, prediction.covariance)
+
+    def test_the_components_add_up(self, fitted, data):
+        test = some_data(data.system, 6, 2)
+        states = test.q, test.v, test.u
+        components, prediction = fitted.components(*states), fitted.predict(*states)
+        parts: Any = list(components.values())
+        assert tuple(components) == tuple(
+            self.prior.term_names if isinstance(self.prior, SumPrior) else (self.prior.title,)
+        )
+        assert [name for part in parts for name in part.latent_names] == [
+            name for term in self.prior.summands() for name in term.latent_names(data.system.robot)
+        ]
+        assert_close(sum(part.joint_force.mean for part in parts), components.total.mean, 1e-10)
+        assert_close(components.total.mean, prediction.unknown_force.mean, 1e-10)
+        assert_close(components.total.covariance, prediction.unknown_force.covariance, 1e-10)
+        offset = data.system.dynamics(*map(torch.tensor, states)).acceleration_map().offset
+        assert_close(offset + sum(part.acceleration.mean for part in parts), prediction.mean, 1e-10)
+        for part in parts:
+            assert_close(part.joint_force.covariance, part.joint_force.covariance.mT, 0.0)
+            if part.point_force is not None:
+                assert part.point_force.mean.shape == (6, 3)
