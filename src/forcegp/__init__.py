@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
-    from forcegp.evaluation import Evaluation, evaluate
+    from forcegp.evaluation import Evaluation, PriorComparison, compare_priors, evaluate
     from forcegp.mechanics import (
         Actuation,
         Armature,
@@ -74,6 +74,8 @@ __all__ = [
     # how good it is
     "evaluate",
     "Evaluation",
+    "compare_priors",
+    "PriorComparison",
 ]
 
 _ROOMS = {
@@ -85,7 +87,7 @@ _ROOMS = {
     "models": {"IndependentGP", "NeuralNetwork", "NetworkEnsemble"}
     | {"StructuredGP", "Noise", "Coefficients", "save_posterior", "load_posterior"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
-    "evaluation": {"Evaluation", "evaluate"},
+    "evaluation": {"Evaluation", "evaluate", "PriorComparison", "compare_priors"},
 }
 
 

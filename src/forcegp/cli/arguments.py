@@ -11,6 +11,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 from forcegp.cli.command import Command
+from forcegp.cli.compare import Compare
 from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
 from forcegp.cli.fit import Fit
@@ -37,6 +38,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
     "simulate": (Simulate, "make a dataset with ground truth"),
     "fit": (Fit, "learn the unknown forces from a dataset"),
+    "compare": (Compare, "which kind of unknown force the data support"),
     "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),

@@ -5,6 +5,7 @@ from forcegp.evaluation.figure_style import save_figure
 from forcegp.evaluation.likelihood_plot import likelihood_figure
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.evaluation.prediction_plot import prediction_figure
+from forcegp.evaluation.prior_comparison import PriorComparison, PriorScore, compare_priors
 from forcegp.evaluation.recorded_motions import RecordedMotions, recorded_motions
 from forcegp.evaluation.rollout_errors import RolloutErrors, rollout_errors
 from forcegp.evaluation.rollout_plot import rollout_figure
@@ -15,8 +16,11 @@ from forcegp.evaluation.tool_path_plot import tool_path_figure
 __all__ = [
     "Evaluation",
     "PredictedRows",
+    "PriorComparison",
+    "PriorScore",
     "RecordedMotions",
     "RolloutErrors",
+    "compare_priors",
     "evaluate",
     "likelihood_figure",
     "predict_rows",

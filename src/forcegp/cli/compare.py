@@ -1,0 +1,204 @@
+"""`forcegp compare`: which prior on the unknown forces the data support."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+from forcegp.cli.command import Debug, Json
+from forcegp.cli.learning_options import LearningOptions
+from forcegp.cli.model_choice import POINTS, resolved_noise
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.evaluation import PriorComparison, PriorScore
+    from forcegp.mechanics import MechanicalSystem
+    from forcegp.priors import ForcePrior
+
+KIND = "forcegp compare"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(LearningOptions):
+    """Fit several priors on the unknown forces to the same rows, and say which of them the data support.
+
+    Each --prior is one candidate, and may be a sum. Candidates are scored by the log density of stretches of time that
+    are left out of the training rows, without another fit; with --test also on another recording.
+
+    For instance:
+      forcegp compare train.h5 --prior joint --prior tool-friction --points 100
+      forcegp compare train.h5 --prior tool-friction --prior "tool-friction + joint-friction" --test test.h5
+    """
+
+    prior: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(give it twice or more)"),
+    ] = ()
+    """A candidate: the name of a prior as in forcegp fit, or a sum such as "tool-friction + joint-friction"."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: nothing is written)")] = None
+    """Also write every fitted model and comparison.json into this folder."""
+    points: Annotated[
+        int | None, arg(metavar="N", constructor=int, help_behavior_hint=f"(default: {POINTS}, or all rows)")
+    ] = None
+    """Train on N rows that lie farthest apart. Time grows with the cube of N."""
+    mean: Literal["analytical", "zero"] = "analytical"
+    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
+    iterations: Annotated[int, arg(metavar="N")] = 200
+    """Most L-BFGS iterations of each start."""
+    block_seconds: Annotated[
+        float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: a twentieth of the recording)")
+    ] = None
+    """Length of the stretches of time that are left out; longer than what one moment tells about the next."""
+    test: Annotated[Path | None, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
+    """Another recording to score the candidates on as well."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Fit, compare, write if asked to, and show."""
+        if self.seed < 0:
+            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
+        if len(self.prior) < 2:
+            given = f"only {self.prior[0]}" if self.prior else "none"
+            raise InvalidInput(f"--prior names the candidates, and there is {given}; give it twice or more.")
+        if self.out is not None:
+            require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        from forcegp.data import Dataset
+
+        dataset = Dataset.load(self.data)
+        system = self._system(dataset)
+        priors = self._priors(system)
+        test = None if self.test is None else Dataset.load(self.test)
+        comparison = self._compare(terminal, dataset, system, priors, test)
+        for warning in comparison.warnings:
+            terminal.warn(warning)
+        content = {"data": str(self.data), "test": None if self.test is None else str(self.test)}
+        content |= comparison.to_dict()
+        folders = _folders(comparison)
+        if self.out is not None:
+            self._write(self.out, comparison, content, folders)
+        terminal.say(*self._report(comparison, folders))
+        return content
+
+    def _priors(self, system: MechanicalSystem) -> dict[str, ForcePrior]:
+        from forcegp.priors import named_prior
+
+        priors: dict[str, ForcePrior] = {}
+        for expression in self.prior:
+            prior = named_prior(expression, system)
+            same = next((name for name, other in priors.items() if other == prior), None)
+            if same is not None:
+                raise InvalidInput(f"--prior {expression!r} is the same as {same!r}; give each candidate once.")
+            priors[re.sub(r"\s*\+\s*", " + ", expression.strip())] = prior
+        return priors
+
+    def _compare(
+        self,
+        terminal: Terminal,
+        dataset: Dataset,
+        system: MechanicalSystem,
+        priors: Mapping[str, ForcePrior],
+        test: Dataset | None,
+    ) -> PriorComparison:
+        from forcegp.evaluation import compare_priors
+        from forcegp.inference import OptimizerOptions
+        from forcegp.models.search import default_restarts
+
+        points = min(POINTS, len(dataset)) if self.points is None else self.points
+        options = OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps)
+        restarts = default_restarts(points) if self.restarts is None else self.restarts
+        names, steps = list(priors), options.iterations + options.adam_steps
+        with terminal.progress(f"comparing: {points} points", may_end_early=True) as report:
+
+            def progress(name: str, restart: int, iteration: int, value: float) -> None:
+                done = (names.index(name) * restarts + restart) * steps + min(iteration, steps)
+                report(done, len(names) * restarts * steps, f"{name}, iteration {iteration}, objective {value:.1f}")
+
+            return compare_priors(
+                dataset,
+                priors,
+                points=points,
+                system=system,
+                mean=self.mean,
+                noise=resolved_noise(self.noise, dataset, self.force_noise),
+                restarts=restarts,
+                seed=self.seed,
+                jobs=self.jobs,
+                hyperprior=self.hyperprior,
+                options=options,
+                block_seconds=self.block_seconds,
+                test=test,
+                progress=progress,
+            )
+
+    def _write(
+        self, out: Path, comparison: PriorComparison, content: Mapping[str, Any], folders: Mapping[str, str]
+    ) -> None:
+        from forcegp.models import save_posterior
+
+        with folder_written_whole(out) as folder:
+            folder.mkdir()
+            for name, posterior in comparison.posteriors.items():
+                save_posterior(posterior, folder / folders[name])
+            write_json(folder / "comparison.json", {**content, "models": dict(folders)})
+            write_config(folder, KIND, self._given())
+
+    def _report(self, comparison: PriorComparison, folders: Mapping[str, str]) -> list[Any]:
+        from rich.text import Text
+
+        from forcegp.cli.tables import columns
+
+        header = ["prior", "func-\ntions", "para-\nmeters", "NLL", "row\nout", "stretch\nout", "below\nthe best"]
+        header += [] if self.test is None else ["MAE,\ntest"]
+        title = (
+            f"{comparison.points} points of {self.data}, {comparison.blocks} stretches of "
+            f"{comparison.block_seconds:.3g} s; log densities of what is left out in nats per row, ± standard error"
+        )
+        rows = [self._row(score, comparison) for score in comparison.scores]
+        preferred = comparison.preferred.name
+        if self.out is not None:
+            following = f"Next: forcegp evaluate {self.out / folders[preferred]} TEST.h5"
+        else:
+            following = (
+                f"Next: forcegp fit {self.data} --prior {_quoted(preferred)} --points {comparison.points} --out run"
+            )
+        table = columns(title, header, rows, long_names=True)
+        unfinished = ", ".join(score.name for score in comparison.scores if not score.converged)
+        warning = [Text(f"Not converged: {unfinished}; give more --iterations.")] if unfinished else []
+        return [table, Text(comparison.verdict), *warning, Text(following)]
+
+    def _row(self, score: PriorScore, comparison: PriorComparison) -> list[str]:
+        from forcegp.cli.tables import NONE, number
+
+        best = score is comparison.best
+        return [
+            score.name,
+            str(score.latents),
+            str(score.parameters),
+            f"{score.nll:.1f}",
+            f"{score.leave_one_out:.3f}",
+            f"{score.leave_block_out:.3f}",
+            NONE if best else f"{-score.difference:.3f} ± {score.standard_error:.3f}",
+            *([] if self.test is None else [number(score.mae)]),
+        ]
+
+
+def _folders(comparison: PriorComparison) -> dict[str, str]:
+    """A folder name for every candidate: its own, of letters that every file system takes."""
+    plain = {name: re.sub(r"[^\w.+-]+", "_", name.replace(" ", "")) for name in comparison.posteriors}
+    taken = list(plain.values())
+    return {
+        name: text if taken.count(text) == 1 else f"{text}-{place}" for place, (name, text) in enumerate(plain.items())
+    }
+
+
+def _quoted(name: str) -> str:
+    return name if re.fullmatch(r"[\w.:=,/-]+", name) else f'"{name}"'
