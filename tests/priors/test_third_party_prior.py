@@ -1,0 +1,59 @@
+"""A prior that forcegp does not bring is one short file, found by name and in stored models, and shown in the docs."""
+
+import re
+
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+from tests.priors.third_party_prior import AirDrag
+
+from forcegp.data import Dataset
+from forcegp.errors import UnknownFrame
+from forcegp.inference import OptimizerOptions
+from forcegp.models import Noise, StructuredGP
+from forcegp.priors import named_prior, prior_to_dict
+
+
+@pytest.fixture(scope="module")
+def text(repository):
+    return (repository / "tests/priors/third_party_prior.py").read_text(encoding="utf-8")
+
+
+def test_it_is_short(text):
+    assert len(text.splitlines()) < 60
+
+
+def test_the_page_on_forces_shows_the_same_file(repository, text):
+    page = repository / "docs" / "forces.md"
+    if not page.exists():
+        pytest.skip("there is no page on forces yet")
+    blocks = re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    shown = [block for block in blocks if "class AirDrag" in block]
+    assert shown in ([], [text])
+
+
+def test_it_is_found_by_name_and_can_be_stored():
+    assert named_prior("air-drag:frame=hand", arm_system()) == AirDrag("hand")
+    assert named_prior("air-drag:frame=hand,kernel=constant + joint-friction").terms[0] == AirDrag("hand", "constant")
+    assert prior_to_dict(AirDrag("hand")) == {"type": "air-drag", "frame": "hand", "kernel": AirDrag("hand").kernel}
+
+
+def test_it_finds_the_drag_that_acts():
+    data = arm_data(40, 1)
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    dynamics = data.system.dynamics(*states)
+    tip = dynamics.state.kinematics.frame_jacobian("hand")[..., :3, :]
+    velocity = (tip @ states[1][..., None])[..., 0]
+    force = -1.7 * velocity.norm(dim=-1, keepdim=True) * velocity
+    a = dynamics.acceleration((tip.mT @ force[..., None])[..., 0])
+    rows = Dataset(q=data.q, v=data.v, u=data.u, a=a.numpy(), time=data.time, system=data.system)
+    model = StructuredGP(data.system, AirDrag("hand", kernel="constant"), noise=Noise(1e-3))
+    part = model.fit(rows, restarts=1, options=OptimizerOptions(iterations=20)).components(*states)["air-drag"]
+    torch.testing.assert_close(part.latents.mean, torch.full((40, 1), 1.7).double(), rtol=1e-3, atol=0.0)
+    torch.testing.assert_close(part.point_force.mean, force, rtol=1e-3, atol=1e-4)
+
+
+def test_a_wrong_link_is_named():
+    model = StructuredGP(arm_system(), AirDrag("hnad"), noise=Noise(0.1))
+    with pytest.raises(UnknownFrame, match="did you mean 'hand'"):
+        model.fit(arm_data(10, 1), restarts=1)
