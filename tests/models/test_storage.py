@@ -9,10 +9,10 @@ import torch
 from safetensors.torch import load_file, save_file
 from tests.models.arm import URDF, arm_data, arm_system
 
-from forcegp.errors import ContactError, FileFormatError
+from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Contact, ImplicitSurface
-from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
+from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
+from forcegp.models import IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
 from forcegp.robots import Robot
 
 FILES = {"model.json", "tensors.safetensors", "robot.urdf"}
@@ -156,3 +156,69 @@ def test_tensors_of_another_type_shape_or_value_are_refused(run, name, damage):
     save_file(tensors | {name: damage(tensors[name]).contiguous()}, run / "tensors.safetensors")
     with pytest.raises(FileFormatError, match="tensors"):
         load_posterior(run)
+
+
+@pytest.fixture(scope="module")
+def carried(data):
+    """A model with an analytical mean, carried to a sphere, a heavier tool and another stabilisation."""
+    fitted = StructuredGP(data.system).fit(data, points=12, restarts=1, options=OPTIONS)
+    robot = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.9"'), gravity=(0.0, 0.0, -9.0))
+    contact = Contact("hand", (0.0, 0.01, 0.2), Sphere((0.0, 0.0, 0.1), 0.6))
+    return fitted.with_system(MechanicalSystem(robot, (contact,), data.system.known_forces, Baumgarte(3.0)))
+
+
+def test_a_model_that_was_carried_to_another_system_predicts_there_after_loading(carried, data, tmp_path):
+    save_posterior(carried, tmp_path / "run")
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES | {"target.urdf"}
+    loaded = load_posterior(tmp_path / "run")
+    states = data.q, data.v, data.u
+    for name in ("acceleration", "multiplier", "contact_force", "unknown_force"):
+        mine, theirs = getattr(carried.predict(*states), name), getattr(loaded.predict(*states), name)
+        assert torch.equal(mine.mean, theirs.mean), name
+        assert torch.equal(mine.covariance, theirs.covariance), name
+    there = carried.model.condition(carried.training, carried.parameters, carried.result, carried.settings)
+    assert (there.predict(*states).mean - loaded.predict(*states).mean).abs().max() > 0.1  # not the old system
+    assert loaded.system.to_dict() == carried.system.to_dict()
+    assert loaded.model.system.to_dict() == carried.model.system.to_dict()
+    again = tmp_path / "again"
+    save_posterior(loaded, again)
+    assert torch.equal(load_posterior(again).predict(*states).mean, loaded.predict(*states).mean)
+
+
+def test_a_carried_model_is_of_a_format_that_older_programs_refuse(carried, posterior, run, tmp_path):
+    save_posterior(carried, tmp_path / "carried")
+    versions = [json.loads((path / "model.json").read_text())["format_version"] for path in (run, tmp_path / "carried")]
+    assert versions == [1, 2]
+
+
+@pytest.mark.parametrize("damage", ["no file", "other robot", "no target"])
+def test_a_damaged_target_is_named(carried, tmp_path, damage):
+    save_posterior(carried, tmp_path / "run")
+    urdf, model = tmp_path / "run" / "target.urdf", tmp_path / "run" / "model.json"
+    if damage == "no file":
+        urdf.unlink()
+    elif damage == "other robot":
+        urdf.write_text(URDF)
+    else:
+        document = json.loads(model.read_text())
+        del document["target"]
+        model.write_text(json.dumps(document))
+    with pytest.raises(FileFormatError, match=r"target\.urdf|'target'"):
+        load_posterior(tmp_path / "run")
+
+
+def test_without_analytical_mean_a_model_moves_to_other_contacts_of_an_equal_robot_only(posterior, data, tmp_path):
+    same = Robot.from_urdf_text(URDF)  # another object, as read from another file
+    moved = posterior.with_system(data.system.with_robot(same).with_contacts(()))
+    save_posterior(moved, tmp_path / "run")
+    states = data.q, data.v, data.u
+    assert torch.equal(load_posterior(tmp_path / "run").predict(*states).mean, moved.predict(*states).mean)
+    heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.9"'))
+    with pytest.raises(InvalidInput, match="no analytical mean"):
+        posterior.with_system(data.system.with_robot(heavier))
+
+
+def test_a_model_of_accelerations_cannot_move(data):
+    fitted = IndependentGP(data.system).fit(data, points=8)
+    with pytest.raises(InvalidInput, match="cannot move to another"):
+        fitted.with_system(data.system.with_contacts(()))

@@ -45,6 +45,8 @@ class Posterior(ABC):
     parameters: Mapping[str, Tensor]
     settings: Mapping[str, Any]
     result: OptimizationResult
+    target: MechanicalSystem | None = None
+    """The system that predictions are for, where it is not that of the model (`with_system`)."""
 
     @property
     def system(self) -> MechanicalSystem:
@@ -184,6 +186,16 @@ class Posterior(ABC):
         raise InvalidInput(
             f"a {self.description} would have to be trained again for every block that is left out; evaluate it on "
             "another recording instead, or use a Gaussian process."
+        )
+
+    def with_system(self, system: MechanicalSystem) -> Posterior:
+        """The same knowledge in another system (robot, contacts, known forces) with the same joints.
+
+        Raises InvalidInput for systems that it cannot be carried to: for every model that learned accelerations.
+        """
+        raise InvalidInput(
+            f"a {self.description} learned the accelerations of one system, contacts included, so it cannot move to "
+            "another; fit it to data from there, or use a structured model, which learns forces."
         )
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:

@@ -1,7 +1,7 @@
 """Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
 
-The folder holds the training points and parameters; loading runs the same conditioning as fitting, so predictions are
-the same.
+A model that was carried to another system (`with_system`) has `target.urdf`, too, the robot there. The folder holds the
+training points and parameters; loading runs the same conditioning as fitting, so predictions are the same.
 """
 
 from __future__ import annotations
@@ -29,8 +29,11 @@ from forcegp.models.protocol import Model, Posterior
 from forcegp.models.stored_models import KINDS, kind_of
 
 FORMAT_VERSION = 1
+TRANSFERRED = 2
+"""Format of a model that was carried to another system: programs that only know 1 would predict for the old system."""
 STATES = ("q", "v", "u", "a")
 NOISE = "training.noise_std"
+ROBOT, TARGET = "robot.urdf", "target.urdf"
 
 
 def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = False) -> None:
@@ -48,18 +51,20 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         if not _is_model_folder(path):
             raise FileFormatError(f"{path} exists and is not a folder written by forcegp, so it is not overwritten")
     kind = kind_of(posterior.model)
-    system = posterior.system.to_dict()
-    urdf = system.pop("urdf")
+    system = posterior.model.system.to_dict()
+    target = None if posterior.target is None else posterior.target.to_dict()
+    robots = {ROBOT: system.pop("urdf")} | ({} if target is None else {TARGET: target.pop("urdf")})
     result = posterior.result
     document = {
         "kind": kind,
-        "format_version": FORMAT_VERSION,
+        "format_version": FORMAT_VERSION if target is None else TRANSFERRED,
         "forcegp_version": __version__,
         "torch_version": torch.__version__,
         "joint_names": list(posterior.joint_names),
         "units": _plain(units_for(posterior.system.robot)),
-        "urdf_sha256": _sha256(urdf),
+        "urdf_sha256": _sha256(robots[ROBOT]),
         "system": system,
+        **({} if target is None else {"target": target, "target_urdf_sha256": _sha256(robots[TARGET])}),
         "model": KINDS[kind].to_dict(posterior.model),
         "result": {
             "value": result.value,
@@ -81,7 +86,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
     try:
         save_file(tensors, temporary / "tensors.safetensors")
-        (temporary / "robot.urdf").write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
+        for name, urdf in robots.items():
+            (temporary / name).write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
         (temporary / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         _share(temporary)
         if path.exists():
@@ -95,7 +101,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
 def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
     """Read a folder that `save_posterior` wrote; it predicts without the training file.
 
-    `contacts` replaces the stored ones.
+    `contacts` replaces those that the model was trained with; the system that it was carried to stays.
 
     Raises
     ------
@@ -104,17 +110,19 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     path = Path(path)
     document = _document(path)
     try:
-        urdf = (path / "robot.urdf").read_bytes().decode("utf-8")
+        urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
+        moved_to = None
+        if document["format_version"] == TRANSFERRED:
+            moved_to = _robot(path, TARGET, document.get("target_urdf_sha256"))
         tensors = load_file(path / "tensors.safetensors")
     except (OSError, SafetensorError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
-    if _sha256(urdf) != document.get("urdf_sha256"):
-        raise FileFormatError(
-            f"{path / 'robot.urdf'} is not the robot that the model was trained with (its hash differs)"
-        )
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
         model = KINDS[document["kind"]].from_dict(system, document["model"])
+        target = None
+        if moved_to is not None:
+            target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
         states = {name: tensors[f"training.{name}"] for name in STATES}
         training = TrainingData(**states, noise_std=tensors.get(NOISE))
         prefix = "parameters."
@@ -140,7 +148,13 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
     _check_tensors(path / "tensors.safetensors", model, training, parameters)
-    return model.condition(training, parameters, optimization, settings)
+    posterior = model.condition(training, parameters, optimization, settings)
+    if target is None:
+        return posterior
+    try:
+        return posterior.with_system(target)
+    except ForceGPError as error:
+        raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
 
 
 def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
@@ -174,13 +188,21 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in KINDS:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version != FORMAT_VERSION:
+    if version not in (FORMAT_VERSION, TRANSFERRED):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}; use the "
-            "version that wrote it "
-            f"({document.get('forcegp_version')}) or fit again"
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} and "
+            f"{TRANSFERRED}; use the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document
+
+
+def _robot(path: Path, name: str, sha256: str | None) -> str:
+    """URDF text of a robot in the folder, as it was written."""
+    urdf = (path / name).read_bytes().decode("utf-8")
+    if _sha256(urdf) != sha256:
+        what = "that the model was trained with" if name == ROBOT else "that the model was carried to"
+        raise FileFormatError(f"{path / name} is not the robot {what} (its hash differs)")
+    return urdf
 
 
 def _share(folder: Path) -> None:

@@ -191,6 +191,7 @@ class StructuredPosterior(Posterior):
         """
         return self.with_system(self.system.with_robot(robot))
 
+    @override
     def with_system(self, system: MechanicalSystem) -> StructuredPosterior:
         """The same forces in another system (robot, contacts, known forces, stabilisation) with the same joints.
 
@@ -202,7 +203,7 @@ class StructuredPosterior(Posterior):
                 f"the model was trained on joints {', '.join(trained.robot.joint_names)}; the other robot has "
                 f"{', '.join(system.robot.joint_names)}. Forces can move to robots with the same joints only."
             )
-        if self.carries_known_forces and system.robot is not trained.robot:
+        if self.carries_known_forces and not system.robot.tree.equals(trained.robot.tree):
             raise InvalidInput(
                 "the model has no analytical mean, so its processes hold gravity and inertia of the robot that it was "
                 "trained on and cannot move to another; fit with mean='analytical' (--mean analytical)."

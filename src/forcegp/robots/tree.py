@@ -62,6 +62,19 @@ class Tree:
         moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **moved, levels=tuple(level.to(device) for level in self.levels))
 
+    def equals(self, other: Tree) -> bool:
+        """Whether both move alike: equal joints, poses, inertias, gravity and armature, whatever their URDFs look like.
+
+        Numbers may differ by rounding (1e-9, relative), as after writing a URDF and reading it again.
+        """
+        if self.rest.shape != other.rest.shape:
+            return False
+        constants = ("rest", "sine", "cosine", "slide", "descendants", "inertias", "gravity", "armature")
+        return all(
+            torch.allclose(getattr(self, name), getattr(other, name).to(self.rest.device), rtol=1e-9, atol=1e-12)
+            for name in constants
+        )
+
 
 def compile_tree(
     description: RobotDescription, layout: Layout, *, gravity: np.ndarray, armature: np.ndarray, device: torch.device
