@@ -43,7 +43,7 @@ def test_it_is_the_shortest_rotation_from_the_vertical():
 
 @pytest.mark.parametrize("down", NEAR_DOWN, ids=str)
 def test_a_ceiling_has_axes_too(down):
-    n = torch.tensor(down).double()
+    n = torch.tensor(down, dtype=torch.float64)
     axes = surface_axes(n)
     torch.testing.assert_close(axes.mT @ axes, torch.eye(3).double(), rtol=0.0, atol=1e-14)
     assert float(torch.linalg.det(axes)) == pytest.approx(1.0, abs=1e-14)
@@ -54,7 +54,7 @@ def test_a_ceiling_has_axes_too(down):
 
 def test_it_is_smooth_by_finite_differences():
     steps = STEP * torch.eye(3).double()[:, None]
-    points = torch.cat([1.5 * normals(200), torch.tensor([(0.0, 0.0, 1.0), *NEAR_DOWN]).double()])
+    points = torch.cat([1.5 * normals(200), torch.tensor([(0.0, 0.0, 1.0), *NEAR_DOWN], dtype=torch.float64)])
     unit_z = points[:, 2] / points.norm(dim=-1)
     points = points[(unit_z - TURNED_OVER).abs() > 1e-3]  # where the axes start from -z instead of z
     numeric = (surface_axes(points + steps) - surface_axes(points - steps)).permute(1, 2, 3, 0) / (2.0 * STEP)
