@@ -27,6 +27,7 @@ from forcegp.models.marginal_likelihood import RESIDUAL_FLOOR, Standardization, 
 from forcegp.models.noise import ACCELERATION
 from forcegp.models.prediction import Prediction
 from forcegp.models.protocol import Posterior
+from forcegp.models.search import blas_threads
 from forcegp.priors.joint_forces import kernels_of
 
 if TYPE_CHECKING:
@@ -176,12 +177,12 @@ class IndependentPosterior(Posterior):
 
     @override
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
-        return LeaveOut.of_independent_outputs(
-            [
+        with blas_threads(len(self.training.q)):
+            parts = [
                 self.likelihood.leave_out(joint, latent, joint_part(self.parameters, joint), blocks)
                 for joint, latent in enumerate(self.latents)
             ]
-        )
+        return LeaveOut.of_independent_outputs(parts)
 
     @override
     def predict_rows(

@@ -23,6 +23,7 @@ from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Array, Posterior
+from forcegp.models.search import blas_threads
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots import Robot
 
@@ -236,9 +237,9 @@ class StructuredPosterior(Posterior):
 
     @override
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
-        with torch.no_grad():
+        with torch.no_grad(), blas_threads(self.training.q.numel()):
             *_, noise = self.likelihood.terms(self.parameters)
-        return leave_blocks_out(self.latent.system, noise, blocks)
+            return leave_blocks_out(self.latent.system, noise, blocks)
 
     @cached_property
     def negative_log_likelihood(self) -> float:
