@@ -1,12 +1,15 @@
 """Drawn functions against the exact posterior, and the fast mean against the plain one."""
 
+import numpy as np
 import pytest
 import torch
-from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
+from gpytorch.kernels import CosineKernel, LinearKernel, MaternKernel, RBFKernel, ScaleKernel
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels, LatentPosterior
-from forcegp.inference.pathwise import FunctionSamples, StackedFunctions
+from forcegp.inference.kernels import kernel_cross, kernel_matrix
+from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
+from forcegp.priors.kernels import kernel_of
 
 POINTS, OUTPUTS = 9, 3
 
@@ -53,11 +56,21 @@ def test_the_stacked_mean_is_the_mean(latent, points):
     torch.testing.assert_close(StackedFunctions.mean_of(latent)(points), latent.mean(points), rtol=1e-10, atol=1e-12)
 
 
-def test_kernels_that_cannot_be_stacked_have_the_same_mean_and_no_samples(points):
+def test_kernels_that_cannot_be_stacked_have_the_same_mean(points):
     latent = conditioned([ScaleKernel(MaternKernel(nu=2.5)), scaled_rbf(1, 0.9, 1.4)], (3, 1))
     torch.testing.assert_close(StackedFunctions.mean_of(latent)(points[:2]), latent.mean(points[:2]))
-    with pytest.raises(InvalidInput, match=r"drawn for ScaleKernel\(RBFKernel\(\)\) .* not for ScaleKernel"):
-        FunctionSamples.draw(latent, 2, seed=0)
+    assert isinstance(draw_functions(latent, 2, seed=0), ComposedSamples)
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [ScaleKernel(CosineKernel()), LinearKernel() * CosineKernel(), ScaleKernel(RBFKernel(active_dims=(0,)))],
+    ids=["no spectrum", "a part of a product", "some features"],
+)
+def test_kernels_that_cannot_be_drawn_are_named(kernel):
+    latent = conditioned([kernel, scaled_rbf(1, 0.9, 1.4)], (1, 1))
+    with pytest.raises(InvalidInput, match=r"no functions can be drawn for a (CosineKernel|ScaleKernel with active)"):
+        draw_functions(latent, 2, seed=0)
 
 
 def test_many_functions_have_mean_and_covariance_of_the_posterior(latent, points):
@@ -104,3 +117,61 @@ def test_drawing_leaves_the_global_random_state_alone(latent):
     before = torch.get_rng_state()
     FunctionSamples.draw(latent, 2, seed=0)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+# ---------------------------------------------------------------- sums and products
+
+
+COMPOSED = {
+    "friction": 1,
+    "linear + matern-3/2": 3,
+    "deep": 2,
+    "periodic * (constant + linear)": 2,
+    "rational-quadratic * matern-1/2 + constant": 2,
+    "squared-exponential * linear * linear": 2,
+}
+
+
+@pytest.mark.parametrize("expression", COMPOSED)
+def test_functions_of_sums_and_products_have_mean_and_covariance_of_the_posterior(expression):
+    """At single points with all latents, and of the first latent across points."""
+    dimension, count = COMPOSED[expression], 6000
+    latent = conditioned(
+        [kernel_of(expression, dimension, 1.3), kernel_of("squared-exponential", 1, 0.8)], (dimension, 1)
+    )
+    points = [
+        torch.randn(3, d, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) for d in (dimension, 1)
+    ]
+    functions = ComposedSamples.draw(latent, count, seed=3, frequencies=16)
+    values = functions([z.expand(count, -1, -1) for z in points])  # S n C
+    mean, covariance = latent.mean(points), latent.covariance(points)
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((values.mean(0) - mean).abs() <= 4.5 * std / count**0.5).all()
+    for n in range(3):
+        scale = std[n][:, None] * std[n][None, :]
+        assert ((torch.cov(values[:, n].mT) - covariance[n]).abs() <= 7.0 * scale / count**0.5).all()
+    kernel, C = next(iter(latent.kernels)), latent.system.deflation.C[..., 0]
+    V = (kernel_cross(kernel, points[0], latent.features[0])[:, :, None] * C[None]).reshape(3, -1)
+    exact = kernel_matrix(kernel, points[0]) - V @ latent.system.factor.solve(V.mT.contiguous())
+    scale = std[:, :1] * std[:, 0][None, :]
+    assert ((torch.cov(values[..., 0].mT) - exact).abs() <= 7.0 * scale / count**0.5).all()
+
+
+def test_a_composed_function_answers_alike_whenever_and_with_whatever_else_it_is_asked():
+    latent = conditioned([kernel_of("friction", 1, 1.3), kernel_of("linear + matern-5/2", 3, 0.8)], (1, 3))
+    points = [torch.randn(4, 5, d, dtype=torch.float64, generator=torch.Generator().manual_seed(d)) for d in (1, 3)]
+    functions = draw_functions(latent, 4, seed=2)
+    together = functions(points)
+    torch.testing.assert_close(together[:, 2:3], functions([z[:, 2:3] for z in points]), rtol=0, atol=1e-12)
+    torch.testing.assert_close(draw_functions(latent, 4, seed=2)(points), together, rtol=0, atol=0)
+    assert (draw_functions(latent, 4, seed=3)(points) - together).abs().max() > 1e-3
+    rest = functions([torch.zeros(4, 1, 1, dtype=torch.float64), points[1][:, :1]])
+    assert float(rest[..., 0].abs().max()) == 0.0  # no friction at rest, in any function
+
+
+def test_drawing_composed_functions_leaves_the_global_random_states_alone():
+    latent = conditioned([kernel_of("matern-5/2", 3, 0.8)], (3,))
+    before, numpy_before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002  # that one is meant
+    draw_functions(latent, 2, seed=0)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002

@@ -7,7 +7,8 @@ sampling functions from Gaussian process posteriors", eq. 10), here in deflated 
 
 with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
 many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
-approximate, and the better the more cosines there are.
+approximate, and the better the more cosines there are. Where all kernels are squared exponentials, all latents are one
+batched operation (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`).
 """
 
 from __future__ import annotations
@@ -17,16 +18,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
+from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
+from forcegp.inference.kernels import kernel_cross
 from forcegp.inference.posterior import LatentPosterior
 
 FREQUENCIES = 256
 """Random frequencies of one drawn function, each with a cosine and a sine."""
+
+
+BLOCK_BYTES = 16 * 2**20
+"""Working memory of the cosines of functions at the training points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,29 +111,23 @@ class FunctionSamples:
     def draw(cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES) -> FunctionSamples:
         """Draw functions; the same seed gives the same ones.
 
-        Raises InvalidInput if a kernel is not a scaled squared exponential, whose spectrum is known to be normal.
+        Raises InvalidInput if a kernel is not a scaled squared exponential; `draw_functions` takes others, too.
         """
         with torch.no_grad():
             kernels = StackedKernels.of(latent)
             if kernels is None:
-                raise InvalidInput(
-                    f"functions can be drawn for ScaleKernel(RBFKernel()) without active_dims only, not for "
-                    f"{_names(latent.kernels)}; use such kernels, or ask for no samples."
-                )
-            system = latent.system
-            count, rank, latents = system.deflation.C.shape
+                raise InvalidInput("only scaled squared exponentials can be stacked; call draw_functions instead")
             generator = torch.Generator(device=kernels.training.device).manual_seed(seed)
             like = {"generator": generator, "dtype": torch.float64, "device": kernels.training.device}
-            omega = torch.randn(samples, latents, kernels.training.shape[-1], frequencies, **like)
+            latents, _, dimension = kernels.training.shape
+            omega = torch.randn(samples, latents, dimension, frequencies, **like)
             scale = (kernels.variances / frequencies).sqrt()[:, None]
             amplitudes = scale * torch.randn(2, samples, latents, frequencies, **like)
-            noise = math.sqrt(1.0 + system.factor.jitter) * torch.randn(samples, count, rank, **like)
+            noise = _noise(latent, samples, generator)
             prior = torch.stack(  # one function at a time, for all its cosines at all points are many numbers
                 [_cosines(kernels.training, omega[s], amplitudes[:, s]) for s in range(samples)]
             )
-            residual = system.deflation.t - torch.einsum("jac,scj->sja", system.deflation.C, prior) - noise
-            alpha = system.factor.solve(residual.reshape(samples, -1).mT.contiguous()).mT
-            beta = torch.einsum("jac,sja->scj", system.deflation.C, alpha.reshape(samples, count, rank))
+            beta = _update_weights(latent, prior, noise)
         return cls(kernels, omega, amplitudes, beta)
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
@@ -139,6 +139,89 @@ class FunctionSamples:
         points = scaled.unflatten(1, (samples, -1)).transpose(0, 1)
         prior = _cosines(points, self.frequencies, self.amplitudes)
         return prior.movedim(1, -1) + update.permute(1, 2, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class ComposedSamples:
+    """S functions drawn from the posterior of the latents, whose kernels are sums and products."""
+
+    latent: LatentPosterior
+    terms: tuple[tuple[DrawnTerm, ...], ...]
+    beta: Float[Tensor, "S C N"]
+
+    @classmethod
+    def draw(cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES) -> ComposedSamples:
+        """Draw functions; the same seed gives the same ones, `frequencies` are those of one function of one term.
+
+        Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
+        """
+        with torch.no_grad():
+            generator = torch.Generator(device=latent.system.beta.device).manual_seed(seed)
+            terms = tuple(
+                tuple(
+                    DrawnTerm.draw(term, z.new_zeros(1, z.shape[-1]), samples, frequencies, generator)
+                    for term in kernel_terms(kernel)
+                )
+                for kernel, z in zip(latent.kernels, latent.features, strict=True)
+            )
+            noise = _noise(latent, samples, generator)
+            prior = [
+                _at_same_points(drawn, z, samples, frequencies) for drawn, z in zip(terms, latent.features, strict=True)
+            ]
+            return cls(latent, terms, _update_weights(latent, torch.stack(prior, dim=1), noise))
+
+    def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
+        """Every function at points of its own: f_s,c(z_s,i)."""
+        columns = []
+        for c, (kernel, z, training) in enumerate(
+            zip(self.latent.kernels, features, self.latent.features, strict=True)
+        ):
+            flat = z.flatten(0, 1)
+            cross = kernel_cross(kernel, flat, training).unflatten(0, z.shape[:2])
+            update = (cross @ self.beta[:, c, :, None])[..., 0]
+            columns.append(_sum(self.terms[c], flat, slice(None)) + update)
+        return torch.stack(columns, dim=-1)
+
+
+def draw_functions(latent: LatentPosterior, samples: int, seed: int) -> FunctionSamples | ComposedSamples:
+    """Functions drawn from the posterior of the latents; the same seed gives the same ones.
+
+    Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
+    """
+    with torch.no_grad():
+        stacked = StackedKernels.of(latent) is not None
+    return (FunctionSamples if stacked else ComposedSamples).draw(latent, samples, seed)
+
+
+def _sum(drawn: Sequence[DrawnTerm], z: Float[Tensor, "n d"], samples: slice) -> Float[Tensor, "S m"]:
+    first, *others = [term(z, samples) for term in drawn]
+    return sum(others, first)
+
+
+def _at_same_points(
+    drawn: Sequence[DrawnTerm], z: Float[Tensor, "N d"], samples: int, frequencies: int
+) -> Float[Tensor, "S N"]:
+    """All functions at z, a few at a time, for all their cosines at all points are many numbers."""
+    few = max(1, BLOCK_BYTES // (8 * max(1, len(z)) * frequencies))
+    parts = [slice(start, min(samples, start + few)) for start in range(0, samples, few)]
+    return torch.cat([_sum(drawn, z.repeat(part.stop - part.start, 1), part) for part in parts])
+
+
+def _noise(latent: LatentPosterior, samples: int, generator: torch.Generator) -> Float[Tensor, "S N r"]:
+    count, rank, _ = latent.system.deflation.C.shape
+    noise = torch.randn(samples, count, rank, generator=generator, dtype=torch.float64, device=generator.device)
+    return math.sqrt(1.0 + latent.system.factor.jitter) * noise
+
+
+def _update_weights(
+    latent: LatentPosterior, prior: Float[Tensor, "S C N"], noise: Float[Tensor, "S N r"]
+) -> Float[Tensor, "S C N"]:
+    """beta_s = C^T T^-1 (t - C g_s(Z) - eps_s)."""
+    system = latent.system
+    count, rank, _ = system.deflation.C.shape
+    residual = system.deflation.t - torch.einsum("jac,scj->sja", system.deflation.C, prior) - noise
+    alpha = system.factor.solve(residual.reshape(len(prior), -1).mT.contiguous()).mT
+    return torch.einsum("jac,sja->scj", system.deflation.C, alpha.reshape(len(prior), count, rank))
 
 
 def _cosines(
@@ -159,7 +242,3 @@ def _scaled(features: Sequence[Tensor], lengthscales: Sequence[Tensor]) -> Float
             for z, scale in zip(features, lengthscales, strict=True)
         ]
     )
-
-
-def _names(kernels: Sequence[Kernel] | object) -> str:
-    return ", ".join(sorted({type(kernel).__name__ for kernel in kernels})) or "no kernel at all"  # type: ignore[attr-defined]  # a module list yields kernels

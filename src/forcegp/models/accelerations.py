@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.pathwise import FunctionSamples, StackedFunctions
+from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.marginal_likelihood import inertials_of
 
@@ -67,7 +67,7 @@ class StructuredAccelerations(AccelerationModel):
     def sampled(self, samples: int, seed: int) -> AccelerationFunction:
         if not len(self.posterior.kernels.kernels):  # no unknown force: all functions are the same
             return self.mean()
-        return self._through(FunctionSamples.draw(self.posterior.latent, samples, seed))
+        return self._through(draw_functions(self.posterior.latent, samples, seed))
 
     def _through(self, functions: Callable[[list[Tensor]], Tensor]) -> AccelerationFunction:
         model, standardize = self.posterior.model, self.posterior.likelihood.standardization
@@ -123,7 +123,7 @@ class IndependentAccelerations(PredictedAccelerations):
     def sampled(self, samples: int, seed: int) -> AccelerationFunction:
         seeds = np.random.SeedSequence(seed).generate_state(len(self.latents))  # joints are independent
         return self._through(
-            [FunctionSamples.draw(latent, samples, int(own)) for latent, own in zip(self.latents, seeds, strict=True)]
+            [draw_functions(latent, samples, int(own)) for latent, own in zip(self.latents, seeds, strict=True)]
         )
 
     def _through(self, functions: Sequence[Callable[[list[Tensor]], Tensor]]) -> AccelerationFunction:
