@@ -16,7 +16,14 @@ from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.force_prior import ForcePrior, Scaling
 from forcegp.priors.joint_forces import kernels_of
 from forcegp.priors.kernels import check_kernel
-from forcegp.priors.tool_point import ToolPoint, contact_axes, has_contact, nominal_normal_force, require_contact
+from forcegp.priors.tool_point import (
+    ToolPoint,
+    contact_axes,
+    has_contact,
+    is_contact_number,
+    nominal_normal_force,
+    require_contact,
+)
 from forcegp.robots import Robot
 
 AXES = ("isotropic", "two-axis")
@@ -45,7 +52,7 @@ class ContactFriction(ForcePrior):
     kernel: str = "friction"
 
     def __post_init__(self) -> None:
-        if self.axes not in AXES or not isinstance(self.contact, int) or self.contact < 0:
+        if self.axes not in AXES or not is_contact_number(self.contact):
             raise InvalidInput(
                 f"ContactFriction has axes {self.axes!r} and contact {self.contact!r}; give 'isotropic' or 'two-axis', "
                 "and a contact's number from 0."

@@ -10,6 +10,8 @@ from typing_extensions import override
 
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.priors.joint_forces import JointForces
+from forcegp.priors.joint_units import joint_units
+from forcegp.robots import Robot
 
 
 @dataclass(frozen=True)
@@ -25,3 +27,7 @@ class JointAccelerations(JointForces):
     @override
     def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
         return dynamics.M
+
+    @override
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        return joint_units("a", robot.joint_names, robot)

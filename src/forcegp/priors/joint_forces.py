@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -14,6 +15,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.priors.force_prior import ForcePrior
+from forcegp.priors.joint_units import joint_labels, joint_units
 from forcegp.priors.kernels import check_kernel, kernel_of
 from forcegp.robots import Robot
 
@@ -66,14 +68,18 @@ class JointForces(ForcePrior):
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
         joints = robot.joint_names
-        named = {name: tuple(f"{name} of {joint}" for joint in joints) for name in INPUTS}
+        named = {name: joint_labels(name, name, joints, robot) for name in INPUTS}
         if self.angles == "sin-cos":
             turns = _turns(robot).tolist()
             turning = [joint for joint, turn in zip(joints, turns, strict=True) if turn]
-            sliding = [f"q of {joint}" for joint, turn in zip(joints, turns, strict=True) if not turn]
+            sliding = [label for label, turn in zip(named["q"], turns, strict=True) if not turn]
             waves = [f"{wave} q of {joint}" for wave in ("sin", "cos") for joint in turning]
             named["q"] = (*sliding, *waves)
         return (tuple(entry for name in self.inputs for entry in named[name]),) * robot.nv
+
+    @override
+    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+        return joint_units("u", robot.joint_names, robot)
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
@@ -86,11 +92,18 @@ class JointForces(ForcePrior):
 
 def chosen_inputs(prior: str, given: object, allowed: tuple[str, ...]) -> tuple[str, ...]:
     """`given` as a tuple of names from `allowed`, each once. Raises InvalidInput for anything else."""
-    inputs = (given,) if isinstance(given, str) else tuple(given)  # type: ignore[arg-type]  # anything is checked below
+    inputs = as_names(given)
     if not inputs or any(name not in allowed for name in inputs) or len(set(inputs)) < len(inputs):
         names = ", ".join(map(repr, allowed))
         raise InvalidInput(f"{prior} inputs are {given!r}; give one or more of {names}, each once.")
     return inputs
+
+
+def as_names(given: object) -> tuple[Any, ...]:
+    """One name, or several, as a tuple; empty for what is neither."""
+    if isinstance(given, str):
+        return (given,)
+    return tuple(given) if isinstance(given, Iterable) else ()
 
 
 def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:

@@ -15,7 +15,8 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_forces import kernels_of
+from forcegp.priors.joint_forces import as_names, kernels_of
+from forcegp.priors.joint_units import joint_labels, joint_units
 from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
 
@@ -63,12 +64,11 @@ class JointFriction(ForcePrior):
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
-        units = {joint.name: "m/s" if joint.type == "prismatic" else "rad/s" for joint in robot.joints}
-        return tuple((f"velocity of {name} [{units[name]}]",) for name in self.latent_names(robot))
+        return tuple((label,) for label in joint_labels("velocity", "v", self.latent_names(robot), robot))
 
     @override
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
-        return joint_force_units(self.latent_names(robot), robot)
+        return joint_units("u", self.latent_names(robot), robot)
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
@@ -83,7 +83,7 @@ def chosen_joints(prior: str, given: object) -> tuple[str, ...] | None:
     """Names of joints as a tuple; None stands for all. Raises InvalidInput for what is no list of different names."""
     if given is None:
         return None
-    names = (given,) if isinstance(given, str) else tuple(given)  # type: ignore[arg-type]  # checked in the next line
+    names = as_names(given)
     if not names or any(not isinstance(name, str) for name in names) or len(set(names)) < len(names):
         raise InvalidInput(f"{prior} joints are {given!r}; give names of joints, each once, or None for all.")
     return names
@@ -104,9 +104,3 @@ def joint_columns(joints: Sequence[str] | None, dynamics: ConstrainedDynamics) -
     columns = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
     columns = columns[:, joint_indices(joints, dynamics.state.kinematics.robot)]
     return columns.expand(*H.shape[:-2], *columns.shape)
-
-
-def joint_force_units(joints: Sequence[str], robot: Robot) -> tuple[str, ...]:
-    """Nm for joints that turn, N for those that slide."""
-    sliding = {joint.name for joint in robot.joints if joint.type == "prismatic"}
-    return tuple("N" if name in sliding else "Nm" for name in joints)

@@ -11,6 +11,7 @@ from functools import partial
 from gpytorch.kernels import Kernel
 from torch import Tensor
 
+from forcegp.errors import InvalidInput
 from forcegp.priors.deep_kernel import deep
 from forcegp.priors.kernel_expressions import KernelExpression, KernelFactory
 from forcegp.priors.stationary_kernels import (
@@ -55,6 +56,8 @@ def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kern
     return KernelExpression(expression, KERNELS).kernel(dimension, variance)
 
 
-def check_kernel(expression: str) -> None:
-    """Raise InvalidInput if `expression` cannot be read or has an unknown name; for constructors."""
+def check_kernel(expression: object) -> None:
+    """Raise InvalidInput if `expression` is no text, cannot be read or has an unknown name; for constructors."""
+    if not isinstance(expression, str):
+        raise InvalidInput(f"the kernel is {expression!r}; give an expression such as 'linear + squared-exponential'.")
     KernelExpression(expression, KERNELS)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
+from inspect import Parameter, signature
 from typing import Any
 
 from forcegp.errors import InvalidInput, unknown_name_message
@@ -21,7 +23,10 @@ from forcegp.priors.tool_forces import ToolForces
 
 @dataclass(frozen=True)
 class NamedPrior:
-    """A prior under a short name: what it is for, its class, and what differs from the defaults of that class."""
+    """A prior under a short name: what it is for, its class, and what differs from the defaults of that class.
+
+    The class, or any other callable, is asked for its parameters; their defaults tell how options are read.
+    """
 
     summary: str
     prior: Callable[..., ForcePrior]
@@ -69,35 +74,57 @@ def _one(text: str, expression: str) -> ForcePrior:
         raise InvalidInput(unknown_name_message("prior", name, f"{expression!r}", NAMED_PRIORS))
     named = NAMED_PRIORS[name]
     given = dict(named.arguments)
-    allowed = {field.name: field for field in fields(named.prior)}  # type: ignore[arg-type]  # priors are dataclasses
+    allowed = signature(named.prior).parameters
     for option in _split(options, ",") if colon else ():
         key, equals, value = (part.strip() for part in option.partition("="))
         if not equals or key not in allowed:
-            known = ", ".join(allowed) or "no options at all"
-            raise InvalidInput(f"prior {name!r} cannot take {option.strip()!r}; write FIELD=VALUE with one of: {known}")
+            raise InvalidInput(_wrong_option(name, option.strip(), key, list(allowed)))
         given[key] = _value(name, key, value, allowed[key].default)
-    missing = [key for key, field in allowed.items() if field.default is MISSING and key not in given]
+    missing = [key for key, field in allowed.items() if field.default is Parameter.empty and key not in given]
     if missing:
         raise InvalidInput(f"prior {name!r} needs {', '.join(missing)}: write {name}:{missing[0]}=...")
     return named.prior(**given)
 
 
+def _wrong_option(name: str, option: str, key: str, allowed: list[str]) -> str:
+    if not allowed:
+        return f"prior {name!r} cannot take {option!r}; it has no options"
+    close = difflib.get_close_matches(key, allowed, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close and close[0] != key else ""
+    return f"prior {name!r} cannot take {option!r}{hint}; write FIELD=VALUE with one of: {', '.join(allowed)}"
+
+
 def _value(name: str, key: str, text: str, default: Any) -> Any:
-    """The text as what the field is by default."""
+    """The text as what the option is by default: truth, number, numbers, names, or text."""
     if isinstance(default, bool):
         if text not in ("true", "false"):
             raise InvalidInput(f"prior {name!r} has {key}={text}; give true or false")
         return text == "true"
+    several = default if isinstance(default, tuple) else ()
+    numbers = bool(several) and all(isinstance(entry, int | float) for entry in several)
     try:
         if isinstance(default, int | float):
             return type(default)(text)
-        if key == "point":
+        if numbers:
             return tuple(float(part) for part in text.split("/"))
     except ValueError:
-        raise InvalidInput(f"prior {name!r} has {key}={text}; give a number (a point as x/y/z)") from None
+        example = "/".join(map(str, several))
+        kind = f"numbers as in {example}" if numbers else "a whole number" if isinstance(default, int) else "a number"
+        raise InvalidInput(f"prior {name!r} has {key}={text}; give {kind}") from None
     if isinstance(default, tuple) or key == "joints":
         return tuple(part.strip() for part in text.split("/"))
-    return text[1:-1].strip() if text.startswith("(") and text.endswith(")") else text
+    return _without_parentheses(text)
+
+
+def _without_parentheses(text: str) -> str:
+    """Without the one pair that encloses the whole text; "(a) + (b)" stays as it is."""
+    enclosed = text.startswith("(") and text.endswith(")")
+    depth, closes = 0, []
+    for index, character in enumerate(text):
+        depth += (character == "(") - (character == ")")
+        if depth == 0:
+            closes.append(index)
+    return text[1:-1].strip() if enclosed and closes == [len(text) - 1] else text
 
 
 def _split(text: str, separator: str) -> list[str]:

@@ -35,6 +35,10 @@ class NoForces(ForcePrior):
         return ()
 
     @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        return ()
+
+    @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
         return ()
 

@@ -15,7 +15,8 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_friction import chosen_joints, joint_columns, joint_force_units, joint_indices
+from forcegp.priors.joint_friction import chosen_joints, joint_columns, joint_indices
+from forcegp.priors.joint_units import joint_labels, joint_units
 from forcegp.priors.kernel_parameters import log_scale, register_log_normal_prior
 from forcegp.robots import Robot
 
@@ -67,12 +68,11 @@ class PeriodicJointForces(ForcePrior):
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
-        units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in robot.joints}
-        return tuple((f"position of {name} [{units[name]}]",) for name in self.latent_names(robot))
+        return tuple((label,) for label in joint_labels("position", "q", self.latent_names(robot), robot))
 
     @override
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
-        return joint_force_units(self.latent_names(robot), robot)
+        return joint_units("u", self.latent_names(robot), robot)
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:

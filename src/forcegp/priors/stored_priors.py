@@ -45,7 +45,7 @@ def prior_to_dict(prior: ForcePrior) -> dict[str, Any]:
     return {"type": name, **prior.to_dict()}
 
 
-def prior_from_dict(stored: Mapping[str, Any]) -> ForcePrior:
+def prior_from_dict(stored: object) -> ForcePrior:
     """The prior that `prior_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
     if isinstance(stored, Mapping) and stored.get("type") == SUM:
         terms = stored.get("terms")

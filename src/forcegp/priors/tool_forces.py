@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -15,12 +16,14 @@ from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.force_prior import ForcePrior, Scaling
 from forcegp.priors.joint_forces import chosen_inputs, kernels_of
+from forcegp.priors.joint_units import joint_labels
 from forcegp.priors.kernels import check_kernel
 from forcegp.priors.tool_point import (
     AXES,
     ToolPoint,
     contact_axes,
     has_contact,
+    is_contact_number,
     nominal_normal_force,
     require_contact,
     require_moving,
@@ -66,13 +69,16 @@ class ToolForces(ForcePrior):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", chosen_inputs("ToolForces", self.inputs, TOOL_INPUTS))
-        object.__setattr__(self, "point", tuple(float(entry) for entry in self.point))
         check_kernel(self.kernel)
-        if self.axes not in AXES or len(self.point) != 3 or not isinstance(self.contact, int) or self.contact < 0:
+        if not (self.frame is None or isinstance(self.frame, str)):
+            raise InvalidInput(f"ToolForces frame is {self.frame!r}; give the name of a link, or None for the contact.")
+        point = _three_numbers(self.point)
+        if self.axes not in AXES or point is None or not is_contact_number(self.contact):
             raise InvalidInput(
                 f"ToolForces has axes {self.axes!r}, point {self.point!r} and contact {self.contact!r}; give axes "
                 f"{' or '.join(map(repr, AXES))}, a point of three numbers in m, and a contact's number from 0."
             )
+        object.__setattr__(self, "point", point)
 
     @property
     @override
@@ -154,7 +160,7 @@ class ToolForces(ForcePrior):
             "angular-velocity": [f"tool angular velocity about {axis} [rad/s]" for axis in turning],
             "position": [f"tool position along {axis} [m]" for axis in (along if self.axes == "surface" else "xyz")],
             "load": ["nominal normal force [N]"],
-            **{name: [f"{name} of {joint}" for joint in robot.joint_names] for name in ("q", "v", "u")},
+            **{name: joint_labels(name, name, robot.joint_names, robot) for name in ("q", "v", "u")},
         }
         return (tuple(entry for name in self.inputs for entry in named[name]),) * self._count
 
@@ -196,6 +202,15 @@ class ToolForces(ForcePrior):
             return where.orientation
         identity = torch.eye(3, dtype=where.position.dtype, device=where.position.device)
         return identity.expand_as(where.orientation)
+
+
+def _three_numbers(given: object) -> tuple[float, ...] | None:
+    """`given` as three finite floats, None where it is anything else."""
+    try:
+        point = () if isinstance(given, str) else tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
+    except (TypeError, ValueError):
+        return None
+    return point if len(point) == 3 and all(map(math.isfinite, point)) else None
 
 
 def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -60,6 +60,11 @@ def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[T
     return size * dynamics.multiplier_map().offset[..., contact].abs()
 
 
+def is_contact_number(value: object) -> bool:
+    """Whether it can be the number of a contact, counted from 0."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
 def require_contact(prior: str, contact: int, system: MechanicalSystem) -> None:
     """Raise InvalidInput if the system has no such contact."""
     if contact >= len(system.contacts):
