@@ -40,10 +40,22 @@ KERNELS = {
     "SE, some inputs, one length scale": lambda: gk.ScaleKernel(gk.RBFKernel(active_dims=(0, 2))).double(),
     "RBF alone": lambda: gk.RBFKernel(ard_num_dims=3).double(),
     "Matern 5/2": lambda: gk.ScaleKernel(gk.MaternKernel(2.5, ard_num_dims=3)).double(),
+    "Matern 1/2": lambda: gk.ScaleKernel(gk.MaternKernel(0.5)).double(),
+    "Matern 3/2, some inputs": lambda: gk.ScaleKernel(
+        gk.MaternKernel(1.5, ard_num_dims=2, active_dims=(0, 2))
+    ).double(),
+    "Matern alone": lambda: gk.MaternKernel(1.5, ard_num_dims=3).double(),
     "rational quadratic": lambda: gk.ScaleKernel(gk.RQKernel()).double(),
     "periodic": lambda: gk.ScaleKernel(periodic()).double(),
     "linear": lambda: gk.LinearKernel().double(),
+    "periodic, one period per input": lambda: gk.PeriodicKernel(ard_num_dims=3).double(),
+    "constant and Matern": lambda: (gk.ConstantKernel() + gk.MaternKernel(2.5)).double(),
     "sum": lambda: (gk.ScaleKernel(gk.RBFKernel()) + gk.LinearKernel()).double(),
+    "product": lambda: (gk.RBFKernel() * gk.LinearKernel(ard_num_dims=3)).double(),
+    "scaled sum of some inputs": lambda: gk.ScaleKernel(
+        gk.RBFKernel(active_dims=(1,)) + gk.MaternKernel(2.5, active_dims=(0, 2))
+    ).double(),
+    "sum with a kernel that is called": lambda: (gk.ScaleKernel(gk.RQKernel()) + gk.RBFKernel()).double(),
 }
 
 
