@@ -140,7 +140,8 @@ class StructuredPosterior(Posterior):
         ----------
         latent: its name, one of `latent_names`.
         features: (n, d), or (n,) where the process has one feature, in the units of `prior.feature_names`. None takes
-            `points` values over the range that the training data visited, for processes of one feature.
+            `points` values over the range that the training data visited, for processes of one feature; a constant,
+            which has none, is one value.
 
         Raises InvalidInput for another name, wrong shapes, and None for processes of several features.
         """
@@ -209,8 +210,9 @@ class StructuredPosterior(Posterior):
                 "the model has no analytical mean, so its processes hold gravity and inertia of the robot that it was "
                 "trained on and cannot move to another; fit with mean='analytical' (--mean analytical)."
             )
-        rest = torch.zeros(1, system.robot.nv, dtype=torch.float64, device=system.robot.device)
-        self.model.prior.mixing(system.dynamics(rest, rest, rest, inertials_of(self.parameters) or None))
+        # asks for the frames, at a state where a surface is likely to have a normal
+        q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
+        self.model.prior.mixing(system.dynamics(q, v, u, inertials_of(self.parameters) or None))
         return replace(self, target=system)
 
     @override
@@ -262,8 +264,12 @@ def _curve_features(latent: str, given: Array | None, visited: Tensor, points: i
     """Features (n, d) of a curve, checked."""
     count = visited.shape[-1]
     if given is None:
+        if not count:
+            return visited[:1]  # a constant has one value
         if count != 1:
             raise InvalidInput(f"{latent!r} is a function of {count} features; give features (n, {count})")
+        if points < 1:
+            raise InvalidInput(f"a curve of points={points} was asked for; give 1 or more")
         steps = torch.linspace(0.0, 1.0, points, dtype=torch.float64, device=visited.device)
         return visited[0] + steps[:, None] * (visited[1] - visited[0])
     z = torch.as_tensor(given, dtype=torch.float64, device=visited.device)
