@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,20 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
     links = re.findall(r"\]\(([^)#]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
     missing = [link for link in links if not link.startswith("http") and not (repository / link).exists()]
     assert not missing
+
+
+def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "comparing-priors.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    verdict, joint, contact, none, left_out = done.stdout.splitlines()
+    assert verdict.startswith("The data support contact: ")
+    scores = [float(re.search(r"functions, (\S+) nats per row", line)[1]) for line in (joint, contact, none)]
+    assert scores[1] > scores[0] > scores[2]
+    assert left_out.endswith("torch.Size([30, 7]) torch.Size([30, 7, 7])")
+    for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
+        for command in re.findall(r"^ *forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
+            parse_arguments(shlex.split(command.partition(">")[0].replace("$seed", "1")))
 
 
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
