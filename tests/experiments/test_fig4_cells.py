@@ -71,7 +71,7 @@ def test_the_feedback_is_that_of_its_formula_and_nothing_on_the_recording(record
 
 def test_the_feedback_pulls_a_displaced_motion_back(motion):
     recorded = fig4_cells._Recorded(motion, 2, 0.5)
-    system, friction = replace(motion.system, baumgarte=BAUMGARTE), motion.metadata["config"]["friction"]
+    system, friction = replace(motion.system, baumgarte=BAUMGARTE), motion.metadata["config"]["viscous_coefficient"]
     contact = system.contacts[0]
 
     def truth(q, v, u):

@@ -120,7 +120,7 @@ def test_leaving_disconnects():
     import pybullet
 
     with BulletArm(urdf(), gravity=9.8, time_step=STEP, tool_point=POINT) as arm:
-        client = arm._client
+        client = arm.client
         assert pybullet.isConnected(client)
     assert not pybullet.isConnected(client)
     arm.close()

@@ -193,7 +193,7 @@ def test_progress_is_reported_up_to_the_end():
         ("tool_point", 0.1, "3 numbers"),
         ("tool_point", (0.0, 0.1), "3 numbers"),
         ("tool_inertia", (0.1, -0.1, 0.1), "> 0"),
-        ("friction", -1.0, ">= 0"),
+        ("viscous_coefficient", -1.0, ">= 0"),
         ("null_space_joints", (0,), "an integer from 1 to 7"),
         ("waypoint_x", (0.5, -0.5), "must not exceed"),
         ("segment_seconds", (0.0, 1.0), "from 0.05"),

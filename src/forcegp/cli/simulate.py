@@ -24,11 +24,13 @@ if TYPE_CHECKING:
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a plane with viscous friction that nobody models
-    (Rath, Geist, Trimpe 2021). Equal seeds give equal motions; train and test need different ones.
+    kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, by default
+    a plane and viscous friction (Rath, Geist, Trimpe 2021). Equal seeds give equal way-points; train and
+    test need different ones.
 
     For instance:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
+      forcegp simulate kuka-surface --friction stribeck --patch 4 --joint-friction stribeck --out rough.h5
     """
 
     scenario: Positional[Literal["kuka-surface"]]
@@ -43,8 +45,19 @@ class Simulate(Command):
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
     episodes: Annotated[int, arg(metavar="N")] = 1
     """Number of independent trajectories, each from the start posture."""
-    friction: Annotated[float, arg(metavar="F")] = 1.0
-    """Viscous friction of the tool on the surface in N/(m/s): the force that nobody models."""
+    friction: Literal["viscous", "coulomb", "stribeck"] | None = None
+    """Friction of the tool, the force that nobody models: viscous, or in proportion to the normal force
+    coulomb or stribeck. Default: viscous; coulomb with --contact bullet, which has no other."""
+    friction_coefficient: Annotated[float | None, arg(metavar="F")] = None
+    """Viscous in N/(m/s), default 1; coulomb and stribeck: friction per normal force while sliding, default 0.3."""
+    joint_friction: Literal["none", "stribeck"] = "none"
+    """Friction of the joints that nobody models either."""
+    patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    """Makes friction so many times as large on the strip 0 < x < 0.25 m of the surface; 1 for none."""
+    surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
+    """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
+    contact: Literal["ideal", "bullet"] = "ideal"
+    """ideal: the tool never leaves the surface. bullet: PyBullet's contact, which it leaves now and then."""
     overwrite: bool = False
     """Replace the file if it exists."""
     json: Json = False
@@ -54,8 +67,7 @@ class Simulate(Command):
         """Simulate and save."""
         require_free_file(self.out, overwrite=self.overwrite)
         start = time.monotonic()
-        options = {name: getattr(self, name) for name in ("seconds", "seed", "noise", "episodes", "friction")}
-        dataset = simulate(terminal, self.scenario, **options)
+        dataset = simulate(terminal, self.scenario, **self._config())
         dataset.save(self.out)
         seconds = time.monotonic() - start
         terminal.say(
@@ -72,6 +84,16 @@ class Simulate(Command):
             "config": dict(dataset.metadata["config"]),
             "wall_seconds": seconds,
         }
+
+    def _config(self) -> dict[str, Any]:
+        """The fields of the scenario's configuration that the options set."""
+        same = ("seconds", "seed", "noise", "episodes", "friction", "joint_friction", "surface", "contact")
+        fields = {name: getattr(self, name) for name in same}
+        fields["patch_factor"] = self.patch
+        if self.friction_coefficient is not None:
+            dry = self.friction in ("coulomb", "stribeck") or self.contact == "bullet"
+            fields["coulomb_coefficient" if dry else "viscous_coefficient"] = self.friction_coefficient
+        return fields
 
 
 def simulate(terminal: Terminal, scenario: str, **options: Any) -> Dataset:

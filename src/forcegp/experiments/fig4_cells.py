@@ -71,7 +71,7 @@ def truth(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, 
     recorded = _Recorded(trajectory, spec["starts"], max(spec["seconds"]))
     assert trajectory.system is not None
     system = replace(trajectory.system, baumgarte=BAUMGARTE)
-    contact, friction = system.contacts[0], trajectory.metadata["config"]["friction"]
+    contact, friction = system.contacts[0], trajectory.metadata["config"]["viscous_coefficient"]
 
     def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         dynamics = system.dynamics(q, v, u)

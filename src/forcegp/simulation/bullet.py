@@ -18,12 +18,14 @@ from forcegp.errors import MissingExtra, SimulationError
 class BulletArm:
     """A serial arm of revolute joints whose only forces are gravity, its own inertia and the torques given to `step`.
 
-    `tool_point` [m] is fixed in the frame of the last link; `gravity` [m/s^2] acts along -z.
+    `tool_point` [m] is fixed in the frame of the last link; `gravity` [m/s^2] acts along -z. `bullet`, `client`, `body`
+    and `joints` (link numbers) are PyBullet's module and its names for this simulation.
 
     Everything else that PyBullet would add is off: joint motors, joint limits and joint damping of the URDF, damping of
-    links, collisions. So one step is `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`. Use it
-    as a context manager; leaving it disconnects. Raises MissingExtra without PyBullet, and SimulationError for a link
-    whose inertia is not along its axes.
+    links; collisions need shapes in the URDF and a second body (`BulletContact`). Without them one step is
+    `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`. Use it as a context manager; leaving it
+    disconnects. Raises MissingExtra without PyBullet, and SimulationError for a link whose inertia is not along its
+    axes.
     """
 
     def __init__(self, urdf: str, *, gravity: float, time_step: float, tool_point: Sequence[float]):
@@ -31,8 +33,9 @@ class BulletArm:
             import pybullet
         except ImportError as error:
             raise MissingExtra("simulation needs PyBullet: pip install 'forcegp[sim]'") from error
-        self._bullet: Any = pybullet
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self.bullet: Any = pybullet
+        self.time_step = time_step
+        self.client = pybullet.connect(pybullet.DIRECT)
         try:
             self._load(urdf, gravity, time_step, tool_point)
         except BaseException:
@@ -40,7 +43,7 @@ class BulletArm:
             raise
 
     def _load(self, urdf: str, gravity: float, time_step: float, tool_point: Sequence[float]) -> None:
-        bullet, client = self._bullet, {"physicsClientId": self._client}
+        bullet, client = self.bullet, {"physicsClientId": self.client}
         bullet.setGravity(0.0, 0.0, -gravity, **client)
         bullet.setPhysicsEngineParameter(fixedTimeStep=time_step, numSubSteps=0, **client)
         with tempfile.TemporaryDirectory() as folder:
@@ -48,20 +51,19 @@ class BulletArm:
             path.write_text(_without_limits_and_damping(urdf), encoding="utf-8")
             # Without this flag Bullet would compute the inertia of every link from its (missing) collision shape.
             flags = bullet.URDF_USE_INERTIA_FROM_FILE
-            self._body = bullet.loadURDF(str(path), useFixedBase=True, flags=flags, **client)
+            self.body = bullet.loadURDF(str(path), useFixedBase=True, flags=flags, **client)
         information = [
-            bullet.getJointInfo(self._body, index, **client)
-            for index in range(bullet.getNumJoints(self._body, **client))
+            bullet.getJointInfo(self.body, index, **client) for index in range(bullet.getNumJoints(self.body, **client))
         ]
         for link in range(-1, len(information)):
             # Damping of links is 0.04 by default. Masses must not be changed in this way: the mass matrix would go
             # stale (bullet3 issue 4809); they are in the URDF.
             bullet.changeDynamics(
-                self._body, link, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6, **client
+                self.body, link, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6, **client
             )
         moving = [joint for joint in information if joint[2] == bullet.JOINT_REVOLUTE]
-        self._joints = [joint[0] for joint in moving]
-        frames = bullet.getLinkStates(self._body, self._joints, **client)
+        self.joints = [joint[0] for joint in moving]
+        frames = bullet.getLinkStates(self.body, self.joints, **client)
         axes, centers = np.array([joint[13] for joint in moving]), np.array([frame[2] for frame in frames])
         # What turns with each link: joint axis, centre of mass, tool point (meaningful for the last link only).
         self._local = np.stack([axes, centers, np.broadcast_to(tool_point, axes.shape)], axis=2)
@@ -70,7 +72,7 @@ class BulletArm:
                 "every link's inertia must be given along the axes of its link (rpy 0 0 0, diagonal)."
             )
         nv = len(moving)
-        bullet.setJointMotorControlArray(self._body, self._joints, bullet.VELOCITY_CONTROL, forces=[0.0] * nv, **client)
+        bullet.setJointMotorControlArray(self.body, self.joints, bullet.VELOCITY_CONTROL, forces=[0.0] * nv, **client)
         self._zeros = [0.0] * nv
 
     def __enter__(self) -> BulletArm:
@@ -83,28 +85,28 @@ class BulletArm:
 
     def close(self) -> None:
         """Disconnect from PyBullet."""
-        if self._bullet.isConnected(self._client):
-            self._bullet.disconnect(self._client)
+        if self.bullet.isConnected(self.client):
+            self.bullet.disconnect(self.client)
 
     def reset(self, q: Float[np.ndarray, " nv"], v: Float[np.ndarray, " nv"]) -> None:
         """Put the arm into a state."""
-        for index, position, velocity in zip(self._joints, q.tolist(), v.tolist(), strict=True):
-            self._bullet.resetJointState(self._body, index, position, velocity, physicsClientId=self._client)
+        for index, position, velocity in zip(self.joints, q.tolist(), v.tolist(), strict=True):
+            self.bullet.resetJointState(self.body, index, position, velocity, physicsClientId=self.client)
 
     def state(self) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " nv"]]:
         """Joint positions [rad] and velocities [rad/s]."""
-        states = self._bullet.getJointStates(self._body, self._joints, physicsClientId=self._client)
+        states = self.bullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
         return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 
     def mass_matrix(self, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray, "nv nv"]:
         """Joint-space inertia [kg m^2]."""
-        return np.array(self._bullet.calculateMassMatrix(self._body, q.tolist(), physicsClientId=self._client))
+        return np.array(self.bullet.calculateMassMatrix(self.body, q.tolist(), physicsClientId=self.client))
 
     def bias_forces(self, q: Float[np.ndarray, " nv"], v: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
         """Coriolis, centrifugal and gravity torques [Nm]: what holds the joint acceleration at zero."""
         return np.array(
-            self._bullet.calculateInverseDynamics(
-                self._body, q.tolist(), v.tolist(), self._zeros, physicsClientId=self._client
+            self.bullet.calculateInverseDynamics(
+                self.body, q.tolist(), v.tolist(), self._zeros, physicsClientId=self.client
             )
         )
 
@@ -117,8 +119,8 @@ class BulletArm:
         et al., Robotics, section 3.1.3). With `w_i = z_1 v_1 + ... + z_i v_i`, the angular velocity of link i,
         `Jdot v = sum_i v_i [(w_i + w_(i-1)) x l_i; w_i x z_i]`.
         """
-        states = self._bullet.getLinkStates(
-            self._body, self._joints, computeForwardKinematics=1, physicsClientId=self._client
+        states = self.bullet.getLinkStates(
+            self.body, self.joints, computeForwardKinematics=1, physicsClientId=self.client
         )
         # Poses of the centres of mass: PyBullet gives the link frames in single precision only.
         turned = _rotation_matrices([state[1] for state in states]) @ self._local
@@ -137,14 +139,14 @@ class BulletArm:
         """Advance by one time step under joint torques [Nm]. Raises SimulationError if they are not finite."""
         if not np.isfinite(torques).all():
             raise SimulationError("the torques are not finite; the simulated motion has diverged.")
-        self._bullet.setJointMotorControlArray(
-            self._body,
-            self._joints,
-            self._bullet.TORQUE_CONTROL,
+        self.bullet.setJointMotorControlArray(
+            self.body,
+            self.joints,
+            self.bullet.TORQUE_CONTROL,
             forces=torques.tolist(),
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
-        self._bullet.stepSimulation(physicsClientId=self._client)
+        self.bullet.stepSimulation(physicsClientId=self.client)
 
 
 def _without_limits_and_damping(urdf: str) -> str:

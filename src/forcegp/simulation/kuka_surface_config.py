@@ -4,17 +4,35 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, Literal, get_args
 
 from forcegp.errors import InvalidInput
+from forcegp.simulation.checked_numbers import (
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Range,
+    checked_numbers,
+    require_choice,
+    require_integer,
+)
+
+Friction = Literal["viscous", "coulomb", "stribeck"]
+JointFriction = Literal["none", "stribeck"]
+Surface = Literal["plane", "tilted", "sphere", "none"]
+ContactKind = Literal["ideal", "bullet"]
+
+PRESS_FOR_DRY_FRICTION = 15.0  # N
+LIFT_SHARE_OF_BULLET = 0.08
 
 
 @dataclass(frozen=True, kw_only=True)
 class KukaSurfaceConfig:
-    """A KUKA LBR iiwa 14 slides its tool on a plane; viscous friction at the tool point is the force nobody models.
+    """A KUKA LBR iiwa 14 slides its tool on a surface; friction is the force nobody models.
 
-    Rath, Geist, Trimpe 2021, section 5, with the constants of their reference implementation. SI units and radians
-    unless a name says otherwise. Raises InvalidInput naming the field and its allowed range.
+    By default a plane and viscous friction at the tool point, as in Rath, Geist, Trimpe 2021, section 5, with the
+    constants of their reference implementation. SI units and radians unless a name says otherwise. Raises InvalidInput
+    naming the field and its allowed range.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -49,10 +67,55 @@ class KukaSurfaceConfig:
     joint_damping: float = 0.5
     """Viscous friction of every joint [Nms/rad]; subtracted from the commanded torque in the recorded `u`."""
 
+    surface: Surface = "plane"
+    """The plane z = surface_height; that plane tilted about the middle of the way-points' region; the top of a big
+    sphere that touches it there; or none: free motion above."""
     surface_height: float = 0.055
-    """The surface is the plane z = surface_height [m], an ideal bilateral constraint from the first touch on."""
-    friction: float = 1.0
-    """Viscous friction of the tool point on the surface [N/(m/s)], the force that no model knows."""
+    """Height of the surface in the middle of the way-points' region [m]."""
+    tilt_degrees: float = 10.0
+    """Angle of the tilted plane [deg]."""
+    tilt_axis: tuple[float, float] = (0.0, 1.0)
+    """Horizontal axis (x, y) about which it is tilted, right-handed."""
+    sphere_radius: float = 1.2
+    """Radius of the sphere [m]."""
+    clearance: float = 0.05
+    """How far above the plane the way-points lie where there is no surface [m]."""
+    contact: ContactKind = "ideal"
+    """ideal: a bilateral constraint from the first touch on. bullet: PyBullet's unilateral contact with Coulomb
+    friction, without restitution, which the tool leaves now and then."""
+
+    friction: Friction | None = None
+    """Friction of the tool on the surface, the force that no model knows: viscous; or coulomb or stribeck, which grow
+    with the normal force. None is viscous for an ideal contact and coulomb, its only law, for PyBullet's."""
+    viscous_coefficient: float = 1.0
+    """Viscous friction of the tool point on the surface [N/(m/s)]."""
+    coulomb_coefficient: float = 0.3
+    """Dry friction of the sliding tool per normal force."""
+    static_coefficient: float = 0.5
+    """Dry friction near rest per normal force (stribeck only)."""
+    stribeck_velocity: float = 0.15
+    """Speed over which the static coefficient falls to the sliding one [m/s]."""
+    friction_smoothing: float = 0.05
+    """Speed below which dry friction of the tool falls to zero [m/s]: a smooth sign, see `DryFriction`. The explicit
+    steps oscillate where `static_coefficient * normal force * patch_factor / friction_smoothing` exceeds some
+    450 N/(m/s), as on a patch of factor 4."""
+    patch_factor: float = 1.0
+    """How many times as large friction is on the patch; 1 for no patch."""
+    patch_x: tuple[float, float] = (0.0, 0.25)
+    """The patch is the strip of the surface with x in this range [m]."""
+    joint_friction: JointFriction = "none"
+    """Friction of the joints that is not part of `u`, in addition to the force at the tool."""
+    joint_coulomb: tuple[float, float, float, float, float, float, float] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)
+    """Coulomb friction of every joint [Nm]; small in the wrist, whose inertia carries no motors here: explicit steps
+    would oscillate under more."""
+    joint_static: tuple[float, float, float, float, float, float, float] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)
+    """Friction of every joint near rest [Nm]."""
+    joint_viscous: tuple[float, float, float, float, float, float, float] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)
+    """Viscous friction of every joint [Nms/rad] beyond `joint_damping`."""
+    joint_stribeck_velocity: float = 0.2
+    """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
+    joint_smoothing: float = 0.1
+    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign, see `JointStribeckFriction`."""
     baumgarte_omega: float = 10.0
     """Natural frequency of the constraint's stabilisation [rad/s]."""
     baumgarte_zeta: float = 1.0
@@ -79,23 +142,85 @@ class KukaSurfaceConfig:
     """Range of random way-points [m]."""
     waypoint_depth: float = 1e-4
     """How far below the surface the way-points lie, so that the tool presses on it [m]."""
+    press: float | None = None
+    """Force along the surface's normal that the controller adds [N]; None is 0 for viscous friction and
+    `PRESS_FOR_DRY_FRICTION` for the others, which need a normal force."""
+    lift_share: float | None = None
+    """Share of way-points that lie `lift_height` above the surface; None is `LIFT_SHARE_OF_BULLET` for PyBullet's
+    contact and 0 for an ideal one, which cannot be left."""
+    lift_height: float = 0.03
+    """Height of those way-points [m]."""
     segment_seconds: tuple[float, float] = (0.5, 1.0)
     """Range of the random time from one way-point to the next [s]."""
     least_acceleration: float = 0.5
     """Acceleration in the parabolic blends, unless a segment needs more to arrive in time [m/s^2]."""
 
     def __post_init__(self) -> None:
-        for name, (allowed, lower, upper) in _RANGES.items():
-            object.__setattr__(self, name, _numbers(name, getattr(self, name), allowed, lower, upper))
-        for name in ("waypoint_x", "waypoint_y", "segment_seconds"):
+        for name, allowed in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None or name not in ("press", "lift_share"):
+                object.__setattr__(self, name, checked_numbers(name, value, allowed, _LENGTHS.get(name)))
+        for name in ("waypoint_x", "waypoint_y", "segment_seconds", "patch_x"):
             first, second = getattr(self, name)
             if first > second:
                 raise InvalidInput(f"{name} is ({first}, {second}); the first must not exceed the second.")
-        _require_integer("seed", self.seed, 0, 2**63 - 1)
-        _require_integer("episodes", self.episodes, 1, 10_000)
+        require_integer("seed", self.seed, 0, 2**63 - 1)
+        require_integer("episodes", self.episodes, 1, 10_000)
         object.__setattr__(self, "null_space_joints", tuple(self.null_space_joints))
         for joint in self.null_space_joints:
-            _require_integer("null_space_joints", joint, 1, 7)
+            require_integer("null_space_joints", joint, 1, 7)
+        if self.friction is None:
+            object.__setattr__(self, "friction", "coulomb" if self.contact == "bullet" else "viscous")
+        for name, choices in _CHOICES.items():
+            require_choice(name, getattr(self, name), choices)
+        self._require_parts_that_fit()
+
+    def _require_parts_that_fit(self) -> None:
+        if not any(self.tilt_axis):
+            raise InvalidInput("tilt_axis is (0, 0); give a horizontal direction (x, y).")
+        corner = 0.5 * math.hypot(*(upper - lower for lower, upper in (self.waypoint_x, self.waypoint_y)))
+        if self.surface == "sphere" and self.sphere_radius < 1.5 * corner:
+            raise InvalidInput(
+                f"sphere_radius is {self.sphere_radius} m; it must be at least {1.5 * corner:.3g} m, one and a half "
+                "times the distance from the middle of the way-points' region to its corners."
+            )
+        if self.contact == "bullet":
+            if self.surface == "none":
+                raise InvalidInput("surface is 'none'; contact 'bullet' needs a surface: plane, tilted or sphere.")
+            if self.friction != "coulomb":
+                raise InvalidInput(f"friction is {self.friction!r}; contact 'bullet' has Coulomb friction: 'coulomb'.")
+        elif self.lift_share and self.surface != "none":
+            raise InvalidInput(
+                f"lift_share is {self.lift_share}; an ideal contact cannot be left. Use contact 'bullet', or 0."
+            )
+        if self.patch_factor != 1.0 and (self.contact == "bullet" or self.surface == "none"):
+            raise InvalidInput(
+                f"patch_factor is {self.patch_factor}; a patch needs a surface and an ideal contact (PyBullet has one "
+                "coefficient for a whole body). Use 1, or surface plane, tilted or sphere and contact ideal."
+            )
+
+    @property
+    def pressing_force(self) -> float:
+        """Force towards the surface that the controller adds [N]."""
+        if self.surface == "none":
+            return 0.0
+        if self.press is None:
+            return 0.0 if self.friction == "viscous" else PRESS_FOR_DRY_FRICTION
+        return self.press
+
+    @property
+    def waypoint_height(self) -> float:
+        """Height of way-points in the middle of their region [m], which follow the surface elsewhere."""
+        if self.surface == "none":
+            return self.surface_height + self.clearance
+        return self.surface_height - self.waypoint_depth
+
+    @property
+    def share_of_lifts(self) -> float:
+        """Share of way-points above the surface."""
+        if self.lift_share is None:
+            return LIFT_SHARE_OF_BULLET if self.contact == "bullet" else 0.0
+        return self.lift_share
 
     @property
     def rows_per_episode(self) -> int:
@@ -113,36 +238,51 @@ class KukaSurfaceConfig:
         return self.episodes * (self.settle_steps + self.rows_per_episode)
 
 
-_POSITIVE = ("finite and > 0", 1e-12, 1e9)
-_NOT_NEGATIVE = ("finite and >= 0", 0.0, 1e9)
-_FINITE = ("finite", -1e9, 1e9)
-_RANGES = {
+_RANGES: dict[str, Range] = {
     "seconds": ("from 0.1 to 1e5 s", 0.1, 1e5),
-    "noise": _NOT_NEGATIVE,
+    "noise": NOT_NEGATIVE,
     "time_step": ("from 1e-5 to 0.01 s", 1e-5, 0.01),
     "settle_seconds": ("from 0.5 to 1000 s", 0.5, 1e3),
-    "gravity": _FINITE,
-    "base_height": _FINITE,
-    "tool_mass": _POSITIVE,
-    "tool_center_of_mass": _FINITE,
-    "tool_inertia": _POSITIVE,
-    "tool_point": _FINITE,
-    "joint_damping": _NOT_NEGATIVE,
-    "surface_height": _FINITE,
-    "friction": _NOT_NEGATIVE,
-    "baumgarte_omega": _NOT_NEGATIVE,
-    "baumgarte_zeta": _NOT_NEGATIVE,
-    "start_degrees": _FINITE,
-    "torque_limits": _POSITIVE,
-    "controller_omega": _POSITIVE,
-    "controller_zeta": _NOT_NEGATIVE,
-    "null_space_stiffness": _NOT_NEGATIVE,
-    "null_space_damping": _NOT_NEGATIVE,
-    "waypoint_x": _FINITE,
-    "waypoint_y": _FINITE,
-    "waypoint_depth": _NOT_NEGATIVE,
+    "gravity": FINITE,
+    "base_height": FINITE,
+    "tool_mass": POSITIVE,
+    "tool_center_of_mass": FINITE,
+    "tool_inertia": POSITIVE,
+    "tool_point": FINITE,
+    "joint_damping": NOT_NEGATIVE,
+    "surface_height": FINITE,
+    "tilt_degrees": ("from -30 to 30", -30.0, 30.0),
+    "tilt_axis": FINITE,
+    "sphere_radius": ("from 1 to 1e6 m", 1.0, 1e6),
+    "clearance": POSITIVE,
+    "viscous_coefficient": NOT_NEGATIVE,
+    "coulomb_coefficient": NOT_NEGATIVE,
+    "static_coefficient": NOT_NEGATIVE,
+    "stribeck_velocity": POSITIVE,
+    "friction_smoothing": POSITIVE,
+    "patch_factor": NOT_NEGATIVE,
+    "patch_x": FINITE,
+    "press": NOT_NEGATIVE,
+    "lift_share": ("from 0 to 1", 0.0, 1.0),
+    "lift_height": NOT_NEGATIVE,
+    "joint_coulomb": NOT_NEGATIVE,
+    "joint_static": NOT_NEGATIVE,
+    "joint_viscous": NOT_NEGATIVE,
+    "joint_stribeck_velocity": POSITIVE,
+    "joint_smoothing": POSITIVE,
+    "baumgarte_omega": NOT_NEGATIVE,
+    "baumgarte_zeta": NOT_NEGATIVE,
+    "start_degrees": FINITE,
+    "torque_limits": POSITIVE,
+    "controller_omega": POSITIVE,
+    "controller_zeta": NOT_NEGATIVE,
+    "null_space_stiffness": NOT_NEGATIVE,
+    "null_space_damping": NOT_NEGATIVE,
+    "waypoint_x": FINITE,
+    "waypoint_y": FINITE,
+    "waypoint_depth": NOT_NEGATIVE,
     "segment_seconds": ("from 0.05 to 100 s", 0.05, 100.0),
-    "least_acceleration": _POSITIVE,
+    "least_acceleration": POSITIVE,
 }
 _LENGTHS = {
     "tool_center_of_mass": 3,
@@ -150,27 +290,18 @@ _LENGTHS = {
     "tool_point": 3,
     "start_degrees": 7,
     "torque_limits": 7,
+    "joint_coulomb": 7,
+    "joint_static": 7,
+    "joint_viscous": 7,
+    "tilt_axis": 2,
+    "patch_x": 2,
     "waypoint_x": 2,
     "waypoint_y": 2,
     "segment_seconds": 2,
 }
-
-
-def _numbers(name: str, value: Any, allowed: str, lower: float, upper: float) -> float | tuple[float, ...]:
-    """The value as float, or as a tuple of floats where the field has several."""
-    length = _LENGTHS.get(name)
-    values = tuple(value) if isinstance(value, tuple | list) else (value,)
-    if len(values) != (length or 1) or isinstance(value, tuple | list) != (length is not None):
-        raise InvalidInput(
-            f"{name} is {value!r}; it must be {f'{length} numbers' if length else 'one number'}, {allowed}."
-        )
-    for number in values:
-        valid = isinstance(number, int | float) and not isinstance(number, bool)
-        if not valid or not lower <= number <= upper:  # NaN fails every comparison
-            raise InvalidInput(f"{name} is {value!r}; it must be {allowed}.")
-    return tuple(float(number) for number in values) if length else float(values[0])
-
-
-def _require_integer(name: str, value: Any, lower: int, upper: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not lower <= value <= upper:
-        raise InvalidInput(f"{name} is {value!r}; it must be an integer from {lower} to {upper}.")
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "friction": get_args(Friction),
+    "joint_friction": get_args(JointFriction),
+    "surface": get_args(Surface),
+    "contact": get_args(ContactKind),
+}

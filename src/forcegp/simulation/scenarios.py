@@ -38,7 +38,7 @@ class Scenario:
 SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
     {
         "kuka-surface": Scenario(
-            summary="a KUKA iiwa slides its tool on a plane with viscous friction that nobody models",
+            summary="a KUKA iiwa slides its tool on a surface with friction that nobody models",
             config=KukaSurfaceConfig,
             function="forcegp.simulation.kuka_surface:simulate_kuka_surface",
         ),

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.tables import Table
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,15 +58,61 @@ class SegmentPath:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class PathOverTable:
+    """A path over a horizontal table, bent to follow the table's true height `h(x, y)`."""
+
+    path: SegmentPath
+    table: Table
+
+    @classmethod
+    def random(
+        cls,
+        config: KukaSurfaceConfig,
+        table: Table,
+        start: Float[np.ndarray, "3"],
+        seconds: float,
+        rng: np.random.Generator,
+        lifts: np.random.Generator,
+    ) -> PathOverTable:
+        """`random_path` over the table, from the true place `start` [m]."""
+        origin = np.array(start, dtype=np.float64)
+        origin[2] -= table.height(origin[None, :2])[0][0]
+        return cls(random_path(config, origin, seconds, rng, lifts), table)
+
+    def sample(
+        self, time: Float[np.ndarray, " times"]
+    ) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]:
+        """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; z and h by the chain rule."""
+        position, velocity, acceleration = self.path.sample(time)
+        height, gradient, hessian = self.table.height(position[:, :2])
+        rate = np.einsum("ti,ti->t", gradient, velocity[:, :2])
+        bend = np.einsum("ti,tij,tj->t", velocity[:, :2], hessian, velocity[:, :2])
+        position[:, 2] += height
+        velocity[:, 2] += rate
+        acceleration[:, 2] += np.einsum("ti,ti->t", gradient, acceleration[:, :2]) + bend
+        return position, velocity, acceleration
+
+
 def random_path(
-    config: KukaSurfaceConfig, start: Float[np.ndarray, "3"], seconds: float, rng: np.random.Generator
+    config: KukaSurfaceConfig,
+    start: Float[np.ndarray, "3"],
+    seconds: float,
+    rng: np.random.Generator,
+    lifts: np.random.Generator | None = None,
 ) -> SegmentPath:
-    """Random way-points just below the surface, from `start` [m], for at least `seconds` [s]."""
+    """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s].
+
+    `lifts` draws which of them lie `config.lift_height` higher (none without it); it is a generator of its own so that
+    equal seeds visit equal places with and without lifts.
+    """
     points, durations = [np.asarray(start, dtype=np.float64)], []
-    height = config.surface_height - config.waypoint_depth
     while sum(durations) < seconds:
         durations.append(rng.uniform(*config.segment_seconds))
+        lifted = lifts is not None and lifts.random() < config.share_of_lifts
+        height = config.waypoint_height + (config.lift_height if lifted else 0.0)
         points.append(np.array([rng.uniform(*config.waypoint_x), rng.uniform(*config.waypoint_y), height]))
     corners, times = np.array(points), np.array(durations)
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    return SegmentPath(corners, times, np.maximum(config.least_acceleration, 4.0 * lengths / times**2))
+    accelerations = np.maximum(config.least_acceleration, 4.0 * lengths / times**2)
+    return SegmentPath(corners, times, accelerations)

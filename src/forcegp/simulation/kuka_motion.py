@@ -1,0 +1,175 @@
+"""One episode of the `kuka-surface` scenario: controller, friction and contact in the loop, recorded row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from forcegp.errors import SimulationError
+from forcegp.simulation.bullet import BulletArm
+from forcegp.simulation.bullet_contact import BulletContact, with_tool_sphere
+from forcegp.simulation.contact_forces import ArmState, IdealContact, NoContact, ToolContact
+from forcegp.simulation.friction_laws import (
+    DryFriction,
+    JointStribeckFriction,
+    PointFriction,
+    RoughPatch,
+    ViscousFriction,
+)
+from forcegp.simulation.kuka_description import TOOL_LINK
+from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.tables import Table, table_of
+from forcegp.simulation.task_space_controller import TaskSpaceController
+from forcegp.simulation.trajectory import PathOverTable
+
+TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])
+"""Euler angles (0, -pi, 0) as a quaternion (x, y, z, w): the tool points straight down."""
+
+STEPS_PER_REPORT = 240
+DIVERGED = 100.0  # rad/s
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The recorded rows of one episode; forces are the true ones."""
+
+    q: Float[np.ndarray, "rows nv"]
+    v: Float[np.ndarray, "rows nv"]
+    u: Float[np.ndarray, "rows nv"]
+    a: Float[np.ndarray, "rows nv"]
+    multiplier: Float[np.ndarray, " rows"]
+    tool_force: Float[np.ndarray, "rows 3"]
+    tool_torques: Float[np.ndarray, "rows nv"]
+    joint_torques: Float[np.ndarray, "rows nv"]
+    in_contact: Bool[np.ndarray, " rows"]
+    gap: Float[np.ndarray, " rows"]
+    saturated: Bool[np.ndarray, " rows"]
+    time: Float[np.ndarray, " rows"]
+
+
+def random_stream(config: KukaSurfaceConfig, episode: int, stream: int) -> np.random.Generator:
+    """Stream 0 draws way-points, 1 noise, 2 lifts: independent of each other and of other episodes and seeds."""
+    return np.random.default_rng([config.seed, episode, stream])
+
+
+def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report: Callable[[int], None]) -> Motion:
+    """One continuous motion of the arm. `report(steps done)` is called now and then.
+
+    Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
+    """
+    settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
+    limits, table, controller = np.array(config.torque_limits), table_of(config), _controller(config)
+    joint_law = _joint_friction(config)
+    columns = {name: np.zeros((steps + 1, 7)) for name in ("q", "v", "u", "tool_torques", "joint_torques")}
+    tool_force, multiplier, gap = np.zeros((steps, 3)), np.zeros(steps), np.zeros(steps)
+    saturated, in_contact = np.zeros(steps, dtype=bool), np.zeros(steps, dtype=bool)
+    if config.contact == "bullet":
+        urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
+
+    with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
+        arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))
+        contact = _contact(config, table, arm)
+        streams = (random_stream(config, episode, stream) for stream in (0, 2))
+        tool = arm.tool(np.zeros(7))[0]
+        path = PathOverTable.random(config, table, tool, steps * config.time_step, *streams)
+        reference = path.sample(config.time_step * np.arange(steps))
+        for step in range(steps):
+            aim = (reference[0][step], reference[1][step], reference[2][step])
+            _require_bounded(config, arm.state()[1], episode, step)
+            state = ArmState.of(arm)
+            v = state.v
+            try:
+                wanted = controller.joint_acceleration(
+                    state.q, v, state.jacobian, state.bias_acceleration, state.position, state.quaternion, aim
+                )
+            except np.linalg.LinAlgError as error:
+                raise SimulationError(
+                    f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
+                    "Start from another posture (start_degrees) or keep the way-points nearer."
+                ) from error
+            asked = state.mass @ wanted + state.bias + config.joint_damping * v
+            if config.pressing_force:
+                asked = asked - config.pressing_force * (table.normal(state.position) @ state.jacobian[:3])
+            commanded = np.clip(asked, -limits, limits)
+            u = commanded - config.joint_damping * v
+            applied = u
+            if joint_law is not None:
+                columns["joint_torques"][step] = joint_law.force(v)
+                applied = u + columns["joint_torques"][step]
+            forces = contact.step(arm, state, applied)
+
+            columns["q"][step], columns["v"][step], columns["u"][step] = state.q, v, u
+            columns["tool_torques"][step] = forces.joint_friction_torques
+            tool_force[step], multiplier[step] = forces.friction, forces.normal_force
+            gap[step], in_contact[step] = table.distance(state.position), forces.acts
+            saturated[step] = (commanded != asked).any()
+            if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
+                report(step + 1)
+        columns["q"][steps], columns["v"][steps] = arm.state()
+        _require_bounded(config, columns["v"][steps], episode, steps)
+
+    if config.surface != "none" and not in_contact[: settle + 1].any():
+        raise SimulationError(
+            f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
+            "Give it more time, or a start posture nearer to the surface."
+        )
+    recorded = slice(settle, steps)
+    acceleration = np.diff(columns["v"], axis=0) / config.time_step
+    return Motion(
+        **{name: values[recorded] for name, values in columns.items()},
+        a=acceleration[recorded],
+        multiplier=multiplier[recorded],
+        tool_force=tool_force[recorded],
+        in_contact=in_contact[recorded],
+        gap=gap[recorded],
+        saturated=saturated[recorded],
+        time=config.time_step * np.arange(settle, steps),
+    )
+
+
+def _controller(config: KukaSurfaceConfig) -> TaskSpaceController:
+    selected = np.zeros(7)
+    selected[[joint - 1 for joint in config.null_space_joints]] = 1.0
+    return TaskSpaceController(
+        omega=config.controller_omega,
+        zeta=config.controller_zeta,
+        orientation=TOOL_ORIENTATION,
+        posture=np.deg2rad(config.start_degrees),
+        selected=selected,
+        stiffness=config.null_space_stiffness,
+        damping=config.null_space_damping,
+    )
+
+
+def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> ToolContact:
+    if config.surface == "none":
+        return NoContact()
+    if config.contact == "bullet":
+        return BulletContact(arm, table, config.coulomb_coefficient)
+    patch = None if config.patch_factor == 1.0 else RoughPatch(*config.patch_x, factor=config.patch_factor)
+    return IdealContact(table, _tool_friction(config), config.baumgarte_omega, config.baumgarte_zeta, patch)
+
+
+def _tool_friction(config: KukaSurfaceConfig) -> PointFriction:
+    if config.friction == "viscous":
+        return ViscousFriction(config.viscous_coefficient)
+    static = config.static_coefficient if config.friction == "stribeck" else config.coulomb_coefficient
+    return DryFriction(config.coulomb_coefficient, static, config.stribeck_velocity, config.friction_smoothing)
+
+
+def _joint_friction(config: KukaSurfaceConfig) -> JointStribeckFriction | None:
+    if config.joint_friction == "none":
+        return None
+    coulomb, static, viscous = map(np.array, (config.joint_coulomb, config.joint_static, config.joint_viscous))
+    return JointStribeckFriction(coulomb, static, viscous, config.joint_stribeck_velocity, config.joint_smoothing)
+
+
+def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:
+    if not np.abs(v).max() < DIVERGED:  # also NaN
+        raise SimulationError(
+            f"episode {episode} diverged after {step * config.time_step:.3g} s (joint velocity {np.abs(v).max():.3g} "
+            "rad/s). Use the published constants, a shorter time_step or a softer controller."
+        )

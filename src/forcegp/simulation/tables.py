@@ -1,0 +1,134 @@
+"""What the tool slides on: distance, normal and curvature in numpy, and the height that way-points follow."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from typing_extensions import override
+
+from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+
+if TYPE_CHECKING:
+    from forcegp.mechanics import Surface
+
+
+class Table(ABC):
+    """A surface above which the robot moves: a signed distance, positive above it, whose gradient is a unit normal."""
+
+    @abstractmethod
+    def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        """Signed distance of a point [m]."""
+
+    @abstractmethod
+    def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Outward unit normal."""
+
+    @abstractmethod
+    def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
+        """`p'^T s_pp p'` [m/s^2], the part of the distance's second derivative that is due to curvature."""
+
+    @abstractmethod
+    def height(
+        self, xy: Float[np.ndarray, "times 2"]
+    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+        """Height [m] above the surface's middle, its gradient and its Hessian [1/m] in x and y."""
+
+    @abstractmethod
+    def surface(self) -> Surface:
+        """The same for a `Contact`."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTable(Table):
+    """The plane through `middle` (3,) [m] with unit `upward` (3,), which is not horizontal."""
+
+    upward: Float[np.ndarray, "3"]
+    middle: Float[np.ndarray, "3"]
+
+    @property
+    def offset(self) -> float:
+        """`n . p` on the plane [m]."""
+        return float(self.upward @ self.middle)
+
+    @override
+    def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        return float(self.upward @ p - self.offset)
+
+    @override
+    def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        return self.upward
+
+    @override
+    def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
+        return 0.0
+
+    @override
+    def height(
+        self, xy: Float[np.ndarray, "times 2"]
+    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+        slope = -self.upward[:2] / self.upward[2]
+        return (xy - self.middle[:2]) @ slope, np.broadcast_to(slope, xy.shape), np.zeros((len(xy), 2, 2))
+
+    @override
+    def surface(self) -> Surface:
+        from forcegp.mechanics import Plane
+
+        x, y, z = self.upward.tolist()
+        return Plane((x, y, z), self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class SphericalTable(Table):
+    """The top of a sphere with `center` (3,) and `radius` [m]."""
+
+    center: Float[np.ndarray, "3"]
+    radius: float
+
+    @override
+    def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        return float(np.linalg.norm(p - self.center) - self.radius)
+
+    @override
+    def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        ray = p - self.center
+        return ray / np.linalg.norm(ray)
+
+    @override
+    def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
+        """`(|p'|^2 - (n . p')^2) / |p - center|`."""
+        return float((velocity @ velocity - (self.normal(p) @ velocity) ** 2) / np.linalg.norm(p - self.center))
+
+    @override
+    def height(
+        self, xy: Float[np.ndarray, "times 2"]
+    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+        """`h = sqrt(R^2 - r^2) - R`, `h_x = -r / (h + R)`, `h_xx = -(1 + h_x h_x^T) / (h + R)`."""
+        ray = xy - self.center[:2]
+        rise = np.sqrt(self.radius**2 - (ray**2).sum(axis=1))
+        gradient = -ray / rise[:, None]
+        hessian = -(np.eye(2) + gradient[:, :, None] * gradient[:, None, :]) / rise[:, None, None]
+        return rise - self.radius, gradient, hessian
+
+    @override
+    def surface(self) -> Surface:
+        from forcegp.mechanics import Sphere
+
+        x, y, z = self.center.tolist()
+        return Sphere((x, y, z), self.radius)
+
+
+def table_of(config: KukaSurfaceConfig) -> Table:
+    """The table of a scenario; for `surface="none"` the plane that way-points keep above."""
+    middle = np.array([np.mean(config.waypoint_x), np.mean(config.waypoint_y), config.surface_height])
+    if config.surface == "sphere":
+        return SphericalTable(middle - (0.0, 0.0, config.sphere_radius), config.sphere_radius)
+    upward = np.array([0.0, 0.0, 1.0])
+    if config.surface == "tilted":
+        angle, (x, y) = np.deg2rad(config.tilt_degrees), np.array(config.tilt_axis) / np.hypot(*config.tilt_axis)
+        # Rodrigues' formula for the vertical unit vector about the horizontal axis (x, y, 0).
+        upward = np.array([y * np.sin(angle), -x * np.sin(angle), np.cos(angle)])
+    return FlatTable(upward, middle)
