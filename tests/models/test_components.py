@@ -15,7 +15,7 @@ from forcegp.models import Noise, StructuredGP, load_posterior, save_posterior
 from forcegp.priors import ContactFriction, JointForces, JointFriction, Payload, ToolForces
 from forcegp.robots import Robot
 
-PRIOR = JointFriction() + ContactFriction(load=True) + Payload("hand", moments=False)
+PRIOR = JointFriction() + ContactFriction() + Payload("hand", moments=False)
 NOISE = 0.05
 TIP = (0.0, 0.0, 0.2)
 OTHER_CONTACTS = {
@@ -95,7 +95,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     mean, covariance = dense.latents(dense.scaled(dynamics))
     B = PRIOR.mixing(dynamics)
     components = moved.components(*states)
-    assert tuple(components) == ("joint-friction", "load-friction", "payload")
+    assert tuple(components) == ("joint-friction", "contact-friction", "payload")
     for name, which in zip(components, (slice(0, 3), slice(3, 4), slice(4, 5)), strict=True):
         part, b = components[name], B[..., which]
         own = covariance[:, which, which]
@@ -119,7 +119,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
         close(gaussian.mean, affine(components.total.mean))
         close(gaussian.covariance, affine.matrix @ B @ covariance @ B.mT @ affine.matrix.mT)
     if contacts == "none":
-        assert float(components["load-friction"].joint_force.mean.abs().max()) == 0.0
+        assert float(components["contact-friction"].joint_force.mean.abs().max()) == 0.0
     bare = moved.components(*states, covariance=False)
     assert torch.equal(bare.total.mean, components.total.mean)
     assert bare["payload"].joint_force.covariance is None
@@ -128,10 +128,10 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
 def test_components_of_any_batch_and_their_names(posterior, states):
     flat = posterior.components(*states)
     folded = posterior.components(*(x.reshape(2, 2, 3) for x in states))
-    close(folded["load-friction"].point_force.mean.reshape(4, 3), flat["load-friction"].point_force.mean, 1e-12)
+    close(folded["contact-friction"].point_force.mean.reshape(4, 3), flat["contact-friction"].point_force.mean, 1e-12)
     single = posterior.components(*(x[1].tolist() for x in states))
     close(single.total.covariance, flat.total.covariance[1], 1e-12)
-    assert flat["load-friction"].latent_units == ("",)
+    assert flat["contact-friction"].latent_units == ("N",)
     assert flat["joint-friction"].latent_names == ("pan", "lift", "bend")
     with pytest.raises(InvalidInput, match="no component 'joint-fricton' in this model; did you mean 'joint-friction'"):
         flat["joint-fricton"]
@@ -141,7 +141,7 @@ def test_components_of_any_batch_and_their_names(posterior, states):
 
 def test_a_curve_is_that_of_dense_conditioning(posterior, dense, train):
     v = torch.tensor(train.v)
-    for name, index in (("joint-friction lift", 1), ("load-friction sliding", 3)):
+    for name, index in (("joint-friction lift", 1), ("contact-friction sliding", 3)):
         curve = posterior.curve(name, points=7)
         assert curve.features.shape == (7, 1)
         z = [curve.features / scale if len(scale) else curve.features[:, :0] for scale in dense.scales]

@@ -15,6 +15,8 @@ from forcegp.priors import ForcePrior
 
 INVISIBLE = 1e-9
 """|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
+ROUNDING = 1e-12
+"""|M^-1 B_c| relative to the largest of them below which a latent moves nothing."""
 EQUAL = 1e-9
 """Relative difference of two latents' effects and features below which they are the same."""
 
@@ -22,9 +24,10 @@ EQUAL = 1e-9
 def check_prior(likelihood: MarginalLikelihood) -> None:
     """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
 
-    Raises InvalidInput if no latent changes the acceleration at any training point, if all features of a latent are
-    constant (a tool or joint that never moves), and if latents of two terms do the same in every row. Warns
-    (DataWarning) of single features that are constant, and of latents that the constraint hides while others show.
+    Raises InvalidInput if no latent changes the acceleration at any training point, if all of one term do nothing at
+    all, if all features of a latent are constant (a tool or joint that never moves), and if latents of two terms do the
+    same in every row. Warns (DataWarning) of single features that are constant, and of latents that move nothing or
+    that the constraint hides while others show.
     """
     names = likelihood.prior.latent_names(likelihood.system.robot)
     if not names:
@@ -34,9 +37,9 @@ def check_prior(likelihood: MarginalLikelihood) -> None:
     features = likelihood.prior.features(dynamics)
     _check_features(likelihood, names, features)
     effect = dynamics.H @ B
-    _check_visible(names, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
     terms = [number for number, (*_, which) in enumerate(_terms(likelihood)) for _ in range(which.stop - which.start)]
-    _check_distinct(names, terms, effect, likelihood.standardization(features))
+    shows = _check_visible(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
+    _check_distinct(names, terms, shows, effect, likelihood.standardization(features))
 
 
 def _terms(likelihood: MarginalLikelihood) -> list[tuple[str, ForcePrior, slice]]:
@@ -69,23 +72,34 @@ def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], featur
             f"{some} never changes in the training rows, so nothing is learned of how {_few(latents)} depends on it; "
             "leave that input out (inputs=...), or give data in which it changes",
             DataWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
-def _check_visible(names: Sequence[str], free: Tensor, effect: Tensor) -> None:
-    """`free` is what each latent would do without the contacts, `effect` what it does with them (N, nv, C)."""
+def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> list[bool]:
+    """Which latents show; `free` is what each would do without the contacts, `effect` what it does (N, nv, C)."""
     size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
-    none = [name for name, value in zip(names, size.tolist(), strict=True) if value == 0.0]
-    if none:
-        raise InvalidInput(
-            f"{_few(none)} exerts no force at any training row; check frame, point and contact of the prior, or leave "
-            "it out"
+    absent = (size <= ROUNDING * size.max()).tolist()
+    for term in set(terms):
+        own = [index for index, number in enumerate(terms) if number == term]
+        if all(absent[index] for index in own):
+            raise InvalidInput(
+                f"{_few([names[index] for index in own])} exerts no force at any training row; check frame, point and "
+                "contact of the prior, or leave it out"
+            )
+    if any(absent):
+        warnings.warn(
+            f"{_few([name for name, nothing in zip(names, absent, strict=True) if nothing])} moves no joint at any "
+            "training row, so what the model says about it is its prior; give data in other postures, or leave it out "
+            "if the prior can do without",
+            DataWarning,
+            stacklevel=5,
         )
-    hidden = shown <= INVISIBLE * size
-    blind = [name for name, flat in zip(names, hidden.tolist(), strict=True) if flat]
+    hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
+    blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
     remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
-    if len(blind) == len(names):
+    shows = [not (nothing or flat) for nothing, flat in zip(absent, hidden, strict=True)]
+    if not any(shows):
         raise InvalidInput(
             f"no data can identify {_few(blind)}: the contacts take the whole force, and the acceleration shows none "
             f"of it; {remedy}"
@@ -95,18 +109,21 @@ def _check_visible(names: Sequence[str], free: Tensor, effect: Tensor) -> None:
             f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
             f"what the model says about it and about the normal force is its prior; {remedy}",
             DataWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
+    return shows
 
 
-def _check_distinct(names: Sequence[str], terms: Sequence[int], effect: Tensor, features: Sequence[Tensor]) -> None:
+def _check_distinct(
+    names: Sequence[str], terms: Sequence[int], shows: Sequence[bool], effect: Tensor, features: Sequence[Tensor]
+) -> None:
     """Latents of two terms with the same effect on the same features are one function; data see only their sum."""
     columns = effect.flatten(0, 1)
     norms = torch.linalg.vector_norm(columns, dim=0)
     cosines = (columns.mT @ columns) / torch.outer(norms, norms).clamp_min(torch.finfo(columns.dtype).tiny)
     for first, second in torch.nonzero(torch.triu(cosines.abs() > 1.0 - EQUAL, diagonal=1)).tolist():
         one, other = features[first], features[second]
-        if terms[first] == terms[second]:
+        if terms[first] == terms[second] or not (shows[first] and shows[second]):
             continue  # joints that the constraint couples; one prior knows that its latents are independent
         if one.shape == other.shape and bool(((one - other).abs() <= EQUAL * (1.0 + one.abs())).all()):
             raise InvalidInput(

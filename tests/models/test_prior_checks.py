@@ -1,0 +1,251 @@
+"""What no data can teach is said before the fit, with the names of what is concerned and what to do about it."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.errors import DataWarning, InvalidInput, UnknownFrame, UnknownJoint
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, Plane
+from forcegp.models import Noise, StructuredGP
+from forcegp.priors import (
+    ContactFriction,
+    JointForces,
+    JointFriction,
+    NoForces,
+    Payload,
+    PeriodicJointForces,
+    SumPrior,
+    ToolForces,
+)
+from forcegp.robots import Robot
+
+ONCE = OptimizerOptions(iterations=1)
+TIP = (0.0, 0.0, 0.2)
+TABLE = (Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.4)),)
+
+
+class Drive(JointFriction):
+    """The same functions with the other sign."""
+
+    def mixing(self, dynamics):
+        return -super().mixing(dynamics)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(12, 1)
+
+
+@pytest.fixture(scope="module")
+def on_a_table():
+    return arm_data(12, 1, arm_system().with_contacts(TABLE))
+
+
+def fit(data, prior, **changes):
+    return StructuredGP(data.system, prior, **changes).fit(data, restarts=1, options=ONCE)
+
+
+def with_columns(data, **columns):
+    return dataclasses.replace(data, truth={}, **columns)
+
+
+@pytest.mark.parametrize("prefix", ["", "tool-friction "], ids=["alone", "in-a-sum"])
+def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
+    prior = ToolForces("hand", TIP, axes="world")
+    prior = prior + JointFriction() if prefix else prior
+    with pytest.warns(DataWarning) as caught:
+        posterior = fit(on_a_table, prior)
+    (message,) = [str(warning.message) for warning in caught]
+    assert message.startswith(f"no data can identify '{prefix}force-z': the contacts take that force")
+    assert "use axes='surface', which leaves out the normal direction" in message
+    force = posterior.components(on_a_table.q, on_a_table.v, on_a_table.u)["tool-friction"].latents
+    states = [torch.tensor(x) for x in (on_a_table.q, on_a_table.v, on_a_table.u)]
+    z = posterior.likelihood.standardization(prior.features(on_a_table.system.dynamics(*states)))[2]
+    prior_variance = list(posterior.latent.kernels)[2](z, diag=True)
+    torch.testing.assert_close(force.mean[:, 2], torch.zeros(12).double(), rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(force.variance[:, 2], prior_variance.detach(), rtol=1e-6, atol=0.0)
+
+
+def test_along_the_surface_nothing_is_hidden(on_a_table):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(on_a_table, ToolForces() + JointFriction())
+
+
+@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
+def test_two_loads_that_weigh_the_same_everywhere_are_one(data):
+    """The origin of the hand lies on the z axis of the fore arm."""
+    with pytest.raises(InvalidInput, match="no data can tell 'payload-1 mass' and 'payload-2 moment-z' apart"):
+        fit(data, Payload("hand") + Payload("fore"))
+
+
+def test_all_hidden_is_refused(data):
+    """A point that is held along all three axes holds the whole arm."""
+    robot = data.system.robot
+    q = torch.tensor(data.q[:1]).expand(12, 3).clone()
+    tip = Contact("hand", TIP, TABLE[0].surface).position(robot.kinematics(q))[0]
+    normals = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    walls = [Plane(normal, float(tip[axis])) for axis, normal in enumerate(normals)]
+    held = data.system.with_contacts([Contact("hand", TIP, wall) for wall in walls])
+    rows = with_columns(data, q=q.numpy(), system=held)
+    with pytest.raises(InvalidInput, match=r"^no data can identify 'pan', 'lift', 'bend': the contacts take"):
+        fit(rows, JointFriction())
+    with (
+        pytest.warns(DataWarning, match="^'moment-y' moves no joint"),
+        pytest.raises(InvalidInput, match="no data can identify 'mass', 'moment-x', 'moment-z': the contacts take"),
+    ):
+        fit(rows, Payload("hand"))
+
+
+def test_a_force_that_moves_no_joint_is_pointed_out(data):
+    """All axes of the arm lie in one plane with gravity or across it: a mass beside that plane moves nothing."""
+    with pytest.warns(DataWarning, match="^'moment-y' moves no joint at any training row.* data in other postures"):
+        posterior = fit(data, Payload("hand"))
+    moment = posterior.components(data.q, data.v, data.u)["payload"].latents
+    assert float(moment.mean[:, 2].abs().max()) < 1e-6
+    with pytest.warns(DataWarning, match="^'payload mass', 'payload moment-y' moves no joint"):
+        fit(data, Payload("fore") + JointFriction())
+
+
+def test_a_term_that_moves_no_joint_is_refused(data):
+    with pytest.raises(InvalidInput, match=r"^'payload mass', 'payload moment-x', .* exerts no force at any training"):
+        fit(data, JointFriction() + Payload("upper"))
+    with pytest.raises(InvalidInput, match=r"^'mass' exerts no force .* check frame, point and contact"):
+        fit(data, Payload("fore", moments=False))
+
+
+def test_an_input_that_never_changes_is_pointed_out(data):
+    still = with_columns(data, u=np.full((12, 3), 2.0) + data.u * [1.0, 0.0, 1.0])
+    with pytest.warns(DataWarning) as caught:
+        fit(still, JointForces())
+    (message,) = [str(warning.message) for warning in caught]
+    assert message.startswith("u of lift [Nm] never changes in the training rows")
+    assert "how 'pan', 'lift', 'bend' depends on it; leave that input out (inputs=...)" in message
+    with pytest.warns(DataWarning, match=r"^u of pan \[Nm\], u of lift \[Nm\], u of bend \[Nm\] never changes"):
+        fit(with_columns(data, u=np.ones((12, 3))), ToolForces(inputs=("velocity", "u")))
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (JointFriction(), r"latent 'lift' depends on velocity of lift \[rad/s\], which is the same in all 12"),
+        (
+            PeriodicJointForces() + JointForces(("u",)),
+            "latent 'periodic-joint-forces lift' depends on position of",
+        ),
+        (JointFriction() + ContactFriction(), "latent 'joint-friction lift'"),
+    ],
+    ids=["friction", "ripple", "sum"],
+)
+def test_a_joint_that_never_moves_teaches_nothing_of_its_own(data, prior, message):
+    free = data.system.with_contacts([])
+    moving = np.array([1.0, 0.0, 1.0])
+    stuck = with_columns(data, q=data.q * moving, v=data.v * moving, system=free)
+    if isinstance(prior, SumPrior) and ContactFriction() in prior.terms:
+        stuck = with_columns(data, v=data.v * moving)
+    with pytest.raises(InvalidInput, match=message) as caught:
+        fit(stuck, prior)
+    assert "give data in which it changes, or leave this prior (or this joint) out" in str(caught.value)
+    others = JointFriction(("pan", "bend"))
+    fit(stuck, others)
+
+
+@pytest.mark.parametrize("prior", [ToolForces(), ContactFriction()], ids=["tool", "contact"])
+def test_a_tool_that_never_moves_has_no_friction(data, prior):
+    with pytest.raises(InvalidInput, match=r"depends on .*\[m/s\], which is the same in all 12 training rows \("):
+        fit(with_columns(data, v=np.zeros((12, 3))), prior)
+
+
+@pytest.mark.parametrize(
+    ("prior", "error", "message"),
+    [
+        (
+            ToolForces("base", axes="world"),
+            InvalidInput,
+            "ToolForces acts on frame 'base', which is fixed",
+        ),
+        (Payload("base"), InvalidInput, "give a frame of a moving link: upper, fore, hand"),
+        (ToolForces("tool", axes="tool"), UnknownFrame, "no frame 'tool'"),
+        (JointFriction(("pna",)), UnknownJoint, "did you mean 'pan'"),
+        (PeriodicJointForces(joints=("elbow",)), UnknownJoint, "Valid joints: bend, lift, pan"),
+        (ContactFriction(contact=1), InvalidInput, "contact 1, but the system has 1 contacts .numbered from 0."),
+        (JointFriction() + ToolForces(contact=2), InvalidInput, "acts at contact 2"),
+    ],
+    ids=lambda value: value.title if hasattr(value, "title") else "",
+)
+def test_a_prior_that_does_not_fit_the_system_is_refused_before_any_data(data, prior, error, message):
+    with pytest.raises(error, match=message):
+        StructuredGP(data.system, prior)
+
+
+@pytest.mark.parametrize(
+    "prior", [ToolForces(), ContactFriction(), ToolForces("hand", axes="world", inputs=("load",))], ids=["a", "b", "c"]
+)
+def test_forces_of_a_contact_need_one(prior):
+    with pytest.raises(InvalidInput, match=r"but the system has no contact; give the contact \(--contact\), or use a"):
+        StructuredGP(arm_system(contacts=0), prior)
+    StructuredGP(arm_system(contacts=0), ToolForces("hand", axes="world"))
+
+
+def test_a_weight_needs_gravity(data):
+    weightless = data.system.with_robot(Robot.from_urdf_text(data.system.robot.urdf_text, gravity=(0.0, 0.0, 0.0)))
+    with pytest.raises(InvalidInput, match="the robot's gravity is zero; leave it out or set gravity"):
+        StructuredGP(weightless, Payload("hand"))
+
+
+def test_equal_terms_are_refused_and_sums_of_one(data):
+    with pytest.raises(InvalidInput, match="the sum has 'joint-friction' twice, which no data can tell apart"):
+        JointFriction() + ContactFriction() + JointFriction()
+    with pytest.raises(InvalidInput, match="a SumPrior has 1 terms; give two or more, or use the prior itself"):
+        SumPrior((JointFriction(),))
+
+
+@pytest.mark.parametrize(
+    ("prior", "names"),
+    [
+        (JointFriction() + JointFriction(("lift",)), "'joint-friction-1 lift' and 'joint-friction-2 lift'"),
+        (JointFriction(("pan",)) + JointFriction(("pan",), kernel="linear"), "'joint-friction-1 pan' and"),
+        (JointForces(("v",)) + JointForces(("v",), kernel="deep"), "'joint-forces-1 pan' and 'joint-forces-2 pan'"),
+        (PeriodicJointForces(1.0) + PeriodicJointForces(2.0), "'periodic-joint-forces-1 pan'"),
+        (JointFriction() + Drive(), "'joint-friction pan' and 'drive pan'"),
+        (
+            ContactFriction(axes="two-axis") + ContactFriction(axes="two-axis", kernel="linear"),
+            "'contact-friction-1 tang",
+        ),
+        (ToolForces(torque=True) + ToolForces(), "'tool-friction-1 force-tangent-1' and 'tool-friction-2 force-tang"),
+    ],
+    ids=["joints", "kernels", "inputs", "periods", "signs", "kernels-of-contacts", "torque"],
+)
+def test_the_same_function_in_two_terms_is_refused(data, prior, names):
+    with pytest.raises(InvalidInput, match=f"no data can tell {names}.* apart: .* leave one of them out"):
+        fit(data, prior)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        JointFriction() + JointForces(("v",)),
+        JointFriction() + JointForces(),
+        ContactFriction() + ContactFriction(axes="two-axis"),
+        JointFriction(("pan",)) + JointFriction(("lift",)),
+        JointFriction() + NoForces(),
+        NoForces(),
+    ],
+    ids=["inputs", "all", "axes", "joints", "nothing", "none"],
+)
+def test_terms_that_differ_are_fitted_without_a_word(data, prior):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(data, prior)
+
+
+def test_no_residual_at_all_is_refused(data):
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    exact = with_columns(data, a=data.system.dynamics(*states).acceleration_map().offset.numpy())
+    with pytest.raises(InvalidInput, match="the accelerations equal the mean exactly, so no unknown force"):
+        fit(exact, JointFriction(), noise=Noise(0.1))
