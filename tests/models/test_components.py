@@ -284,3 +284,7 @@ def test_one_prior_alone_is_one_component(train, states):
         components = fitted.components(*states)
         assert tuple(components) == (name,)
         close(components[name].joint_force.covariance, components.total.covariance, 1e-12)
+        dynamics = train.system.dynamics(*states)
+        curve = fitted.curve(fitted.latent_names[0], prior.features(dynamics)[0])  # standardised or only scaled
+        close(curve.mean, components[name].latents.mean[:, 0], 1e-10)
+        close(curve.std, components[name].latents.std[:, 0], 1e-8)
