@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int
 
 from forcegp.data import Dataset
+from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 
 
@@ -41,11 +42,29 @@ def _warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
                 f"training and test rows come from the same recording (equal metadata, episodes {shared} in both), "
                 "so these scores flatter the model; test on another trajectory."
             )
+    yield from system_warnings(posterior, dataset)
+
+
+def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+    """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy."""
     own, model = dataset.system, posterior.system
-    if own is not None and (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte):
-        yield (
-            "the contacts of the model are not those of the data; the constraint error is measured on those of the data"
+    if own is None:
+        return
+    contacts = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
+    # inertias that were identified are meant to differ from those that the data came with
+    robots = "learned" not in posterior.settings and not own.robot.tree.equals(model.robot.tree)
+    if not contacts and not robots:
+        return
+    what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
+    are, those = ("are", "those") if contacts else ("is", "that")
+    measured = f"; the constraint error is measured on {those} of the data" if contacts else ""
+    remedy = ""
+    if isinstance(posterior, StructuredPosterior) and not (robots and posterior.carries_known_forces):
+        remedy = (
+            "; to predict what the forces do there, carry the model over: posterior.with_system(dataset.system), on "
+            "the command line --system data"
         )
+    yield f"the {what} of the model {are} not {those} of the data{measured}{remedy}"
 
 
 def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
