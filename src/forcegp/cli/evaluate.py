@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
@@ -37,8 +38,10 @@ class Evaluate(Command):
     """The dataset to predict (HDF5)."""
     every: Annotated[int, arg(metavar="K")] = 1
     """Take every K-th row only."""
+    system: SystemChoice = "model"
+    """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
     plots: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: no plots)")] = None
-    """Also draw predictions, tool path and training into this folder, with the scores as evaluation.json."""
+    """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
     overwrite: bool = False
     """Replace the folder of plots if forcegp wrote it."""
     json: Json = False
@@ -51,27 +54,39 @@ class Evaluate(Command):
         if self.plots is not None:
             require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
         from forcegp.data import Dataset
+        from forcegp.evaluation import force_scores, normal_force_rests_on_prior
         from forcegp.models import load_posterior
 
         posterior = load_posterior(self.run_folder)
         dataset = Dataset.load(self.data).rows(slice(None, None, self.every))
+        posterior = carried_over(terminal, posterior, dataset, self.system)
         evaluation = score(terminal, posterior, dataset)
+        forces = force_scores(posterior, dataset)
+        rests_on_prior = normal_force_rests_on_prior(posterior)
         scores = {
             "run": str(self.run_folder),
             "data": str(self.data),
             "every": self.every,
+            "system": self.system,
             "model": posterior.description,
             "points": len(posterior.training.q),
             **evaluation.to_dict(),
+            "forces": forces.to_dict(),
+            "normal_force_rests_on_prior": rests_on_prior,
         }
         if self.plots is not None:
             with folder_written_whole(self.plots) as folder:
                 folder.mkdir()
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
-                write_config(folder, KIND, {"options": {name: scores[name] for name in ("run", "data", "every")}})
+                options = ("run", "data", "every", "system")
+                write_config(folder, KIND, {"options": {name: scores[name] for name in options}})
             terminal.note(f"plots: {self.plots}")
-        terminal.say(*_report(posterior, evaluation, dataset, self.data))
+        from forcegp.cli.tables import NORMAL_FORCES, NORMAL_FORCES_KNOWN, NORMAL_FORCES_SEEN, force_facts
+
+        learned = NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
+        told = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
+        terminal.say(*_report(posterior, evaluation, dataset, self.data, told))
         return scores
 
 
@@ -89,7 +104,10 @@ def score(terminal: Terminal, posterior: Posterior, dataset: Dataset, name: str 
 def draw(terminal: Terminal, folder: Path, posterior: Posterior, dataset: Dataset) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
     from forcegp.evaluation import (
+        curve_panels,
+        friction_curves_figure,
         likelihood_figure,
+        normal_force_figure,
         prediction_figure,
         save_figure,
         summary_figure,
@@ -105,6 +123,10 @@ def draw(terminal: Terminal, folder: Path, posterior: Posterior, dataset: Datase
     if posterior.system.contacts:
         figures["tool_path.png"] = lambda: tool_path_figure(posterior, dataset)
         figures["summary.png"] = lambda: summary_figure(posterior, dataset)
+        if posterior.speaks_of_forces:
+            figures["normal_force.png"] = lambda: normal_force_figure(posterior, dataset)
+    if curve_panels(posterior):
+        figures["forces.png"] = lambda: friction_curves_figure(posterior, dataset)
     with terminal.progress("drawing") as report:
         for done, (name, figure) in enumerate(figures.items()):
             report(done, len(figures), name)
@@ -112,13 +134,25 @@ def draw(terminal: Terminal, folder: Path, posterior: Posterior, dataset: Datase
     return list(figures)
 
 
-def _report(posterior: Posterior, evaluation: Evaluation, dataset: Dataset, data: Path) -> list[Any]:
-    from forcegp.cli.tables import NORMAL_FORCES, evaluation_table, facts, multiplier_scores, number
+def _learns_forces(posterior: Posterior) -> bool:
+    """False for known forces alone."""
+    from forcegp.models import StructuredPosterior
+
+    return not isinstance(posterior, StructuredPosterior) or bool(posterior.latent_names)
+
+
+def _report(
+    posterior: Posterior, evaluation: Evaluation, dataset: Dataset, data: Path, forces: Mapping[str, str]
+) -> list[Any]:
+    from forcegp.cli.tables import evaluation_table, facts, number
 
     points = len(posterior.training.q)
     units = dataset.units["a"]
     unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
-    title = f"{points} training points, {posterior.description}; {evaluation.rows} rows of {data}; errors in {unit}"
+    where = "" if posterior.target is None else ", carried to the robot and contacts of the data"
+    title = (
+        f"{points} training points, {posterior.description}{where}; {evaluation.rows} rows of {data}; errors in {unit}"
+    )
     floor = "" if evaluation.noise_floor is None else f" (a perfect model has {number(evaluation.noise_floor)})"
     values = {
         "MAE": f"{number(evaluation.mae)}{floor}",
@@ -128,6 +162,4 @@ def _report(posterior: Posterior, evaluation: Evaluation, dataset: Dataset, data
     }
     if evaluation.force_mae is not None:
         values["force that moves the robot"] = f"MAE {number(evaluation.force_mae)} against the truth"
-    if evaluation.multiplier_mae is not None:
-        values["contact force (multiplier)"] = f"{multiplier_scores(evaluation)}; {NORMAL_FORCES}"
-    return [evaluation_table(title, evaluation), facts("", values)]
+    return [evaluation_table(title, evaluation), facts("", {**values, **forces})]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
@@ -50,6 +51,8 @@ class Rollout(Command):
     """Begin at so many rows, spread evenly over the recording."""
     seconds: Annotated[float, arg(metavar="S")] = 1.0
     """How long each motion lasts."""
+    system: SystemChoice = "model"
+    """Robot and contacts to roll out: model, those that it was trained with; data, those of the recording."""
     integrator: Annotated[str, arg(metavar="NAME")] = "symplectic-euler"
     """symplectic-euler (as in PyBullet), rk4, or projected (contacts hold exactly)."""
     baumgarte: Annotated[str, arg(metavar="OMEGA[,ZETA]|none")] = "none"
@@ -69,7 +72,7 @@ class Rollout(Command):
         baumgarte = parse_baumgarte(self.baumgarte)
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
         from forcegp.data import Dataset
-        from forcegp.evaluation import recorded_motions, rollout_errors
+        from forcegp.evaluation import recorded_motions, rollout_errors, system_warnings
         from forcegp.models import load_posterior
 
         posterior = load_posterior(self.run_folder)
@@ -79,6 +82,9 @@ class Rollout(Command):
                 f"{self.data} has joints {', '.join(dataset.joint_names)}; the model was trained on "
                 f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
             )
+        posterior = carried_over(terminal, posterior, dataset, self.system)
+        for sentence in system_warnings(posterior, dataset):
+            terminal.warn(sentence)
         recorded = recorded_motions(dataset, rows, self.seconds)
         begun = time.process_time()
         with terminal.progress(f"rolling out: {len(recorded.rows)} motions of {recorded.time[-1]:.3g} s") as report:
@@ -131,6 +137,7 @@ class Rollout(Command):
             "seconds": float(errors.time[-1]),
             "steps": steps,
             "unit": dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m",
+            "system": self.system,
             "integrator": self.integrator,
             "baumgarte": None if baumgarte is None else {"omega": baumgarte.omega, "zeta": baumgarte.zeta},
             "samples": self.samples,
@@ -171,7 +178,7 @@ class Rollout(Command):
         stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
         title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
         save_figure(rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png")
-        options = ("run", "data", "rows", "seconds", "integrator", "baumgarte", "samples", "seed")
+        options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
         write_config(folder, KIND, {"options": {name: summary[name] for name in options}})
 
 

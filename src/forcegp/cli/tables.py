@@ -10,11 +10,13 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from forcegp.evaluation import Evaluation
+    from forcegp.evaluation import Evaluation, ForceScore, ForceScores
 
 
 NONE = "–"
 NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
+NORMAL_FORCES_KNOWN = "it follows from the known forces alone"
+NORMAL_FORCES_SEEN = "this prior leaves no force along the contact normal free, so accelerations decide it"
 
 
 def facts(title: str, values: Mapping[str, str]) -> Table:
@@ -82,6 +84,29 @@ def multiplier_scores(evaluation: Evaluation) -> str:
     """`MAE 1.2345 N, 90.1 % in the 95 % band`, against the true multipliers."""
     inside = percent(evaluation.multiplier_coverage_95)
     return f"MAE {number(evaluation.multiplier_mae)} N, {inside} in the 95 % band"
+
+
+def force_facts(scores: ForceScores, normal_forces: str) -> dict[str, str]:
+    """One line per force that the truth knows: its errors relative to its size, and whether the intervals hold.
+
+    `normal_forces` says what the multiplier rests on.
+    """
+    values = {f"{name}, at the joints": _force_scores(score) for name, score in scores.joint_force.items()}
+    values |= {f"{name}, at its point": _force_scores(score) for name, score in scores.point_force.items()}
+    if scores.multiplier is not None:
+        told = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
+        values["contact force (multiplier)"] = told
+    return values
+
+
+def _force_scores(score: ForceScore) -> str:
+    """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
+    if score.relative_rmse is None:
+        error = f"{number(score.rmse)} (the true force is zero)"
+    else:
+        share = 100.0 * score.relative_rmse
+        error = f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %"
+    return f"RMS error {error}, {percent(score.coverage_95)} in the 95 % band"
 
 
 def number(value: float | None) -> str:

@@ -1,0 +1,32 @@
+"""The option --system: predict under the robot and contacts of the model, or under those of the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+from forcegp.cli.terminal import Terminal
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset
+    from forcegp.models import Posterior
+
+SystemChoice = Literal["model", "data"]
+
+
+def carried_over(terminal: Terminal, posterior: Posterior, dataset: Dataset, choice: SystemChoice) -> Posterior:
+    """The posterior for the chosen system.
+
+    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data,
+    which is said on stderr. Raises InvalidInput where the data know no system or the model cannot move there.
+    """
+    if choice == "model":
+        return posterior
+    if dataset.system is None:
+        raise InvalidInput("--system data: the data know no robot and contacts; leave the option out.")
+    if "learned" not in posterior.settings:
+        return posterior.with_system(dataset.system)
+    terminal.note("--system data: contacts of the data; the robot stays the identified one")
+    there = dataset.system
+    return posterior.with_system(replace(posterior.system, contacts=there.contacts, baumgarte=there.baumgarte))
