@@ -46,7 +46,7 @@ def test_the_committed_page_is_made_of_the_committed_numbers(repository):
     folder = repository / "docs" / "reproduction"
     experiments = PRESETS["paper"]
     documents = {experiment.name: read_document(folder / f"{experiment.name}.json") for experiment in experiments}
-    assert (repository / "docs" / "reproduction.md").read_text() == report(experiments, documents, "reproduction")
+    assert (repository / "docs" / "reproduction.md").read_text() == report(experiments, documents)
     for experiment in experiments:
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))

@@ -18,10 +18,11 @@ from forcegp.errors import InvalidInput
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce(Command):
-    """Compute figures of Rath, Geist, Trimpe (2021), with error bars, beside the published values.
+    """Compute figures of Rath, Geist, Trimpe (2021) beside the published values, and what goes beyond the paper.
 
-    FIGURE is fig2b, fig2c, fig3, fig4, extrapolation, ablation or all. Every finished piece of work is kept in the
-    folder; after an interruption the same command goes on from there.
+    FIGURE is fig2b, fig2c, fig3, fig4, extrapolation, ablation or all; with the presets of force priors it is
+    data-efficiency, friction, transfer, unilateral-contact, deep-kernel or all. Every finished piece of work is kept in
+    the folder; after an interruption the same command goes on from there.
 
     For instance:
       forcegp reproduce all --preset smoke
@@ -33,12 +34,13 @@ class Reproduce(Command):
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""
-    preset: Annotated[str, arg(metavar="smoke|paper")] = "smoke"
-    """smoke: small, in a few minutes, to see that everything works. paper: the full experiments, CPU-hours."""
+    preset: Annotated[str, arg(metavar="smoke|paper|forces|forces-smoke")] = "smoke"
+    """smoke: small, in a few minutes, to see that everything works. paper: the full experiments, CPU-hours.
+    forces: what priors that know what a force is are worth; forces-smoke: the same, small."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reproduction-PRESET)")] = None
     """The folder of results; an unfinished one is gone on with."""
     docs: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: only into --out)")] = None
-    """Write the page reproduction.md, its figures, JSON and CSV into this folder, too."""
+    """Write the page (reproduction.md, force-priors.md), its figures, JSON and CSV into this folder, too."""
     points: Annotated[tuple[int, ...], arg(metavar="N", help_behavior_hint="(default: the preset's)")] = ()
     """Other numbers of training points."""
     seeds: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: the preset's)")] = ()
@@ -54,8 +56,9 @@ class Reproduce(Command):
             raise InvalidInput(f"--jobs is {self.jobs}; give at least 1.")
         if any(seed < 0 for seed in self.seeds):
             raise InvalidInput(f"--seeds are {self.seeds}; give numbers of at least 0.")
+        from forcegp.experiments.pages import page_of
         from forcegp.experiments.presets import experiments_of
-        from forcegp.experiments.reproduction import BESIDE, page_name, reproduce
+        from forcegp.experiments.reproduction import page_name, reproduce
 
         start = time.monotonic()
         experiments = experiments_of(self.preset, self.figure)
@@ -76,7 +79,8 @@ class Reproduce(Command):
                 progress=report,
             )
         terminal.say(
-            f"{out / page_name(experiments)} tells what was found; figures, JSON and CSV lie in {out / BESIDE}."
+            f"{out / page_name(experiments, self.preset)} tells what was found; figures, JSON and CSV lie in "
+            f"{out / page_of(self.preset).name}."
         )
         terminal.note(f"{time.monotonic() - start:.0f} s")
         return {"out": str(out), "preset": self.preset, "figures": summaries}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.experiments.ablation import Ablation
+from forcegp.experiments.data_efficiency import DataEfficiency
+from forcegp.experiments.deep_kernel import DeepKernel
 from forcegp.experiments.experiment import DataSettings, Experiment
 from forcegp.experiments.extrapolation import Extrapolation
 from forcegp.experiments.fig2b import Fig2b
@@ -11,6 +13,9 @@ from forcegp.experiments.fig2c import Fig2c
 from forcegp.experiments.fig3 import Fig3
 from forcegp.experiments.fig4 import Fig4
 from forcegp.experiments.fits import FitSettings
+from forcegp.experiments.friction import Friction
+from forcegp.experiments.transfer import Transfer
+from forcegp.experiments.unilateral_contact import UnilateralContact
 
 PAPER_DATA = DataSettings(train_seconds=200.0, rows=10_000, test_seconds=100.0, every=12)
 SMOKE_DATA = DataSettings(train_seconds=10.0, rows=400, test_seconds=12.0, every=12)
@@ -20,6 +25,10 @@ SMOKE_SEARCH = FitSettings(restarts={"0": 1}, iterations=15, tolerance={"0": 1e-
 
 # Seeds that served no choice made elsewhere in this project.
 PAPER_SEEDS = (101, 102, 103, 104, 105)
+
+# Seeds that served no choice of a prior or kernel.
+FORCE_SEEDS = (301, 302, 303, 304, 305)
+FORCE_DATA = DataSettings(train_seconds=100.0, rows=400, test_seconds=40.0, every=12)
 
 PAPER_POINTS = (100, 200, 400, 600, 800, 1000)
 SMOKE_POINTS = (20, 40)
@@ -79,6 +88,22 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
         Fig4(data=SMOKE_DATA, points=SMOKE_POINTS, seeds=(101,), starts=2, seconds=(0.1, 0.2), settings=SMOKE_SEARCH),
         Extrapolation(data=SMOKE_DATA, points=30, seeds=(101,), settings=SMOKE_SEARCH),
         Ablation(data=SMOKE_DATA, points=SMOKE_POINTS, seeds=(101,), settings=SMOKE_SEARCH, cutoffs=(30.0,), steps=20),
+    ),
+    "forces": (
+        DataEfficiency(data=FORCE_DATA, points=(10, 20, 50, 100), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
+        Friction(data=FORCE_DATA, points=(200,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
+        Transfer(data=FORCE_DATA, points=(100,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
+        UnilateralContact(data=FORCE_DATA, points=(200,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
+        DeepKernel(data=FORCE_DATA, points=(200,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
+    ),
+    "forces-smoke": (
+        DataEfficiency(
+            data=SMOKE_DATA, points=(10, 20), seeds=(201,), settings=SMOKE_SEARCH, region_points=SMOKE_POINTS[0]
+        ),
+        Friction(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        Transfer(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        UnilateralContact(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        DeepKernel(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
     ),
 }
 

@@ -1,4 +1,4 @@
-"""The page `reproduction.md`: every number on it comes from the results."""
+"""The page of a preset: every number on it comes from the results."""
 
 from __future__ import annotations
 
@@ -7,31 +7,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from forcegp.experiments.experiment import Experiment, markdown_table
-
-INTRODUCTION = """Rath, Geist and Trimpe, "Using Physics Knowledge for Learning Rigid-body Forward Dynamics with \
-Gaussian Process Force Priors" (CoRL 2021), figure by figure, and what goes beyond it. This page, its tables and its \
-figures are written by
-
-    {command}
-
-and never by hand; the numbers lie beside it as JSON and CSV. Every pair of training and test trajectory has its own \
-way-points and noise, so no test row is a training row. Medians over seeds come with the least and the largest value."""
+from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 
 
-def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]], beside: str) -> str:
-    """Markdown from the documents of the experiments: one section for each, then the times.
-
-    `beside` is the folder of the figures, relative to the page.
-    """
+def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]]) -> str:
+    """Markdown from the documents of the experiments: one section for each, then the times."""
     preset = documents[experiments[0].name]["preset"]
-    parts = ["# Reproduction of the paper"]
-    parts.append(INTRODUCTION.format(command=documents[experiments[0].name]["command"]))
-    if preset != "paper":
+    page = page_of(preset)
+    parts = [f"# {page.title}"]
+    parts.append(page.introduction.format(command=documents[experiments[0].name]["command"]))
+    if preset in TRIAL_PRESETS:
         parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers say nothing about the models.**")
     for experiment in experiments:
         document = documents[experiment.name]
         parts.append(f"## {experiment.title}")
-        parts += [f"![{experiment.title}]({beside}/{name}.png)" for name in document["figures"]]
+        parts += [f"![{experiment.title}]({page.name}/{name}.png)" for name in document["figures"]]
         parts.append(experiment.section(document["summary"]))
         parts += _warnings(document["warnings"])
     seconds = {name: value for document in documents.values() for name, value in document["cpu_seconds"].items()}

@@ -16,14 +16,12 @@ from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.evaluation import save_figure
 from forcegp.experiments.cells import Progress, run_cells
 from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.pages import page_of
 from forcegp.experiments.report import report
 from forcegp.experiments.results import KIND, Results, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-BESIDE = "reproduction"
-"""The folder beside the page with its figures, JSON and CSV."""
 
 
 def reproduce(
@@ -38,8 +36,9 @@ def reproduce(
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
-    Writes the page (`page_name`) and, in `reproduction/`, `<name>.json`, `<name>.csv` and the figures as PNG and SVG,
-    into `out` and, if given, into `docs`, too. `command` is what the page says that it was written by.
+    Writes the page (`page_name`) and, in the folder of its name (`page_of`), `<name>.json`, `<name>.csv` and the
+    figures as PNG and SVG, into `out` and, if given, into `docs`, too. `command` is what the page says that it was
+    written by.
     Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and as
     `Results.open` and `run_cells`.
     """
@@ -47,7 +46,7 @@ def reproduce(
         experiment.require_possible()
     results = Results.open(out, preset)
     for root in (out, docs) if docs is not None else (out,):
-        _make_folder(root / BESIDE)
+        _make_folder(root / page_of(preset).name)
     cells = {cell.name: cell for experiment in experiments for cell in experiment.cells()}
     run_cells(results, list(cells.values()), jobs, progress)
     documents, pictures, tables = {}, {}, {}
@@ -70,30 +69,31 @@ def reproduce(
         pictures |= figures
         tables[experiment.name] = as_csv(experiment.rows(summary))
     for root in (out, docs) if docs is not None else (out,):
-        _publish(root, experiments, documents, pictures, tables)
+        _publish(root, preset, experiments, documents, pictures, tables)
     return {name: document["summary"] for name, document in documents.items()}
 
 
 def _publish(
     root: Path,
+    preset: str,
     experiments: Sequence[Experiment],
     documents: Mapping[str, Mapping[str, Any]],
     pictures: Mapping[str, Figure],
     tables: Mapping[str, str],
 ) -> None:
-    beside = root / BESIDE
+    beside = root / page_of(preset).name
     for name, figure in pictures.items():
         save_figure(figure, beside / f"{name}.png")
         save_vector(figure, beside / f"{name}.svg")
     for name, document in documents.items():
         write_json(beside / f"{name}.json", document)
         write_text(beside / f"{name}.csv", tables[name])
-    write_text(root / page_name(experiments), report(experiments, documents, BESIDE))
+    write_text(root / page_name(experiments, preset), report(experiments, documents))
 
 
-def page_name(experiments: Sequence[Experiment]) -> str:
+def page_name(experiments: Sequence[Experiment], preset: str) -> str:
     """`reproduction.md` for all experiments, `fig3.md` for one: a part does not take the place of the whole."""
-    return f"{experiments[0].name}.md" if len(experiments) == 1 else "reproduction.md"
+    return f"{experiments[0].name}.md" if len(experiments) == 1 else f"{page_of(preset).name}.md"
 
 
 def _make_folder(folder: Path) -> None:

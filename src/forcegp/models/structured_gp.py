@@ -28,6 +28,7 @@ from forcegp.models.fit_arguments import (
     training_rows,
 )
 from forcegp.models.identification import Identification
+from forcegp.models.load_refinement import fit_with_refined_loads
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import Noise
 from forcegp.models.objective import LOG_VARIANCE_SPREAD, FitObjective, with_variance_priors
@@ -124,13 +125,43 @@ class StructuredGP(Model):
             costs 2 w x^2. 0 is no prior.
         progress: called as progress(restart, iteration, nll) with jobs = 1.
 
+        Where the prior has a friction that is proportional to the normal force, and no `expected` friction is given,
+        the fit is repeated with the normal force under the friction that was found, until it settles (not with
+        `learn`).
+
         Raises
         ------
         InvalidInput: the dataset does not fit the system, or an argument is out of range.
         ContactError: a contact cannot hold at some row, or no row touches its surface.
         FitError: no restart could be evaluated; the message names the cause.
         """
+        how = {"seed": seed, "hyperprior": hyperprior, "options": options, "jobs": jobs, "progress": progress}
         rows = training_rows(self.system.robot.joint_names, dataset, points)
+        first = self._fit(rows, dataset, restarts, start, learn, prior_strength, **how)
+        if learn is not None:
+            return first
+
+        def again(prior: ForcePrior, last: StructuredPosterior) -> StructuredPosterior:
+            return replace(self, prior=prior)._fit(rows, dataset, 1, last.parameters, None, 0.0, **how)
+
+        return fit_with_refined_loads(first, again)
+
+    def _fit(
+        self,
+        rows: Dataset,
+        dataset: Dataset,
+        restarts: int | None,
+        start: Mapping[str, Tensor] | None,
+        learn: Learned | Sequence[Learned] | None,
+        prior_strength: float,
+        *,
+        seed: int,
+        jobs: int,
+        hyperprior: bool,
+        options: OptimizerOptions | None,
+        progress: FitProgress | None,
+    ) -> StructuredPosterior:
+        """`fit` to these rows of the dataset with the prior as it is."""
         noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, jobs, seed)
@@ -270,5 +301,5 @@ def _check_distance(system: MechanicalSystem, training: TrainingData) -> None:
                 f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
                 "rows in contact only (forcegp.data.rows_in_contact)",
                 DataWarning,
-                stacklevel=3,
+                stacklevel=4,
             )

@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.priors.expected_friction import ExpectedFriction
 from forcegp.priors.force_prior import ForcePrior, Scaling
 from forcegp.priors.joint_forces import kernels_of
 from forcegp.priors.kernels import check_kernel
@@ -38,7 +39,9 @@ class ContactFriction(ForcePrior):
     Isotropic: f = g(|v_t|) v_t / |v_t| with one latent g on the sliding speed. Two-axis: one latent per tangent, each
     on the velocity along its own. With `load` the friction is proportional to the nominal normal force (what the
     contact would carry under the known forces alone, `nominal_normal_force`), and the latents are friction coefficients
-    without unit; the closer the known forces are to all forces, the better that load is. The kernel "friction" is
+    without unit. Friction changes the normal force in turn: `expected` counts with a friction coefficient (a number, or
+    `ExpectedFriction`), and where it is None `StructuredGP.fit` finds it by itself, by fitting again with what it has
+    learned (`refined_loads`). The kernel "friction" is
     Coulomb, Stribeck and viscous friction with a learned velocity scale (see `JointFriction`). Without the contact
     there is no friction.
     """
@@ -49,6 +52,7 @@ class ContactFriction(ForcePrior):
     contact: int = 0
     axes: str = "isotropic"
     load: bool = False
+    expected: ExpectedFriction | None = None
     kernel: str = "friction"
 
     def __post_init__(self) -> None:
@@ -57,6 +61,9 @@ class ContactFriction(ForcePrior):
                 f"ContactFriction has axes {self.axes!r} and contact {self.contact!r}; give 'isotropic' or 'two-axis', "
                 "and a contact's number from 0."
             )
+        if self.expected is not None and not self.load:
+            raise InvalidInput("ContactFriction has an expected friction but no load; give load=True, or leave it out")
+        object.__setattr__(self, "expected", ExpectedFriction.of(self.expected))
         check_kernel(self.kernel)
 
     @property
@@ -85,12 +92,11 @@ class ContactFriction(ForcePrior):
             return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, self._count)
         tangents, sliding = self._sliding(dynamics)
         if self.axes == "isotropic":
-            speed = (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
-            directions = tangents @ (sliding / speed)[..., None]
+            directions = tangents @ _direction(sliding)
         else:
             directions = tangents
         if self.load:
-            directions = nominal_normal_force(dynamics, self.contact)[..., None, None] * directions
+            directions = self._normal_force(dynamics, tangents, sliding)[..., None, None] * directions
         return -directions
 
     @override
@@ -100,7 +106,7 @@ class ContactFriction(ForcePrior):
         _, sliding = self._sliding(dynamics)
         if self.axes == "two-axis":
             return sliding[..., :1], sliding[..., 1:]
-        return ((sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt(),)
+        return (_speed(sliding),)
 
     @override
     def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
@@ -133,3 +139,17 @@ class ContactFriction(ForcePrior):
         where = ToolPoint.of_contact(dynamics, self.contact)
         tangents = contact_axes(dynamics, self.contact)[..., :2]
         return tangents, (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]
+
+    def _normal_force(self, dynamics: ConstrainedDynamics, tangents: Tensor, sliding: Tensor) -> Tensor:
+        if self.expected is None:
+            return nominal_normal_force(dynamics, self.contact)
+        direction = (tangents @ _direction(sliding))[..., 0]
+        return self.expected.normal_force(dynamics, self.contact, direction, _speed(sliding)[..., 0])
+
+
+def _speed(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
+    return (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
+
+
+def _direction(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2 1"]:
+    return (sliding / _speed(sliding))[..., None]

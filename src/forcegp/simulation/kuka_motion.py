@@ -62,7 +62,7 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table, controller = np.array(config.torque_limits), table_of(config), _controller(config)
-    joint_law = _joint_friction(config)
+    joint_law = joint_friction_of(config)
     columns = {name: np.zeros((steps + 1, 7)) for name in ("q", "v", "u", "tool_torques", "joint_torques")}
     tool_force, multiplier, gap = np.zeros((steps, 3)), np.zeros(steps), np.zeros(steps)
     saturated, in_contact = np.zeros(steps, dtype=bool), np.zeros(steps, dtype=bool)
@@ -150,17 +150,19 @@ def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> ToolCon
     if config.contact == "bullet":
         return BulletContact(arm, table, config.coulomb_coefficient)
     patch = None if config.patch_factor == 1.0 else RoughPatch(*config.patch_x, factor=config.patch_factor)
-    return IdealContact(table, _tool_friction(config), config.baumgarte_omega, config.baumgarte_zeta, patch)
+    return IdealContact(table, tool_friction_of(config), config.baumgarte_omega, config.baumgarte_zeta, patch)
 
 
-def _tool_friction(config: KukaSurfaceConfig) -> PointFriction:
+def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
+    """The law of the ideal contact."""
     if config.friction == "viscous":
         return ViscousFriction(config.viscous_coefficient)
     static = config.static_coefficient if config.friction == "stribeck" else config.coulomb_coefficient
     return DryFriction(config.coulomb_coefficient, static, config.stribeck_velocity, config.friction_smoothing)
 
 
-def _joint_friction(config: KukaSurfaceConfig) -> JointStribeckFriction | None:
+def joint_friction_of(config: KukaSurfaceConfig) -> JointStribeckFriction | None:
+    """The law of the joints beyond what is subtracted from `u`; None without one."""
     if config.joint_friction == "none":
         return None
     coulomb, static, viscous = map(np.array, (config.joint_coulomb, config.joint_static, config.joint_viscous))

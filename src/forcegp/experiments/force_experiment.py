@@ -1,0 +1,155 @@
+"""What the experiments on force priors share: trials (a model on a scenario), their cells, and summaries over seeds."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from typing_extensions import override
+
+from forcegp.experiments.cells import Cell
+from forcegp.experiments.experiment import DataSettings, Experiment, Row, spread
+from forcegp.experiments.fits import FitSettings, fit_cost
+from forcegp.experiments.force_scenarios import SCENARIOS
+from forcegp.experiments.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TASKS = "forcegp.experiments.force_cells"
+TEST_SEED = 1000
+"""The test trajectory of seed k has seed k + 1000."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One model on one scenario.
+
+    prior: expression of `forcegp.priors.named_prior`, or a model of `force_cells`; tests: label -> scenario that the
+    model is scored on, under that scenario's contacts; region: train at tool x < 0, test at x > 0.1 m.
+    """
+
+    label: str
+    scenario: str
+    prior: str
+    points: int
+    tests: Mapping[str, str] = field(default_factory=dict)
+    mean: str = "analytical"
+    region: bool = False
+
+    @property
+    def name(self) -> str:
+        """Unique among the trials of all experiments with the same data."""
+        place = "-extrapolation" if self.region else ""
+        prior = self.prior.replace("/", "-").replace(" ", "")
+        tested = "-".join(sorted({scenario for scenario in self.tests.values() if scenario != self.scenario}))
+        return f"{self.scenario}{place}/{prior}-{self.mean}{f'-on-{tested}' if tested else ''}/n{self.points}"
+
+
+@dataclass(frozen=True)
+class ForceExperiment(Experiment):
+    """Trials on seeds; a subclass says which trials, and tells what came out."""
+
+    data: DataSettings
+    points: tuple[int, ...]
+    seeds: tuple[int, ...]
+    settings: FitSettings
+
+    @abstractmethod
+    def trials(self) -> list[Trial]:
+        """Every model on every scenario."""
+
+    @override
+    def cells(self) -> list[Cell]:
+        out: dict[str, Cell] = {}
+        for seed in self.seeds:
+            for trial in self.trials():
+                train = self.data_cell(trial.scenario, seed, training=True)
+                tests = {
+                    label: self.data_cell(name, seed, training=False) for label, name in self._tests(trial).items()
+                }
+                spec = {
+                    "train": train.name,
+                    "tests": {label: cell.name for label, cell in tests.items()},
+                    "prior": trial.prior,
+                    "mean": trial.mean,
+                    "points": trial.points,
+                    "region": trial.region,
+                    "seed": seed,
+                    **self.settings.of(trial.points),
+                }
+                after = (train.name, *(cell.name for cell in tests.values()))
+                cost = 0.3 * fit_cost("s-gp", trial.points, spec)
+                for cell in (train, *tests.values(), Cell(trial_name(trial, seed), f"{TASKS}:fit", spec, after, cost)):
+                    out[cell.name] = cell
+        return list(out.values())
+
+    @override
+    def summary(self, results: Results) -> dict[str, Any]:
+        return {"points": list(self.points), "trials": [self._summarized(results, trial) for trial in self.trials()]}
+
+    def _summarized(self, results: Results, trial: Trial) -> dict[str, Any]:
+        found = [results.result(trial_name(trial, seed)) for seed in self.seeds]
+        tests = {}
+        for label in self._tests(trial):
+            names = dict.fromkeys(name for cell in found for name in cell["tests"][label])
+            tests[label] = {name: spread(cell["tests"][label].get(name) for cell in found) for name in names}
+        coverages = [curve["coverage"] for cell in found for curve in cell["curves"].values()]
+        return {
+            "label": trial.label,
+            "scenario": trial.scenario,
+            "prior": trial.prior,
+            "points": trial.points,
+            "region": trial.region,
+            "tests": tests,
+            "curve_coverage": spread(coverages),
+            "curve_coverage_of_seeds": spread(
+                _mean([curve["coverage"] for curve in cell["curves"].values()]) for cell in found if cell["curves"]
+            ),
+            "leave_one_out": spread(cell["leave_one_out"] for cell in found),
+            "search_seconds": spread(cell["search"]["cpu_seconds"] for cell in found),
+        }
+
+    @override
+    def rows(self, summary: Mapping[str, Any]) -> list[Row]:
+        return [
+            {key: trial[key] for key in ("label", "scenario", "prior", "points")}
+            | {"extrapolation": int(trial["region"]), "tested_on": label}
+            | {
+                f"{name}_{part}": None if value is None else value[part]
+                for name, value in scores.items()
+                for part in ("median", "min", "max")
+            }
+            for trial in summary["trials"]
+            for label, scores in trial["tests"].items()
+        ]
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+        return {}
+
+    def _tests(self, trial: Trial) -> Mapping[str, str]:
+        return trial.tests or {trial.scenario: trial.scenario}
+
+    def data_cell(self, scenario: str, seed: int, *, training: bool) -> Cell:
+        """The trajectory of that scenario and seed."""
+        spec = {
+            "scenario": dict(SCENARIOS[scenario]),
+            "seed": seed if training else TEST_SEED + seed,
+            "seconds": self.data.train_seconds if training else self.data.test_seconds,
+            "rows": self.data.rows if training else None,
+            "every": self.data.every,
+        }
+        kind = "train" if training else "test"
+        return Cell(f"force-data/{scenario}/{kind}/seed{seed}", f"{TASKS}:simulate", spec, cost=0.15 * spec["seconds"])
+
+
+def trial_name(trial: Trial, seed: int) -> str:
+    """Where the cell of a trial lies."""
+    return f"force-fits/{trial.name}/seed{seed}"
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

@@ -1,0 +1,105 @@
+"""The normal force that friction is proportional to, when friction itself changes it: expected friction as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.priors.joint_friction import joint_indices
+from forcegp.priors.tool_point import ToolPoint
+
+SMALLEST_SHARE = 0.1
+"""Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""
+
+
+@dataclass(frozen=True)
+class TabulatedCurve:
+    """Values over one velocity, in between and beyond linear: (at, values), `at` increasing."""
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    at: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("at", "values"):
+            object.__setattr__(self, name, tuple(float(entry) for entry in getattr(self, name)))
+        if len(self.at) < 2 or len(self.at) != len(self.values) or any(b <= a for a, b in pairwise(self.at)):
+            raise InvalidInput(
+                f"a tabulated curve has {len(self.at)} places and {len(self.values)} values; give two or more of each, "
+                "places increasing"
+            )
+
+    def __call__(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """The value at x; differentiable in x, with steps in the derivative at the places."""
+        at, values = (torch.tensor(part, dtype=x.dtype, device=x.device) for part in (self.at, self.values))
+        right = torch.searchsorted(at, x.detach().contiguous()).clamp(1, len(at) - 1)
+        slope = (values[right] - values[right - 1]) / (at[right] - at[right - 1])
+        return values[right - 1] + slope * (x - at[right - 1])
+
+
+@dataclass(frozen=True)
+class ExpectedFriction:
+    """What is expected of the friction that changes a normal force.
+
+    sliding: friction coefficient over the sliding speed (m/s); joints: joint name -> resisting force (Nm or N) over the
+    joint's velocity.
+    """
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    sliding: TabulatedCurve
+    joints: tuple[tuple[str, TabulatedCurve], ...] = ()
+
+    @classmethod
+    def of(cls, given: object) -> ExpectedFriction | None:
+        """None, a coefficient that holds at all speeds, an `ExpectedFriction`, or what files hold of one."""
+        if given is None or isinstance(given, ExpectedFriction):
+            return given
+        try:
+            if isinstance(given, Mapping):
+                joints = tuple((str(name), TabulatedCurve(**curve)) for name, curve in given["joints"])
+                return cls(TabulatedCurve(**given["sliding"]), joints)
+            return cls(TabulatedCurve((0.0, 1.0), (float(given),) * 2))  # type: ignore[arg-type]  # errors below
+        except (TypeError, ValueError, KeyError):
+            message = f"expected is {given!r}; give a friction coefficient, an ExpectedFriction, or None"
+            raise InvalidInput(message) from None
+
+    def normal_force(
+        self,
+        dynamics: ConstrainedDynamics,
+        contact: int,
+        direction: Float[Tensor, "*batch 3"],
+        speed: Float[Tensor, "*batch"],
+    ) -> Float[Tensor, "*batch"]:
+        """|normal force| in N under the known forces and the expected friction.
+
+        With the multiplier lambda_0 under known forces and joint friction, and sliding along the unit vector d with the
+        coefficient mu, lambda = lambda_0 - mu |s_p lambda| g, where g = (d lambda / d Q_U) J_p^T d, so that
+        |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g).
+        """
+        state, multiplier = dynamics.state, dynamics.multiplier_map()
+        robot = state.kinematics.robot
+        rows = multiplier.matrix[..., contact, :]
+        free = multiplier.offset[..., contact]
+        for index, (_, curve) in zip(joint_indices([name for name, _ in self.joints], robot), self.joints, strict=True):
+            free = free - rows[..., index] * curve(state.v[..., index])
+        size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
+        J = ToolPoint.of_contact(dynamics, contact).jacobian[..., :3, :]
+        g = (rows * (J.mT @ direction[..., None])[..., 0]).sum(-1)
+        growth = 1.0 + free.sign() * self.sliding(speed) * size * g
+        return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
+
+
+Table = Callable[[str], TabulatedCurve]
+"""Name of a latent -> its posterior mean over the velocities that the data visited."""

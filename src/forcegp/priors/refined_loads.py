@@ -1,0 +1,45 @@
+"""Friction that grows with the normal force, and the normal force that changes with friction: one step towards both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from forcegp.priors.contact_friction import ContactFriction
+from forcegp.priors.expected_friction import ExpectedFriction, Table
+from forcegp.priors.force_prior import ForcePrior, SumPrior
+from forcegp.priors.joint_friction import JointFriction
+from forcegp.robots import Robot
+
+
+def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior | None:
+    """The same prior, where every load-dependent isotropic `ContactFriction` expects the friction in `table`.
+
+    A first fit takes the normal force under the known forces alone; its posterior mean of the sliding friction, and of
+    the `JointFriction` beside it in the sum, tells a better one, with which a second fit finds better curves, and so
+    on. None for priors without such a term.
+    """
+    terms = prior.summands()
+    names = prior.latent_names(robot)
+    slices = prior.slices(robot) if isinstance(prior, SumPrior) else (slice(0, len(names)),)
+    if not any(_has_load(term) for term in terms):
+        return None
+    joints = tuple(
+        (joint, table(latent))
+        for term, which in zip(terms, slices, strict=True)
+        if isinstance(term, JointFriction)
+        for joint, latent in zip(term.latent_names(robot), names[which], strict=True)
+    )
+    refined = tuple(
+        _expecting(term, ExpectedFriction(table(names[which][0]), joints)) if _has_load(term) else term
+        for term, which in zip(terms, slices, strict=True)
+    )
+    return refined[0] if len(refined) == 1 else SumPrior(refined)
+
+
+def _has_load(term: ForcePrior) -> bool:
+    return isinstance(term, ContactFriction) and term.load and term.axes == "isotropic"
+
+
+def _expecting(term: ForcePrior, expected: ExpectedFriction) -> ContactFriction:
+    assert isinstance(term, ContactFriction), "terms with a load are contact frictions"
+    return replace(term, expected=expected)
