@@ -28,7 +28,7 @@ def test_simulate_writes_the_dataset_that_its_summary_describes(workshop):
     assert summary["config"]["seed"] == data.metadata["config"]["seed"] == 1
     np.testing.assert_array_equal(data.noise_std, summary["noise_std"])
     np.testing.assert_array_equal(data.noise_std, np.full(7, 0.1))
-    assert sorted(summary["truth"]) == ["Q_U", "a", "lambda"]
+    assert set(summary["truth"]) == {"Q_U", "Q_U.tool-friction", "a", "force.tool-friction", "lambda"}
     assert Dataset.load(workshop / "test.h5").metadata["config"]["seed"] == 2
 
 
@@ -75,9 +75,10 @@ def test_evaluate_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert len({len(line.split()) for line in lines}) == 1
     assert "mean" in done.stdout
     told = " ".join(done.stdout.split())
-    assert re.search(r"multiplier\) MAE \S+ N, \S+ % in the 95 % band; forces along the contact normal rest on", told)
+    assert re.search(r"multiplier\) MAE \S+ N, RMS error \S+ %, \S+ % in the 95 % band; forces along the", told)
+    assert "contact normal rest on the prior alone" in told
     names = {file.name for file in figures.iterdir()}
-    pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png"}
+    pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png", "normal_force.png"}
     assert names == pictures | {"evaluation.json", "config.json"}
     assert all((figures / name).read_bytes().startswith(PNG) for name in pictures)
     assert json.loads((figures / "evaluation.json").read_text())["rows"] == 480
@@ -116,6 +117,7 @@ def test_every_model_is_fitted_scored_and_drawn_by_the_same_commands(workshop, f
     assert (scores["unknown_force_mae"] is None) == (scores["multiplier_mae"] is None) == black_box
     assert (scores["constraint_error"] > 1e-6) == black_box
     pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png"}
+    pictures |= set() if black_box else {"normal_force.png"}
     assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json"}
     shown = forcegp("evaluate", run, "test.h5", "--every", 40, folder=workshop)
     assert shown.returncode == 0, shown.stderr
