@@ -96,7 +96,7 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     from forcegp.evaluation import evaluate
 
     assert test.system is not None, "simulated data carry their system"
-    if hasattr(posterior, "with_system"):
+    if posterior.speaks_of_forces:
         posterior = posterior.with_system(test.system)
     out = evaluate(posterior, test).to_dict()
     kept = {name: out[name] for name in ("mae", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae")}
