@@ -1,5 +1,6 @@
 """Measured data: the `Dataset`, its file format, splits, sampling and filtering."""
 
+from forcegp.data.contact_rows import contact_rows, rows_in_contact
 from forcegp.data.dataset import Dataset
 from forcegp.data.farthest_points import farthest_point_sampling, farthest_rows
 from forcegp.data.filtering import (
@@ -19,6 +20,7 @@ __all__ = [
     "REVOLUTE_UNITS",
     "Dataset",
     "FrozenDict",
+    "contact_rows",
     "differentiate",
     "differentiated",
     "farthest_point_sampling",
@@ -26,6 +28,7 @@ __all__ = [
     "low_pass",
     "require_disjoint",
     "resample",
+    "rows_in_contact",
     "time_blocks",
     "train_test_split",
     "uniform_step",
