@@ -33,7 +33,16 @@ if TYPE_CHECKING:
         load_posterior,
         save_posterior,
     )
-    from forcegp.priors import JointAccelerations, JointForces, NoForces
+    from forcegp.priors import (
+        ContactFriction,
+        JointAccelerations,
+        JointForces,
+        JointFriction,
+        NoForces,
+        Payload,
+        PeriodicJointForces,
+        ToolForces,
+    )
     from forcegp.robots import Robot
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -61,6 +70,11 @@ __all__ = [
     "simulate_kuka_surface",
     # what is unknown, and the model that learns it
     "JointForces",
+    "JointFriction",
+    "PeriodicJointForces",
+    "ToolForces",
+    "ContactFriction",
+    "Payload",
     "JointAccelerations",
     "NoForces",
     "Noise",
@@ -83,7 +97,8 @@ _ROOMS = {
     "mechanics": {"MechanicalSystem", "Contact", "Plane", "Sphere", "Cylinder", "ImplicitSurface", "Baumgarte"}
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"},
     "data": {"Dataset"},
-    "priors": {"JointForces", "JointAccelerations", "NoForces"},
+    "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}
+    | {"JointAccelerations", "NoForces"},
     "models": {"IndependentGP", "NeuralNetwork", "NetworkEnsemble"}
     | {"StructuredGP", "Noise", "Coefficients", "save_posterior", "load_posterior"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
