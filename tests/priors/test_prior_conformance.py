@@ -15,6 +15,7 @@ from forcegp.priors import (
     PeriodicJointForces,
     ToolForces,
 )
+from forcegp.priors.expected_friction import ExpectedFriction, TabulatedCurve
 
 TIP = ("hand", (0.0, 0.0, 0.2))  # where the arm touches its plane
 
@@ -66,6 +67,21 @@ class TestContactFriction(PriorConformance):
 
 class TestContactFrictionUnderLoad(PriorConformance):
     prior = ContactFriction(load=True)
+    acts_at = TIP
+
+
+class TestContactFrictionUnderExpectedLoad(PriorConformance):
+    prior = ContactFriction(load=True, expected=0.3)
+    acts_at = TIP
+
+
+class TestContactFrictionUnderLoadWithJointFriction(PriorConformance):
+    prior = ContactFriction(
+        load=True,
+        expected=ExpectedFriction(
+            TabulatedCurve((0.0, 0.4, 1.0), (0.0, 0.2, 0.1)), (("bend", TabulatedCurve((-1.0, 1.0), (-2.0, 3.0))),)
+        ),
+    )
     acts_at = TIP
 
 

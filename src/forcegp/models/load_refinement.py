@@ -25,33 +25,37 @@ PLACES = 60
 
 
 def fit_with_refined_loads(
-    first: StructuredPosterior, again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior]
+    first: StructuredPosterior,
+    again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior],
+    rounds: int = ROUNDS,
 ) -> StructuredPosterior:
     """`first` itself, or the most likely of the fits that follow it with the normal forces of the one before.
 
     Every round is an exact fit of a legitimate prior: friction proportional to a given function of the state. What
     changes from round to round is that function, towards the normal force under the friction that was found.
-    `again(prior, posterior)` fits with another prior, beginning from the parameters of a posterior.
+    `again(prior, posterior)` fits with another prior, beginning from the parameters of a posterior. Warns
+    (NumericalWarning) where the normal forces have not settled after `rounds` fits.
     """
+    given = first.model.prior  # whose terms tell which expectations are the user's
     best = last = first
-    change = float("inf")
-    for round_number in range(1, ROUNDS + 1):
-        prior = refined_loads(last.model.prior, last.model.system.robot, lambda name, p=last: _table(p, name))
+    for fits in range(rounds + 1):
+        prior = refined_loads(given, last.model.system.robot, lambda name, p=last: _table(p, name))
         if prior is None:
             return first
         change = _change(last, prior)
         if change < SETTLED:
             break
-        last = again(prior, last).with_settings(load_refinements=round_number)
+        if fits == rounds:
+            warnings.warn(
+                f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
+                "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
+                NumericalWarning,
+                stacklevel=3,
+            )
+            break
+        last = again(prior, last).with_settings(load_refinements=fits + 1)
         if last.negative_log_likelihood < best.negative_log_likelihood:
             best = last
-    else:
-        warnings.warn(
-            f"the normal forces of load-dependent friction still changed by {change:.1%} after {ROUNDS} fits; the most "
-            "likely of them is kept. Give expected=COEFFICIENT to hold them fixed.",
-            NumericalWarning,
-            stacklevel=3,
-        )
     return best
 
 

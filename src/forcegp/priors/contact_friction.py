@@ -16,6 +16,7 @@ from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expected_friction import ExpectedFriction
 from forcegp.priors.force_prior import ForcePrior, Scaling
 from forcegp.priors.joint_forces import kernels_of
+from forcegp.priors.joint_friction import joint_indices
 from forcegp.priors.kernels import check_kernel
 from forcegp.priors.tool_point import (
     ToolPoint,
@@ -40,10 +41,10 @@ class ContactFriction(ForcePrior):
     on the velocity along its own. With `load` the friction is proportional to the nominal normal force (what the
     contact would carry under the known forces alone, `nominal_normal_force`), and the latents are friction coefficients
     without unit. Friction changes the normal force in turn: `expected` counts with a friction coefficient (a number, or
-    `ExpectedFriction`), and where it is None `StructuredGP.fit` finds it by itself, by fitting again with what it has
-    learned (`refined_loads`). The kernel "friction" is
-    Coulomb, Stribeck and viscous friction with a learned velocity scale (see `JointFriction`). Without the contact
-    there is no friction.
+    `ExpectedFriction`), which stays as it is given; where it is None, `StructuredGP.fit` finds it for isotropic
+    friction by itself, by fitting again with what it has learned (`refined_loads`). The kernel "friction" is Coulomb,
+    Stribeck and viscous friction with a learned velocity scale (see `JointFriction`). Without the contact there is no
+    friction.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -52,7 +53,7 @@ class ContactFriction(ForcePrior):
     contact: int = 0
     axes: str = "isotropic"
     load: bool = False
-    expected: ExpectedFriction | None = None
+    expected: ExpectedFriction | float | None = None
     kernel: str = "friction"
 
     def __post_init__(self) -> None:
@@ -74,6 +75,9 @@ class ContactFriction(ForcePrior):
     @override
     def check(self, system: MechanicalSystem) -> None:
         require_contact("ContactFriction", self.contact, system)
+        expected = ExpectedFriction.of(self.expected)
+        if expected is not None:
+            joint_indices([name for name, _ in expected.joints], system.robot)
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
@@ -141,10 +145,11 @@ class ContactFriction(ForcePrior):
         return tangents, (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]
 
     def _normal_force(self, dynamics: ConstrainedDynamics, tangents: Tensor, sliding: Tensor) -> Tensor:
-        if self.expected is None:
+        expected = ExpectedFriction.of(self.expected)
+        if expected is None:
             return nominal_normal_force(dynamics, self.contact)
         direction = (tangents @ _direction(sliding))[..., 0]
-        return self.expected.normal_force(dynamics, self.contact, direction, _speed(sliding)[..., 0])
+        return expected.normal_force(dynamics, self.contact, direction, _speed(sliding)[..., 0])
 
 
 def _speed(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from math import isfinite
 from typing import ClassVar
 
 import torch
@@ -22,7 +23,10 @@ SMALLEST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class TabulatedCurve:
-    """Values over one velocity, in between and beyond linear: (at, values), `at` increasing."""
+    """Values over one velocity, in between and beyond linear: (at, values), `at` increasing.
+
+    Raises InvalidInput for anything but two or more finite places and as many finite values.
+    """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
     __no_type_check__: ClassVar[bool] = True
@@ -32,7 +36,7 @@ class TabulatedCurve:
 
     def __post_init__(self) -> None:
         for name in ("at", "values"):
-            object.__setattr__(self, name, tuple(float(entry) for entry in getattr(self, name)))
+            object.__setattr__(self, name, _finite(name, getattr(self, name)))
         if len(self.at) < 2 or len(self.at) != len(self.values) or any(b <= a for a, b in pairwise(self.at)):
             raise InvalidInput(
                 f"a tabulated curve has {len(self.at)} places and {len(self.values)} values; give two or more of each, "
@@ -42,7 +46,8 @@ class TabulatedCurve:
     def __call__(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """The value at x; differentiable in x, with steps in the derivative at the places."""
         at, values = (torch.tensor(part, dtype=x.dtype, device=x.device) for part in (self.at, self.values))
-        right = torch.searchsorted(at, x.detach().contiguous()).clamp(1, len(at) - 1)
+        # counted, since torch.searchsorted warns of its copies under vmap
+        right = (at < x.detach()[..., None]).sum(-1).clamp(1, len(at) - 1)
         slope = (values[right] - values[right - 1]) / (at[right] - at[right - 1])
         return values[right - 1] + slope * (x - at[right - 1])
 
@@ -52,7 +57,7 @@ class ExpectedFriction:
     """What is expected of the friction that changes a normal force.
 
     sliding: friction coefficient over the sliding speed (m/s); joints: joint name -> resisting force (Nm or N) over the
-    joint's velocity.
+    joint's velocity. Curves may be negative, as those that a fit has found can be where the data say little.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -63,17 +68,23 @@ class ExpectedFriction:
 
     @classmethod
     def of(cls, given: object) -> ExpectedFriction | None:
-        """None, a coefficient that holds at all speeds, an `ExpectedFriction`, or what files hold of one."""
+        """None, a coefficient that holds at all speeds, an `ExpectedFriction`, or what files hold of one.
+
+        Raises InvalidInput for anything else, and for a coefficient that is negative or not finite.
+        """
         if given is None or isinstance(given, ExpectedFriction):
             return given
+        message = f"expected is {given!r}; give a friction coefficient of at least 0, an ExpectedFriction, or None"
         try:
             if isinstance(given, Mapping):
                 joints = tuple((str(name), TabulatedCurve(**curve)) for name, curve in given["joints"])
                 return cls(TabulatedCurve(**given["sliding"]), joints)
-            return cls(TabulatedCurve((0.0, 1.0), (float(given),) * 2))  # type: ignore[arg-type]  # errors below
+            coefficient = float(given)  # type: ignore[arg-type]  # what is no number is an error below
         except (TypeError, ValueError, KeyError):
-            message = f"expected is {given!r}; give a friction coefficient, an ExpectedFriction, or None"
             raise InvalidInput(message) from None
+        if not 0.0 <= coefficient < float("inf"):
+            raise InvalidInput(message)
+        return cls(TabulatedCurve((0.0, 1.0), (coefficient, coefficient)))
 
     def normal_force(
         self,
@@ -99,6 +110,16 @@ class ExpectedFriction:
         g = (rows * (J.mT @ direction[..., None])[..., 0]).sum(-1)
         growth = 1.0 + free.sign() * self.sliding(speed) * size * g
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
+
+
+def _finite(name: str, given: object) -> tuple[float, ...]:
+    try:
+        values = tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # errors below
+    except (TypeError, ValueError):
+        values = (float("nan"),)
+    if not all(map(isfinite, values)):
+        raise InvalidInput(f"a tabulated curve has {name} {given!r}; give finite numbers")
+    return values
 
 
 Table = Callable[[str], TabulatedCurve]

@@ -12,16 +12,16 @@ from forcegp.robots import Robot
 
 
 def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior | None:
-    """The same prior, where every load-dependent isotropic `ContactFriction` expects the friction in `table`.
+    """The same prior, where isotropic `ContactFriction` with a load and no `expected` expects the friction in `table`.
 
     A first fit takes the normal force under the known forces alone; its posterior mean of the sliding friction, and of
     the `JointFriction` beside it in the sum, tells a better one, with which a second fit finds better curves, and so
-    on. None for priors without such a term.
+    on. An `expected` that is there was given on purpose and stays. None for priors without such a term.
     """
     terms = prior.summands()
     names = prior.latent_names(robot)
     slices = prior.slices(robot) if isinstance(prior, SumPrior) else (slice(0, len(names)),)
-    if not any(_has_load(term) for term in terms):
+    if not any(_wants_load(term) for term in terms):
         return None
     joints = tuple(
         (joint, table(latent))
@@ -30,14 +30,14 @@ def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior |
         for joint, latent in zip(term.latent_names(robot), names[which], strict=True)
     )
     refined = tuple(
-        _expecting(term, ExpectedFriction(table(names[which][0]), joints)) if _has_load(term) else term
+        _expecting(term, ExpectedFriction(table(names[which][0]), joints)) if _wants_load(term) else term
         for term, which in zip(terms, slices, strict=True)
     )
     return refined[0] if len(refined) == 1 else SumPrior(refined)
 
 
-def _has_load(term: ForcePrior) -> bool:
-    return isinstance(term, ContactFriction) and term.load and term.axes == "isotropic"
+def _wants_load(term: ForcePrior) -> bool:
+    return isinstance(term, ContactFriction) and term.load and term.expected is None and term.axes == "isotropic"
 
 
 def _expecting(term: ForcePrior, expected: ExpectedFriction) -> ContactFriction:
