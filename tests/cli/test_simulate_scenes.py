@@ -1,0 +1,50 @@
+"""`forcegp simulate` with other friction, surfaces and contacts, through the real executable."""
+
+import json
+
+import pytest
+
+from forcegp import Dataset
+from forcegp.mechanics import Sphere
+
+pytest.importorskip("pybullet")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("--friction-coefficient 2.5", {"friction": "viscous", "viscous_coefficient": 2.5}),
+        (
+            "--friction stribeck --friction-coefficient 0.2 --surface sphere --joint-friction stribeck --patch 2",
+            {"friction": "stribeck", "coulomb_coefficient": 0.2, "surface": "sphere", "patch_factor": 2.0},
+        ),
+        ("--contact bullet --friction-coefficient 0.2", {"friction": "coulomb", "coulomb_coefficient": 0.2}),
+    ],
+)
+def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
+    made = forcegp(
+        *("simulate", "kuka-surface", "--seconds", 0.5, "--out", "log.h5", "--json", *options.split()), folder=tmp_path
+    )
+    assert made.returncode == 0, made.stderr
+    data, summary = Dataset.load(tmp_path / "log.h5"), json.loads(made.stdout)
+    assert expected.items() <= summary["config"].items()
+    assert expected.items() <= data.metadata["config"].items()
+    assert ("Q_U.joint-friction" in data.truth) == ("--joint-friction" in options)
+    assert ("in_contact" in data.truth) == ("bullet" in options)
+    assert isinstance(data.system.contacts[0].surface, Sphere) == ("sphere" in options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--contact bullet --friction viscous", "contact 'bullet' has Coulomb friction"),
+        ("--surface none --patch 4", "a patch needs a surface"),
+        ("--friction wet", "wet"),
+    ],
+)
+def test_options_that_do_not_fit_end_in_one_line(forcegp, tmp_path, options, message):
+    failed = forcegp("simulate", "kuka-surface", "--out", "log.h5", *options.split(), folder=tmp_path)
+    assert failed.returncode == 2
+    assert message in failed.stderr
+    assert len(failed.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "log.h5").exists()

@@ -1,0 +1,62 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from forcegp.data import Dataset, contact_rows, rows_in_contact
+from forcegp.errors import ContactError
+from forcegp.mechanics import Contact, Plane
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+pytest.importorskip("pybullet")
+
+
+@pytest.fixture(scope="module")
+def hopping() -> Dataset:
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=15.0, seed=5, contact="bullet"))
+
+
+@pytest.mark.parametrize("noise_is_known", [True, False])
+def test_rows_in_contact_are_those_where_the_simulator_pushed(hopping, noise_is_known):
+    data = hopping if noise_is_known else dataclasses.replace(hopping, noise_std=None)
+    true, found = data.truth["in_contact"].astype(bool), contact_rows(data)
+    assert true.mean() < 0.95
+    assert (found & true).sum() / found.sum() > 0.98
+    assert (found & true).sum() / true.sum() > 0.98
+    kept = rows_in_contact(data)
+    np.testing.assert_array_equal(kept.time, data.time[found[:, 0]])
+
+
+def test_truth_is_not_looked_at(hopping):
+    blind = dataclasses.replace(hopping, truth={})
+    np.testing.assert_array_equal(contact_rows(blind), contact_rows(hopping))
+
+
+@pytest.mark.parametrize("surface", ["plane", "tilted", "sphere"])
+def test_an_ideal_contact_keeps_its_rows(surface):
+    data = simulate_kuka_surface(KukaSurfaceConfig(seconds=10.0, seed=6, surface=surface))
+    assert contact_rows(data).mean() > 0.999
+
+
+def test_a_surface_in_the_wrong_place_is_told(hopping):
+    (contact,) = hopping.system.contacts
+    wrong = Contact(contact.frame, contact.point, Plane((0.0, 0.0, 1.0), 0.5))
+    data = dataclasses.replace(hopping, system=hopping.system.with_contacts([wrong]))
+    with pytest.raises(ContactError, match=r"contact 0 \(frame 'lbr_iiwa_link_7'\).*median distance.*0.445 m") as error:
+        rows_in_contact(data)
+    assert "leave this contact out" in str(error.value)
+
+
+def test_without_contacts_there_is_nothing_to_find(hopping):
+    for nothing, message in ((None, "no system"), (hopping.system.with_contacts([]), "without contacts")):
+        truth = {"a": hopping.truth["a"]}
+        with pytest.raises(ContactError, match=message):
+            contact_rows(dataclasses.replace(hopping, system=nothing, truth=truth))
+
+
+def test_every_contact_has_a_column_and_all_must_act(hopping):
+    (contact,) = hopping.system.contacts
+    here = contact_rows(hopping)[:, 0]
+    both = dataclasses.replace(hopping, truth={}, system=hopping.system.with_contacts([contact, contact]))
+    np.testing.assert_array_equal(contact_rows(both), np.stack([here, here], axis=1))
+    assert len(rows_in_contact(both)) == here.sum()

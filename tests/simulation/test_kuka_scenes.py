@@ -1,0 +1,176 @@
+"""The scenario's kinds of friction, surface and contact: the physics by forcegp's own robot."""
+
+import numpy as np
+import pytest
+import torch
+from tests.data.samples import assert_equal
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput, SimulationError
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+from forcegp.simulation.friction_laws import DryFriction, JointStribeckFriction, RoughPatch
+
+pytest.importorskip("pybullet")
+
+SCENES = {
+    "coulomb": {"friction": "coulomb"},
+    "stribeck": {"friction": "stribeck", "joint_friction": "stribeck"},
+    "patch": {"patch_factor": 4.0},
+    "tilted": {"surface": "tilted", "friction": "stribeck"},
+    "sphere": {"surface": "sphere", "friction": "coulomb"},
+    "none": {"surface": "none", "joint_friction": "stribeck"},
+    "bullet": {"contact": "bullet", "seconds": 6.0},
+    "bullet-sphere": {"contact": "bullet", "surface": "sphere"},
+}
+
+
+def config(name: str) -> KukaSurfaceConfig:
+    return KukaSurfaceConfig(**{"seconds": 2.0, "settle_seconds": 2.0, "seed": 5, **SCENES[name]})
+
+
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, Dataset]:
+    return {name: simulate_kuka_surface(config(name)) for name in SCENES}
+
+
+def tensors(data: Dataset, *names: str) -> list[torch.Tensor]:
+    return [torch.tensor(data.truth[name] if name in data.truth else getattr(data, name)) for name in names]
+
+
+def tool_motion(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobian, velocity, normal and place of the tool point in every row."""
+    q, v, u = tensors(data, "q", "v", "u")
+    dynamics, (contact,) = data.system.dynamics(q, v, u), data.system.contacts
+    jacobian = dynamics.state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
+    place = contact.position(dynamics.state.kinematics)
+    velocity = (jacobian @ v[..., None])[..., 0]
+    return tuple(part.numpy() for part in (jacobian, velocity, dynamics.normals[:, 0], place))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_equations_of_motion_hold_in_every_row(scenes, name):
+    data = scenes[name]
+    q, v, u, a, unknown = tensors(data, "q", "v", "u", "a", "Q_U")
+    dynamics = data.system.dynamics(q, v, u)
+    force = u + unknown
+    if data.system.contacts:
+        (multiplier,) = tensors(data, "lambda")
+        force = force + (dynamics.A.mT @ multiplier[..., None])[..., 0]
+    np.testing.assert_allclose(data.system.robot.inverse_dynamics(q, v, a), force, rtol=0, atol=1e-10)
+    if not name.startswith(("bullet", "none")):
+        np.testing.assert_allclose((dynamics.A @ a[..., None])[..., 0], dynamics.b, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_parts_of_the_unknown_force_exist_where_the_force_does_and_add_up(scenes, name):
+    data, made = scenes[name], config(name)
+    parts = {part for part in data.truth if part.startswith("Q_U.")}
+    expected = set() if made.surface == "none" else {"Q_U.tool-friction"}
+    expected |= {"Q_U.joint-friction"} if made.joint_friction != "none" else set()
+    assert parts == expected
+    assert ("in_contact" in data.truth) == (made.contact == "bullet")
+    assert ("lambda" in data.truth) == ("force.tool-friction" in data.truth) == (made.surface != "none")
+    assert len(data.system.contacts) == (made.surface != "none")
+    np.testing.assert_allclose(sum(data.truth[part] for part in parts), data.truth["Q_U"], atol=1e-13)
+    assert KukaSurfaceConfig(**data.metadata["config"]) == made
+
+
+@pytest.mark.parametrize("name", ["coulomb", "stribeck", "tilted", "sphere"])
+def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
+    data, made = scenes[name], config(name)
+    jacobian, velocity, normal, _ = tool_motion(data)
+    force, load = data.truth["force.tool-friction"], np.abs(data.truth["lambda"][:, 0])
+    static = made.static_coefficient if made.friction == "stribeck" else made.coulomb_coefficient
+    law = DryFriction(made.coulomb_coefficient, static, made.stribeck_velocity, made.friction_smoothing)
+    tangential = velocity - (velocity * normal).sum(1)[:, None] * normal
+    speed = np.linalg.norm(tangential, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), law.coefficient(speed) * load, atol=1e-9)
+    assert ((force * velocity).sum(1) <= 1e-12).all()
+    np.testing.assert_allclose((force * normal).sum(1), 0.0, atol=1e-10)
+    torques = (jacobian.transpose(0, 2, 1) @ force[..., None])[..., 0]
+    np.testing.assert_allclose(torques, data.truth["Q_U.tool-friction"], atol=1e-10)
+    assert 10.0 < np.median(load) < 40.0
+
+
+def test_joint_friction_is_its_law(scenes):
+    data, made = scenes["none"], config("none")
+    law = JointStribeckFriction(
+        *map(np.array, (made.joint_coulomb, made.joint_static, made.joint_viscous)),
+        stribeck_velocity=made.joint_stribeck_velocity,
+        smoothing=made.joint_smoothing,
+    )
+    np.testing.assert_array_equal(data.truth["Q_U.joint-friction"], law.force(data.v))
+
+
+def test_the_patch_multiplies_viscous_friction_where_it_lies(scenes):
+    data = scenes["patch"]
+    _, velocity, _, place = tool_motion(data)
+    scale = np.array([RoughPatch(0.0, 0.25, 4.0).scale(x) for x in place[:, 0]])
+    np.testing.assert_allclose(data.truth["force.tool-friction"], -scale[:, None] * velocity, atol=1e-10)
+    assert (scale > 3.9).any()
+    assert (scale < 1.1).any()
+
+
+def test_free_motion_stays_above_the_table(scenes):
+    data = scenes["none"]
+    pose = data.system.robot.frame_pose(torch.tensor(data.q), "lbr_iiwa_link_7").numpy()
+    height = (pose[:, :3, :3] @ [0.0, 0.0, 0.1] + pose[:, :3, 3])[:, 2]
+    np.testing.assert_allclose(height, 0.055 + 0.05, atol=5e-3)
+    assert data.system.contacts == ()
+
+
+@pytest.mark.parametrize("name", ["bullet", "bullet-sphere"])
+def test_bullets_contact_only_pushes_within_its_friction_cone(scenes, name):
+    data = scenes[name]
+    on, load = data.truth["in_contact"][:, 0].astype(bool), data.truth["lambda"][:, 0]
+    force = data.truth["force.tool-friction"]
+    assert (load[on] > 0.0).all()
+    assert not load[~on].any()
+    assert not force[~on].any()
+    np.testing.assert_array_equal(data.truth["Q_U"][~on], 0.0)
+    ratio = np.linalg.norm(force, axis=1)[on] / load[on]
+    assert ratio.max() < 0.3 * 1.01
+    jacobian, velocity, _, _ = tool_motion(data)
+    fast = on & (np.linalg.norm(velocity, axis=1) > 0.1)
+    assert np.median(np.linalg.norm(force, axis=1)[fast] / load[fast]) == pytest.approx(0.3, rel=0.02)
+    assert ((force * velocity).sum(1)[fast] < 0.0).mean() > 0.99
+    # A lever arm of 1 mm is all that lies between PyBullet's force at the sphere and one at the tool point.
+    torques = (jacobian.transpose(0, 2, 1) @ force[..., None])[..., 0]
+    arm = np.abs(data.truth["Q_U.tool-friction"] - torques).max(axis=1)
+    assert (arm <= 1.5e-3 * np.linalg.norm(force, axis=1) + 1e-3).mean() > 0.99
+
+
+def test_the_tool_leaves_bullets_surface_now_and_then(scenes):
+    share = 1.0 - scenes["bullet"].truth["in_contact"].mean()
+    assert 0.02 < share < 0.6
+
+
+@pytest.mark.parametrize("name", ["stribeck", "bullet"])
+def test_equal_seeds_give_equal_data(scenes, name):
+    assert_equal(simulate_kuka_surface(config(name)), scenes[name])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"friction": "wet"}, "one of viscous, coulomb, stribeck"),
+        ({"surface": "cone"}, "one of plane, tilted, sphere, none"),
+        ({"contact": "bullet", "surface": "none"}, "needs a surface"),
+        ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),
+        ({"contact": "bullet", "patch_factor": 2.0}, "ideal contact"),
+        ({"surface": "none", "patch_factor": 2.0}, "needs a surface"),
+        ({"lift_share": 0.1}, "cannot be left"),
+        ({"surface": "sphere", "waypoint_x": (-5.0, 5.0)}, "sphere_radius"),
+        ({"tilt_axis": (0.0, 0.0)}, "horizontal direction"),
+        ({"press": -1.0}, ">= 0"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        KukaSurfaceConfig(**changes)
+
+
+def test_friction_beyond_what_determines_the_normal_force_is_refused():
+    extreme = {"coulomb_coefficient": 20.0, "static_coefficient": 20.0, "friction_smoothing": 1e-3}
+    with pytest.raises(SimulationError, match="not determined"):
+        simulate_kuka_surface(KukaSurfaceConfig(seconds=1.0, friction="stribeck", **extreme))
