@@ -1,0 +1,189 @@
+"""Friction under load on the small arm: fits that find the normal force which friction itself changes."""
+
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import NOISE, arm_data
+
+from forcegp.data import Dataset
+from forcegp.errors import NumericalWarning
+from forcegp.inference import OptimizerOptions
+from forcegp.models import StructuredGP, load_posterior, save_posterior
+from forcegp.models.load_refinement import SETTLED, fit_with_refined_loads
+from forcegp.priors import ContactFriction, JointFriction, SumPrior
+
+COULOMB, SLOWLY = 0.35, 0.1  # coefficient, and the speed (m/s) below which it falls to zero
+OPTIONS = OptimizerOptions(iterations=60)
+LOAD = ContactFriction(load=True)
+
+
+def coefficient(speed: torch.Tensor) -> torch.Tensor:
+    return COULOMB * torch.tanh(speed / SLOWLY)
+
+
+@cache
+def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
+    """Coulomb friction of the tool, solved together with acceleration and multiplier: one dense system per row.
+
+    M a - A^T lambda + mu(|v_t|) sign |s_p| lambda J^T d = Q_K - c v with the sign of lambda that comes out of it.
+    """
+    data = arm_data(rows, seed)
+    system = data.system
+    J = system.robot.kinematics(torch.tensor(data.q)).frame_jacobian("hand", system.contacts[0].point)[:, :3]
+    A = system.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u))).A
+    v = torch.tensor(data.v)
+    v = v - (torch.linalg.pinv(A) @ (A @ v[..., None]))[..., 0]  # along the plane
+    states = torch.tensor(data.q), v, torch.tensor(data.u)
+    dynamics = system.dynamics(*states)
+    velocity = (J @ v[..., None])[..., 0]
+    speed = velocity.norm(dim=-1)
+    resisting = coefficient(speed)[:, None] * (J.mT @ (velocity / speed[:, None])[..., None])[..., 0]
+    joints = -joint_friction * v
+    solved = []
+    for sign in (1.0, -1.0):
+        top = torch.cat([dynamics.M, (sign * resisting)[..., None] - A.mT], -1)
+        matrix = torch.cat([top, torch.cat([A, A.new_zeros(rows, 1, 1)], -1)], -2)
+        solved.append(torch.linalg.solve(matrix, torch.cat([dynamics.Q_K + joints, dynamics.b], -1)))
+    positive = solved[0][:, 3] > 0.0
+    assert bool((positive ^ (solved[1][:, 3] < 0.0)).all())  # exactly one sign is consistent
+    found = torch.where(positive[:, None], solved[0], solved[1])
+    a, multiplier = found[:, :3].numpy(), found[:, 3:]
+    noise = NOISE * np.random.default_rng(seed + 100).standard_normal(a.shape)
+    Q_U = (joints - multiplier.abs() * resisting).numpy()
+    truth = {"a": a, "lambda": multiplier.numpy(), "Q_U": Q_U}
+    return replace(data, v=v.numpy(), a=a + noise, truth=truth)
+
+
+def first_fit(model: StructuredGP, data: Dataset):
+    """The fit under the nominal normal force, which `fit` does not stop at."""
+    return model._fit(data, data, 1, None, None, 0.0, seed=0, jobs=1, hyperprior=True, options=OPTIONS, progress=None)
+
+
+def errors(posterior, test: Dataset) -> dict[str, float]:
+    """Root-mean-square errors: acceleration without noise, lambda relative to itself, and the coefficient."""
+    predicted = posterior.predict(test.q, test.v, test.u, covariance=False)
+    name = posterior.latent_names[-1]
+    speeds = torch.linspace(0.05, float(posterior.curve(name).visited[1, 0]), 50, dtype=torch.float64)
+
+    def size(values: torch.Tensor) -> float:
+        return float(values.square().mean().sqrt())
+
+    normal_force = torch.tensor(test.truth["lambda"])
+    return {
+        "acceleration": size(predicted.mean - torch.tensor(test.truth["a"])),
+        "normal force": size(predicted.multiplier.mean - normal_force) / size(normal_force),
+        "coefficient": size(posterior.curve(name, speeds).mean - coefficient(speeds)),
+    }
+
+
+@pytest.fixture(scope="module")
+def fits():
+    """The same prior under the nominal and under the refined normal force."""
+    data = sliding_data(60, 0)
+    model = StructuredGP(data.system, LOAD)
+    return first_fit(model, data), model.fit(data, restarts=1, options=OPTIONS)
+
+
+def test_the_data_are_as_they_say():
+    """Accelerations and multipliers of Gauss' principle under the friction that they themselves make."""
+    data = sliding_data(60, 0)
+    dynamics = data.system.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u)))
+    Q_U = torch.tensor(data.truth["Q_U"])
+    torch.testing.assert_close(dynamics.acceleration(Q_U), torch.tensor(data.truth["a"]), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(dynamics.multiplier(Q_U), torch.tensor(data.truth["lambda"]), rtol=1e-9, atol=1e-9)
+    assert bool(((Q_U * torch.tensor(data.v)).sum(-1) <= 0.0).all())
+
+
+def test_the_refined_fit_is_nearer_to_the_truth(fits):
+    nominal, refined = (errors(posterior, sliding_data(80, 7)) for posterior in fits)
+    assert refined["acceleration"] < 0.1 * nominal["acceleration"]
+    assert refined["normal force"] < 0.1 * nominal["normal force"]
+    assert refined["coefficient"] < 0.1 * nominal["coefficient"]
+
+
+def test_it_ends_where_nothing_changes_any_more(fits):
+    nominal, refined = fits
+    assert 1 <= refined.settings["load_refinements"] <= 8
+    assert "load_refinements" not in nominal.settings
+    assert nominal.model.prior == LOAD
+    assert refined.model.prior.expected is not None
+    expected = refined.model.prior.expected.sliding
+    found = refined.curve("sliding", np.array(expected.at)).mean
+    assert float((found - torch.tensor(expected.values)).abs().max()) < 5 * SETTLED
+    assert refined.negative_log_likelihood < nominal.negative_log_likelihood
+
+
+def test_the_refined_fit_comes_back_from_a_folder(fits, tmp_path):
+    refined, test = fits[1], sliding_data(5, 8)
+    save_posterior(refined, tmp_path / "run")
+    again = load_posterior(tmp_path / "run")
+    assert again.model.prior == refined.model.prior
+    assert torch.equal(again.predict(test.q, test.v, test.u).mean, refined.predict(test.q, test.v, test.u).mean)
+
+
+def test_joint_friction_beside_it_counts_for_the_normal_force():
+    data, test = sliding_data(60, 0, 1.5), sliding_data(80, 7, 1.5)
+    model = StructuredGP(data.system, JointFriction(kernel="linear") + LOAD)
+    refined = model.fit(data, restarts=1, options=OPTIONS)
+    nominal = errors(first_fit(model, data), test)
+    assert isinstance(refined.model.prior, SumPrior)
+    friction = refined.model.prior.terms[1]
+    assert [name for name, _ in friction.expected.joints] == list(data.system.robot.joint_names)
+    for _, curve in friction.expected.joints:
+        at, values = (torch.tensor(part, dtype=torch.float64) for part in (curve.at, curve.values))
+        assert float((values - 1.5 * at).abs().max()) < 0.02
+    assert errors(refined, test)["acceleration"] < 0.1 * nominal["acceleration"]
+
+
+def test_an_expectation_that_was_given_stays():
+    data = sliding_data(20, 0)
+    given = ContactFriction(load=True, expected=0.1)
+    posterior = StructuredGP(data.system, given).fit(data, restarts=1, options=OPTIONS)
+    assert posterior.model.prior == given
+    assert "load_refinements" not in posterior.settings
+    alone = first_fit(StructuredGP(data.system, given), data)
+    assert all(torch.equal(posterior.parameters[name], value) for name, value in alone.parameters.items())
+
+
+def test_fits_that_learn_physical_parameters_take_the_nominal_normal_force():
+    data = sliding_data(20, 0)
+    learn = data.system.robot.link("hand").inertial("mass")
+    posterior = StructuredGP(data.system, LOAD).fit(
+        data, restarts=1, options=OptimizerOptions(iterations=3), learn=learn, prior_strength=1.0
+    )
+    assert posterior.model.prior == LOAD
+    assert posterior.identification is not None
+    assert "load_refinements" not in posterior.settings
+
+
+def test_fits_without_a_load_are_single(fits):
+    data = arm_data(15, seed=0)
+    first = first_fit(StructuredGP(data.system, JointFriction()), data)
+
+    def again(prior, last):
+        raise AssertionError("there is nothing to fit again")
+
+    assert fit_with_refined_loads(first, again) is first
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fit_with_refined_loads(first, again, rounds=0) is first
+
+
+def test_too_few_rounds_are_told(fits):
+    nominal, _ = fits
+    data, tried = sliding_data(60, 0), []
+
+    def again(prior, last):
+        tried.append(prior)
+        return first_fit(StructuredGP(data.system, prior), data)
+
+    with pytest.warns(NumericalWarning, match=r"still change by \d.*% after 1 refinements; .*expected=COEFFICIENT"):
+        best = fit_with_refined_loads(nominal, again, rounds=1)
+    assert len(tried) == 1
+    assert best.settings["load_refinements"] == 1
+    with pytest.warns(NumericalWarning, match="after 0 refinements"):
+        assert fit_with_refined_loads(nominal, again, rounds=0) is nominal
