@@ -14,15 +14,16 @@ from forcegp.experiments.force_scenarios import LABELS
 from forcegp.experiments.force_tables import score_table
 
 KERNELS = {
-    "squared exponential": "tool-forces",
-    "deep": "tool-forces:kernel=deep",
+    "squared exponential": "friction-map",
+    "Matérn 3/2": "friction-map:kernel=matern-3/2",
+    "deep": "friction-map:kernel=deep",
 }
 SCENARIOS = ("patch", "viscous")
 
 
 @dataclass(frozen=True)
 class DeepKernel(ForceExperiment):
-    """Tool forces on velocity and place, on a strip of other friction and without one."""
+    """A map of friction over the table, on a strip of other friction and without one."""
 
     name: ClassVar[str] = "deep-kernel"
     title: ClassVar[str] = "Deep kernels"
@@ -39,9 +40,9 @@ class DeepKernel(ForceExperiment):
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
         parts = [
-            f"Tool forces on velocity and place, analytical mean, {len(self.seeds)} seeds. Leave-one-out: log density "
-            "of a training row given all others, in nats per row, from the same fit; the higher, the better. It is "
-            "what `forcegp compare` chooses by."
+            "`friction-map`: viscous friction whose coefficient depends on the place, analytical mean, "
+            f"{len(self.seeds)} seeds. Leave-one-out: log density of a training row given all others, in nats per row, "
+            "from the same fit; the higher, the better. `forcegp compare` chooses by that of stretches of time."
         ]
         columns = ("mae_noise_free", "nlpd", "coverage_95")
         for scenario in SCENARIOS:

@@ -28,7 +28,8 @@ PAPER_SEEDS = (101, 102, 103, 104, 105)
 
 # Seeds that served no choice of a prior or kernel.
 FORCE_SEEDS = (301, 302, 303, 304, 305)
-FORCE_DATA = DataSettings(train_seconds=100.0, rows=400, test_seconds=40.0, every=12)
+FORCE_DATA = DataSettings(train_seconds=60.0, rows=400, test_seconds=24.0, every=12)
+FORCE_SMOKE_DATA = DataSettings(train_seconds=5.0, rows=200, test_seconds=5.0, every=12)
 
 PAPER_POINTS = (100, 200, 400, 600, 800, 1000)
 SMOKE_POINTS = (20, 40)
@@ -98,12 +99,12 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
     ),
     "forces-smoke": (
         DataEfficiency(
-            data=SMOKE_DATA, points=(10, 20), seeds=(201,), settings=SMOKE_SEARCH, region_points=SMOKE_POINTS[0]
+            data=FORCE_SMOKE_DATA, points=(10, 20), seeds=(201,), settings=SMOKE_SEARCH, region_points=SMOKE_POINTS[0]
         ),
-        Friction(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
-        Transfer(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
-        UnilateralContact(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
-        DeepKernel(data=SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        Friction(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        Transfer(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        UnilateralContact(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        DeepKernel(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
     ),
 }
 

@@ -6,10 +6,11 @@ paths switch silently to conjugate gradients above N D = 800 (measured error of 
 iiwa).
 
 The leaves: functions of the distance (squared exponential, Matern) have hand-written gradients, one N x N by N x d
-product and no N x N x d tensor; linear and constant kernels, and those with one of the two methods below, are matrix
+product and no N x N x d tensor; linear and constant kernels, and those with one of the methods below, are matrix
 products; every other kernel is called as it is, and once more in the backward pass. A kernel class may have one of
 
     squared_exponential_embedding(z) (n, e): then k(z, z') = exp(-1/2 |e(z) - e(z')|^2)
+    matern_embedding(z) (n, e) and nu: then k(z, z') is the Matern of smoothness nu (1/2, 3/2, 5/2) of |e(z) - e(z')|
     weight_features(z) (n, p): then k(z, z') = phi(z) . phi(z')
 
 both differentiable in z and in the kernel's parameters.
@@ -80,9 +81,10 @@ def dense_matrix(
         return _of_distance(kernel, z, other, torch.ones((), dtype=z.dtype, device=z.device))
     if type(kernel) is ConstantKernel:
         return kernel.constant.reshape(1, 1).expand(len(z), len(z if other is None else other)).contiguous()
-    embed = squared_exponential_embedding(kernel)
-    if embed is not None:
-        return _of_embedding(embed(z), None if other is None else embed(other))
+    embedded = embedding(kernel)
+    if embedded is not None:
+        embed, smoothness = embedded
+        return _of_embedding(embed(z), None if other is None else embed(other), smoothness)
     feature = weight_features(kernel)
     assert feature is not None  # _is_known said so
     left = feature(z)
@@ -94,6 +96,18 @@ def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
     if type(kernel) is PeriodicKernel:
         return partial(_circles, kernel)
     return getattr(kernel, "squared_exponential_embedding", None)
+
+
+def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
+    """e(z) and the smoothness nu of k as a function of |e(z) - e(z')|, infinite for the squared exponential.
+
+    None for kernels that are not of that form, or not known to be.
+    """
+    squared_exponential = squared_exponential_embedding(kernel)
+    if squared_exponential is not None:
+        return squared_exponential, math.inf
+    matern = getattr(kernel, "matern_embedding", None)
+    return None if matern is None else (matern, float(cast(float, kernel.nu)))
 
 
 def weight_features(kernel: Kernel) -> PointMap | None:
@@ -136,11 +150,7 @@ def _is_known(kernel: Kernel) -> bool:
         # It takes over the `active_dims` of its base, which then does not select again.
         base = kernel.base_kernel
         return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
-    return (
-        type(kernel) in KNOWN
-        or squared_exponential_embedding(kernel) is not None
-        or weight_features(kernel) is not None
-    )
+    return type(kernel) in KNOWN or embedding(kernel) is not None or weight_features(kernel) is not None
 
 
 def _selected(kernel: Kernel, z: Tensor) -> Tensor:
@@ -163,11 +173,13 @@ def _of_distance(kernel: Kernel, z: Tensor, other: Tensor | None, outputscale: T
     return outputscale * _matern(distance(z, other), smoothness)
 
 
-def _of_embedding(left: Tensor, right: Tensor | None) -> Tensor:
-    if right is not None:
+def _of_embedding(left: Tensor, right: Tensor | None, smoothness: float) -> Tensor:
+    if right is not None and smoothness == math.inf:
         return torch.exp(-0.5 * squared_distance(left, right))
+    if right is not None:
+        return _matern(distance(left, right), smoothness)
     one = torch.ones(1, dtype=left.dtype, device=left.device)
-    return cast(Tensor, _Stationary.apply(left, one, one[0], math.inf))
+    return cast(Tensor, _Stationary.apply(left, one, one[0], smoothness))
 
 
 def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:

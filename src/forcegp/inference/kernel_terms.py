@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import PointMap, squared_exponential_embedding, weight_features
+from forcegp.inference.kernel_matrices import PointMap, embedding, weight_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,8 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
     raise InvalidInput(
         f"no functions can be drawn for a {kind}; they can for sums and products of squared exponential, Matern, "
         "rational quadratic, periodic, linear and constant kernels, and of those that have the method "
-        "`squared_exponential_embedding` or `weight_features`, all without active_dims; use such kernels, or ask for "
-        "no samples."
+        "`squared_exponential_embedding`, `matern_embedding` or `weight_features`, all without active_dims; use such "
+        "kernels, or ask for no samples."
     )
 
 
@@ -108,8 +108,11 @@ def _spectral_factor(kernel: Kernel) -> SpectralFactor | None:
         return SpectralFactor(partial(_scaled, kernel), -0.5, float(kernel.nu))
     if type(kernel) is RQKernel:
         return SpectralFactor(partial(_scaled, kernel), 0.5, float(kernel.alpha.detach()))
-    embedding = squared_exponential_embedding(kernel)
-    return None if embedding is None else SpectralFactor(embedding)
+    found = embedding(kernel)
+    if found is None:
+        return None
+    embed, smoothness = found
+    return SpectralFactor(embed) if smoothness == math.inf else SpectralFactor(embed, -0.5, smoothness)
 
 
 def _scaled(kernel: Kernel, z: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expected_friction import ExpectedFriction
 from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_forces import kernels_of
+from forcegp.priors.joint_forces import chosen_inputs, kernels_of
 from forcegp.priors.joint_friction import joint_indices
 from forcegp.priors.kernels import check_kernel
 from forcegp.priors.tool_point import (
@@ -29,6 +29,7 @@ from forcegp.priors.tool_point import (
 from forcegp.robots import Robot
 
 AXES = ("isotropic", "two-axis")
+CONTACT_INPUTS = ("velocity", "position")
 SMALLEST_SPEED = 1e-6
 """m/s; below it the direction of sliding is rounded off, far below any velocity scale of friction."""
 
@@ -54,7 +55,9 @@ class ContactFriction(ForcePrior):
     axes: str = "isotropic"
     load: bool = False
     expected: ExpectedFriction | float | None = None
-    kernel: str = "friction"
+    viscous: bool = False
+    inputs: tuple[str, ...] = ("velocity",)
+    kernel: str | None = None
 
     def __post_init__(self) -> None:
         if self.axes not in AXES or not is_contact_number(self.contact):
@@ -65,12 +68,21 @@ class ContactFriction(ForcePrior):
         if self.expected is not None and not self.load:
             raise InvalidInput("ContactFriction has an expected friction but no load; give load=True, or leave it out")
         object.__setattr__(self, "expected", ExpectedFriction.of(self.expected))
-        check_kernel(self.kernel)
+        object.__setattr__(self, "inputs", chosen_inputs("ContactFriction", self.inputs, CONTACT_INPUTS))
+        check_kernel(self._kernel)
+
+    @property
+    def _kernel(self) -> str:
+        if self.kernel is not None:
+            return self.kernel
+        return "friction" if self.inputs == ("velocity",) and not self.viscous else "squared-exponential"
 
     @property
     @override
     def title(self) -> str:
-        return "load-friction" if self.load else "contact-friction"
+        if self.load:
+            return "load-friction"
+        return "friction-map" if "position" in self.inputs else "contact-friction"
 
     @override
     def check(self, system: MechanicalSystem) -> None:
@@ -99,36 +111,50 @@ class ContactFriction(ForcePrior):
             directions = tangents @ _direction(sliding)
         else:
             directions = tangents
+        if self.viscous:
+            directions = _speed(sliding)[..., None] * directions
         if self.load:
             directions = self._normal_force(dynamics, tangents, sliding)[..., None, None] * directions
         return -directions
 
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
-        if not has_contact(dynamics, self.contact):
-            return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], 1),) * self._count
-        _, sliding = self._sliding(dynamics)
-        if self.axes == "two-axis":
-            return sliding[..., :1], sliding[..., 1:]
-        return (_speed(sliding),)
+        if not has_contact(dynamics, self.contact):  # the force is zero whatever its features are
+            width = len(self.inputs) + ("position" in self.inputs)
+            return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], width),) * self._count
+        tangents, sliding = self._sliding(dynamics)
+        speeds = (_speed(sliding),) if self.axes == "isotropic" else (sliding[..., :1], sliding[..., 1:])
+        position = ToolPoint.of_contact(dynamics, self.contact).position
+        place = (tangents.mT @ position[..., None])[..., 0]
+        return tuple(
+            torch.cat([{"velocity": speed, "position": place}[name] for name in self.inputs], dim=-1)
+            for speed in speeds
+        )
 
     @override
-    def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
-        return ("scale",) * self._count
+    def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...], ...]:
+        ways: dict[str, tuple[Scaling, ...]] = {"velocity": ("scale",), "position": ("standardize", "standardize")}
+        chosen: tuple[Scaling, ...] = tuple(way for name in self.inputs for way in ways[name])
+        return (chosen,) * self._count
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
-        if self.axes == "isotropic":
-            return (("sliding speed [m/s]",),)
-        return ("velocity along tangent-1 [m/s]",), ("velocity along tangent-2 [m/s]",)
+        place = ("tool position along tangent-1 [m]", "tool position along tangent-2 [m]")
+        tangents = ("velocity along tangent-1 [m/s]", "velocity along tangent-2 [m/s]")
+        moving = ("sliding speed [m/s]",) if self.axes == "isotropic" else tangents
+        return tuple(
+            tuple(entry for name in self.inputs for entry in {"velocity": (speed,), "position": place}[name])
+            for speed in moving
+        )
 
     @override
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
-        return ("" if self.load else "N",) * self._count
+        per_speed = "N/(m/s)" if self.viscous else "N"
+        return (per_speed.replace("N", "", 1).replace("/(m/s)", "s/m") if self.load else per_speed,) * self._count
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return kernels_of(self.kernel, dimensions, variances)
+        return kernels_of(self._kernel, dimensions, variances)
 
     @override
     def to_dict(self) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.priors.deep_kernel import deep
+from forcegp.priors.friction_kernel import SmoothSignKernel, friction
 from forcegp.priors.kernel_expressions import KernelExpression, KernelFactory
 from forcegp.priors.stationary_kernels import (
     matern,
@@ -21,7 +22,7 @@ from forcegp.priors.stationary_kernels import (
     squared_exponential,
     squared_exponential_kernel,
 )
-from forcegp.priors.weight_kernels import SmoothSignKernel, constant, friction, linear
+from forcegp.priors.weight_kernels import constant, linear
 
 __all__ = ["KERNELS", "KernelFactory", "SmoothSignKernel", "check_kernel", "kernel_of", "squared_exponential_kernel"]
 

@@ -45,6 +45,11 @@ NAMED_PRIORS: dict[str, NamedPrior] = {
     ),
     "contact-friction": NamedPrior("isotropic friction at the contact, on the sliding speed", ContactFriction),
     "load-friction": NamedPrior("the same, proportional to the normal force", ContactFriction, (("load", True),)),
+    "friction-map": NamedPrior(
+        "viscous friction at the contact whose coefficient depends on the place",
+        ContactFriction,
+        (("viscous", True), ("inputs", ("position",))),
+    ),
     "payload": NamedPrior("weight and place of an unknown load: payload:frame=LINK", Payload),
     "joint-accelerations": NamedPrior("accelerations without the contacts, on (q, v, u)", JointAccelerations),
     "none": NamedPrior("no unknown force at all", NoForces),

@@ -37,7 +37,10 @@ def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior |
 
 
 def _wants_load(term: ForcePrior) -> bool:
-    return isinstance(term, ContactFriction) and term.load and term.expected is None and term.axes == "isotropic"
+    """Whether its latent is a friction coefficient over the sliding speed alone, and the load is still to be found."""
+    if not isinstance(term, ContactFriction) or not term.load or term.expected is not None:
+        return False
+    return term.axes == "isotropic" and term.inputs == ("velocity",) and not term.viscous
 
 
 def _expecting(term: ForcePrior, expected: ExpectedFriction) -> ContactFriction:
