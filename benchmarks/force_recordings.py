@@ -1,0 +1,103 @@
+"""Recordings with forces of which the truth is known, for the pictures of docs/forces.md."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+
+from forcegp import Dataset, KukaSurfaceConfig, MechanicalSystem, Robot, StructuredGP, simulate_kuka_surface
+from forcegp.priors import ForcePrior
+from forcegp.robots import parameters_from_physical
+
+NOISE = 0.1
+"""rad/s^2"""
+TOOL = "lbr_iiwa_link_7"
+F64 = torch.float64
+
+Law = Callable[[torch.Tensor], torch.Tensor]
+
+
+@cache
+def recording(seed: int, **options: Any) -> Dataset:
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=40.0, seed=seed, **options))
+
+
+def with_force(data: Dataset, prior: ForcePrior, *laws: Law, seed: int = 5) -> Dataset:
+    """The states and torques of `data` with the acceleration under another unknown force, one law per latent."""
+    assert data.system is not None
+    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
+    dynamics = data.system.dynamics(q, v, u)
+    latents = [law(z[:, 0]) for law, z in zip(laws, prior.features(dynamics), strict=True)]
+    a = dynamics.acceleration((prior.mixing(dynamics) @ torch.stack(latents, -1)[..., None])[..., 0]).numpy()
+    return replace(data, a=a + NOISE * np.random.default_rng(seed).standard_normal(a.shape), truth={"a": a})
+
+
+def fitted(data: Dataset, prior: ForcePrior, points: int, mean: str = "analytical", **options: Any) -> Any:
+    assert data.system is not None
+    return StructuredGP(data.system, prior, mean).fit(data, points=points, restarts=1, **options)  # type: ignore[arg-type]
+
+
+def turntable(torque: Law) -> Dataset:
+    """25 postures at rest of a joint about the vertical, on which nothing but `torque` acts; none near half a turn."""
+    robot = Robot.from_urdf_text(TURNTABLE)
+    rng = np.random.default_rng(0)
+    q = torch.tensor(rng.uniform(-math.pi + 0.8, math.pi - 0.8, (25, 1)))
+    a = robot.forward_dynamics(q, 0.0 * q, torque(q)).numpy()
+    return _dataset(MechanicalSystem(robot), q.numpy(), 0.0 * a, 0.0 * a, a, rng)
+
+
+def slow_motions(mass: float, place: torch.Tensor) -> Dataset:
+    """300 states of the KUKA in free motion with a point mass at `place` in link 7, of which its system knows nothing.
+
+    Accelerations of some 0.1 rad/s^2: what shows is the weight, but the mass has its inertia, too.
+    """
+    known = recording(1).system
+    assert known is not None
+    carrying = known.robot.with_inertials({TOOL: _with_body(known.robot, mass, place)})
+    rng = np.random.default_rng(3)
+    q = np.deg2rad((85, 50, -10, -100, -170, -25, -100)) + rng.uniform(-0.8, 0.8, (300, 7))
+    v, a = 0.1 * rng.standard_normal((2, 300, 7))
+    u = carrying.inverse_dynamics(torch.tensor(q), torch.tensor(v), torch.tensor(a)).numpy()
+    return _dataset(MechanicalSystem(known.robot), q, v, u, a, rng)
+
+
+def _dataset(
+    system: MechanicalSystem, q: np.ndarray, v: np.ndarray, u: np.ndarray, a: np.ndarray, rng: np.random.Generator
+) -> Dataset:
+    """With noise on the acceleration."""
+    return Dataset(
+        q=q,
+        v=v,
+        u=u,
+        a=a + NOISE * rng.standard_normal(a.shape),
+        time=0.01 * np.arange(len(q)),
+        joint_names=system.robot.joint_names,
+        noise_std=np.full(q.shape[1], NOISE),
+        system=system,
+    )
+
+
+def _with_body(robot: Robot, mass: float, place: torch.Tensor) -> torch.Tensor:
+    """Inertial parameters of link 7 with a point mass fixed to it."""
+    link = robot.link(TOOL)
+    own, center, inertia = (torch.tensor(x, dtype=F64) for x in (link.mass, link.center_of_mass, link.inertia))
+    together = own + mass
+    middle = (own * center + mass * place) / together
+
+    def shifted(m: torch.Tensor | float, d: torch.Tensor) -> torch.Tensor:
+        return m * (d.square().sum() * torch.eye(3, dtype=F64) - torch.outer(d, d))
+
+    return parameters_from_physical(
+        together, middle, inertia + shifted(own, center - middle) + shifted(mass, place - middle)
+    )
+
+
+TURNTABLE = """<robot name="turntable"><link name="base"/><joint name="turn" type="continuous"><parent link="base"/>
+<child link="table"/><axis xyz="0 0 1"/></joint><link name="table"><inertial><mass value="2"/>
+<inertia ixx="0.3" iyy="0.3" izz="0.5" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
