@@ -31,6 +31,7 @@ TRUE_NAMES: dict[str, str] = {
     "tool-forces": "tool-friction",
     "contact-friction": "tool-friction",
     "load-friction": "tool-friction",
+    "friction-map": "tool-friction",
 }
 """Component of a model -> what a Dataset calls that force (`Q_U.<name>`, `force.<name>`), where it is not the same."""
 

@@ -124,29 +124,28 @@ def _normal_force(posterior: Any, test: Dataset) -> dict[str, Any]:
 
 def _components(posterior: Any, test: Dataset) -> dict[str, Any]:
     """How far the components are from their sum, and the error of every joint force that the truth knows [Nm]."""
+    from forcegp.evaluation import force_scores
+
     found = posterior.components(test.q, test.v, test.u, covariance=False)
     if not found:
         return {}
     total = sum(part.joint_force.mean for part in found.values())
     out = {"component_sum_error": float((total - found.total.mean).abs().max())}
-    for name, part in found.items():
-        truth = test.truth.get("Q_U.joint-friction" if name == "joint-friction" else "Q_U.tool-friction")
-        if truth is not None:
-            out[f"force_mae.{name}"] = float((part.joint_force.mean - torch.tensor(truth)).abs().mean())
-    return out
+    return out | {f"force_mae.{name}": score.mae for name, score in force_scores(posterior, test).joint_force.items()}
 
 
 def curve_scores(posterior: Any) -> dict[str, Any]:
     """Share of the visited range where the 95 % band of a friction curve holds the true law, per curve."""
+    from forcegp.evaluation import curve_coverage
     from forcegp.experiments.true_curves import true_curves
 
     out = {}
     for latent, law in true_curves(posterior).items():
         curve = posterior.curve(latent)
-        lower, upper = curve.interval(0.95)
         truth = torch.tensor(law(curve.features[:, 0].numpy()))
+        size = float(truth.square().mean().sqrt())
         out[latent] = {
-            "coverage": float(((lower <= truth) & (truth <= upper)).double().mean()),
-            "relative_error": float((curve.mean - truth).square().mean().sqrt() / truth.square().mean().sqrt()),
+            "coverage": curve_coverage(curve, law),
+            "relative_error": float((curve.mean - truth).square().mean().sqrt()) / size if size else None,
         }
     return out

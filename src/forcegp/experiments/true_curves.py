@@ -32,10 +32,10 @@ def true_curves(posterior: Any) -> dict[str, Law]:
         if isinstance(term, JointFriction):
             for joint, name in zip(term.latent_names(system.robot), names[which], strict=True):
                 out[name] = _joint_law(config, system.robot.joint_names.index(joint))
-        elif isinstance(term, ContactFriction) and term.axes == "isotropic":
+        elif isinstance(term, ContactFriction) and term.axes == "isotropic" and term.inputs == ("velocity",):
             law = _tool_law(config, term.load)
             if law is not None:
-                out[names[which][0]] = law
+                out[names[which][0]] = _per_speed(law) if term.viscous else law
     return out
 
 
@@ -59,6 +59,10 @@ def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
     if isinstance(law, ViscousFriction) and not load and config.patch_factor == 1.0:
         return lambda speed: law.coefficient * np.asarray(speed)
     return None
+
+
+def _per_speed(law: Law) -> Law:
+    return lambda speed: law(speed) / speed
 
 
 def _tuples(config: Mapping[str, Any]) -> dict[str, Any]:
