@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import override
 
 from forcegp.experiments import published
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
-from forcegp.experiments.force_tables import only_test, score_table
+from forcegp.experiments.force_tables import only_test, plain_ticks, score_table
 from forcegp.experiments.results import Results
 
 if TYPE_CHECKING:
@@ -60,7 +61,11 @@ class DataEfficiency(ForceExperiment):
         published_mae = published.FIG2B_MAE["s-gp-mean"]
         label = "S-GP + mean, published (2021)"
         panels[0].plot(published.FIG2B_POINTS, published_mae, color=QUIET, linestyle="--", linewidth=1.0, label=label)
-        panels[0].axhline(published.NOISE_STD * (2.0 / 3.141592653589793) ** 0.5, color=QUIET, linewidth=0.8)
+        perfect = published.NOISE_STD * (2.0 / pi) ** 0.5
+        panels[0].axhline(perfect, color=QUIET, linewidth=0.8, label="a perfect prediction")
+        for axes in panels:
+            plain_ticks(axes.xaxis)
+            plain_ticks(axes.yaxis)
         handles = panels[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=SMALL, frameon=False)
         return {"data-efficiency": figure}

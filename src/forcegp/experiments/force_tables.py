@@ -1,13 +1,15 @@
-"""Tables and bars of the experiments on force priors."""
+"""Tables and plots of the experiments on force priors."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from forcegp.experiments.experiment import markdown_table, shown
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 COLUMNS = {
@@ -46,27 +48,40 @@ def only_test(trial: Mapping[str, Any]) -> Mapping[str, Any]:
     return scores
 
 
-def bars_figure(groups: Mapping[str, Mapping[str, Mapping[str, Any]]], score: str, label: str) -> Figure:
-    """Group -> model -> scores: one panel per group, a bar per model, the range over seeds as a line."""
-    from forcegp.evaluation.figure_style import QUIET, SERIES, new_figure, quiet
+def dots_figure(groups: Mapping[str, Mapping[str, Mapping[str, Any]]], score: str, label: str) -> Figure:
+    """Group -> model -> scores: one panel per group, a dot per model at the median, the range over seeds as a line.
 
-    models = list(dict.fromkeys(model for scores in groups.values() for model in scores))
-    figure = new_figure(3.4 * len(groups) + 0.6, 0.34 * max(len(scores) for scores in groups.values()) + 1.3)
+    The first model of a group is what the others are compared with, and grey.
+    """
+    from forcegp.evaluation.figure_style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
+
+    figure = new_figure(4.8 * len(groups), 0.32 * max(len(scores) for scores in groups.values()) + 1.3)
     panels = figure.subplots(1, len(groups), squeeze=False)[0]
     for axes, (group, scores) in zip(panels, groups.items(), strict=True):
-        for place, (model, values) in enumerate(scores.items()):
-            value = values[score]
-            color = SERIES[models.index(model) % len(SERIES)]
-            axes.barh(place, value["median"], color=color, height=0.62)
-            axes.plot([value["min"], value["max"]], [place, place], color=QUIET, linewidth=1.2)
-            axes.annotate(
-                f"{value['median']:.3g}", (value["max"], place), (4, 0), textcoords="offset points", va="center", size=7
-            )
+        for place, model in enumerate(scores):
+            value, color = scores[model][score], PREDICTION if place else MEASUREMENT
+            axes.plot([value["min"], value["max"]], [place, place], color=color, linewidth=3.0, alpha=0.45)
+            axes.plot(value["median"], place, "o", color=color, markersize=6.0)
+            text = f"{value['median']:.3g}"
+            beside = (value["max"], place)
+            axes.annotate(text, beside, (7, 0), textcoords="offset points", va="center", fontsize=SMALL, color=TRUTH)
         axes.set_yticks(range(len(scores)), list(scores))
-        axes.invert_yaxis()
+        axes.set_ylim(len(scores) - 0.5, -0.5)
         axes.set_xscale("log")
         lowest = min(values[score]["min"] for values in scores.values())
         highest = max(values[score]["max"] for values in scores.values())
-        axes.set_xlim(0.5 * lowest, 4.0 * highest)
-        quiet(axes, title=group, x=label, y="")
+        axes.set_xlim(0.6 * lowest, 2.5 * highest)
+        plain_ticks(axes.xaxis)
+        quiet(axes, title=fill(group, 44), x=label)
     return figure
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers such as 0.02 and 50 at 1, 2 and 5 times powers of ten of a logarithmic axis."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    low, high = axis.get_view_interval()
+    steps = (1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=steps))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -12,7 +12,7 @@ from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_cells import MODEL, load
 from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
 from forcegp.experiments.force_scenarios import LABELS
-from forcegp.experiments.force_tables import bars_figure, only_test, score_table
+from forcegp.experiments.force_tables import dots_figure, only_test, score_table
 from forcegp.experiments.results import Results
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Friction(ForceExperiment):
         posterior = load_posterior(results.cell_folder(trial_name(pictured, seed)) / MODEL)
         test = load(results, self.data_cell(pictured.scenario, seed, training=False).name)
         return {
-            "friction-errors": bars_figure(groups, "mae_noise_free", "MAE against noise-free accelerations [rad/s²]"),
+            "friction-errors": dots_figure(groups, "mae_noise_free", "mean absolute error, noise-free [rad/s²]"),
             "friction-curves": friction_curves_figure(posterior, test),
             "friction-normal-force": normal_force_figure(posterior, test),
         }
@@ -84,9 +84,10 @@ class Friction(ForceExperiment):
         parts = [
             f"{', '.join(map(str, self.points))} points, analytical mean, {len(self.seeds)} seeds. The normal force is "
             "that of the simulation; its error is relative to its own root mean square. “Sum of components” is the "
-            "largest difference between the sum of all component forces and the total. Curve: share of the visited "
-            "velocities at which the 95 % band of a friction curve holds the law that was simulated, mean over the "
-            "model's curves, where its prior has such a law. The pictures show the last model of the last table."
+            "largest difference between the sum of all component forces and the total. “Curve in its band” is "
+            "the share of the visited velocities at which the 95 % band of a friction curve holds the law that was "
+            "simulated, mean over the model's curves, where its prior has such a law. The pictures show the last model "
+            "of the last table."
         ]
         for scenario in PRIORS:
             trials = [trial for trial in summary["trials"] if trial["scenario"] == scenario]
