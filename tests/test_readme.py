@@ -7,9 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+from benchmarks.force_pictures import PICTURES
+
+from forcegp import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.cli.arguments import parse_arguments
 from forcegp.experiments import published
 from forcegp.experiments.model_names import MODELS
+from forcegp.priors import KERNELS, NAMED_PRIORS, named_prior
 
 
 def test_the_python_example_runs(repository: Path, tmp_path: Path):
@@ -50,6 +54,49 @@ def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
     for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
         for command in re.findall(r"^ *forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
             parse_arguments(shlex.split(command.partition(">")[0].replace("$seed", "1")))
+
+
+def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    example, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # the other has tests of its own
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    tool, total, curve, error, free = done.stdout.splitlines()
+    assert tool == "torch.Size([2400, 1]) torch.Size([2400, 7, 7]) torch.Size([2400, 3])"
+    assert total == "torch.Size([2400, 7]) torch.Size([2400, 1])"
+    assert re.fullmatch(r"sliding speed \[m/s\] from \S+ to \S+, 200 values in N", curve)
+    assert float(error.split()[-2]) < 20.0
+    assert free == "torch.Size([2400, 0])"
+    assert {"friction.png", "normal-force.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_commands_and_priors_of_the_page_on_forces_exist(repository: Path):
+    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    rows = page.partition("## Which prior?")[2].partition("\n## ")[0]
+    told = {name.partition(":")[0] for name in re.findall(r"^\| `([^`]+)` \|", rows, re.MULTILINE)}
+    assert told == set(NAMED_PRIORS) - {"air-drag"}
+    rows = page.partition("## Kernels")[2].partition("\n## ")[0]
+    told = {
+        name for cell in re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
+    }
+    assert told == set(KERNELS)
+    system = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).system
+    count = 0
+    for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
+        for line in re.findall(r"^forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
+            command = parse_arguments(shlex.split(line))
+            for prior in getattr(command, "prior", ()):
+                named_prior(prior, system)
+                count += 1
+    assert count > 10
+
+
+def test_the_pictures_and_pages_that_the_page_on_forces_names_exist(repository: Path):
+    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)#]+)\)", page)
+    written_by_a_command = {"force-priors.md"}
+    assert not [link for link in set(links) - written_by_a_command if not (repository / "docs" / link).exists()]
+    drawn = re.findall(r"\]\(forces/(.*)\.png\)", page)
+    assert set(drawn) == set(PICTURES)
 
 
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
