@@ -1,13 +1,24 @@
 """The presets, and the page that the documentation shows."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from forcegp.errors import InvalidInput
 from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import markdown_table, number, shown, spread
+from forcegp.experiments.force_experiment import ForceExperiment, Trial
+from forcegp.experiments.force_scenarios import SCENARIOS
+from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 from forcegp.experiments.presets import PRESETS, experiments_of
 from forcegp.experiments.report import report
 from forcegp.experiments.reproduction import as_csv, read_document
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+COMMITTED = [
+    preset for preset in PRESETS if preset not in TRIAL_PRESETS and (DOCS / f"{page_of(preset).name}.md").exists()
+]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -42,15 +53,47 @@ def test_unknown_names_list_the_known():
         experiments_of("papers", "all")
 
 
-def test_the_committed_page_is_made_of_the_committed_numbers(repository):
-    folder = repository / "docs" / "reproduction"
-    experiments = PRESETS["paper"]
+@pytest.mark.parametrize("preset", COMMITTED)
+def test_the_committed_page_is_made_of_the_committed_numbers(preset):
+    name = page_of(preset).name
+    folder, experiments = DOCS / name, PRESETS[preset]
     documents = {experiment.name: read_document(folder / f"{experiment.name}.json") for experiment in experiments}
-    assert (repository / "docs" / "reproduction.md").read_text() == report(experiments, documents)
+    assert {document["preset"] for document in documents.values()} == {preset}
+    assert (DOCS / f"{name}.md").read_text() == report(experiments, documents)
     for experiment in experiments:
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
         assert all((folder / f"{name}{ending}").exists() for name in document["figures"] for ending in (".png", ".svg"))
+
+
+def test_the_page_of_the_paper_is_committed():
+    assert "paper" in COMMITTED
+
+
+@pytest.mark.parametrize("preset", ["forces", "forces-smoke"])
+def test_trials_are_told_apart_by_their_names(preset):
+    """One name is one model on one scenario, in all experiments: they share cells, and no cell is of two trials."""
+    known: dict[str, Trial] = {}
+    for experiment in PRESETS[preset]:
+        assert isinstance(experiment, ForceExperiment)
+        trials = experiment.trials()
+        assert len({trial.name for trial in trials}) == len(trials)
+        for trial in trials:
+            first = known.setdefault(trial.name, trial)
+            assert replace(trial, label="") == replace(first, label="")
+            assert {trial.scenario, *trial.tests.values()} <= set(SCENARIOS)
+    assert len({repr(replace(trial, label="")) for trial in known.values()}) == len(known)
+
+
+@pytest.mark.parametrize(
+    "change", [{"points": 3}, {"prior": "joint:inputs=q"}, {"mean": "zero"}, {"region": True}, {"scenario": "tilted"}]
+)
+def test_what_differs_between_trials_shows_in_their_names(change):
+    trial = Trial("one", "viscous", "joint", 10, {"there": "sphere"})
+    assert replace(trial, **change).name != trial.name
+    assert replace(trial, label="other").name == trial.name
+    assert replace(trial, tests={"there": "tilted"}).name != trial.name
+    assert "/" not in replace(trial, prior="joint:inputs=q/v").name.split("/")[1]
 
 
 def test_spreads_and_tables():

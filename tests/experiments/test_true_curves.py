@@ -1,0 +1,95 @@
+"""The laws that a simulation followed, as curves: closed forms with the numbers of its configuration."""
+
+import dataclasses
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forcegp.inference import OptimizerOptions
+from forcegp.models import IndependentGP, StructuredGP
+from forcegp.priors import ContactFriction, JointFriction, ToolForces
+from forcegp.simulation import KukaSurfaceConfig
+
+V = np.linspace(-1.5, 1.5, 40)  # rad/s, without 0
+SPEED = np.linspace(0.01, 1.2, 40)  # m/s
+
+
+@pytest.fixture
+def curves(motion):
+    """The true curves of a prior, fitted to rows that say to come from a simulation with these changes."""
+    from forcegp.experiments.true_curves import true_curves
+
+    def of(prior, **changes):
+        config = dataclasses.asdict(KukaSurfaceConfig(seconds=2, seed=1, **changes))
+        stated = {name: list(value) if isinstance(value, tuple) else value for name, value in config.items()}
+        data = replace(motion.rows(slice(0, None, 60)), metadata={"config": stated})
+        model = StructuredGP(data.system, prior)
+        return true_curves(model.fit(data, restarts=1, options=OptimizerOptions(iterations=0)))
+
+    return of
+
+
+def test_friction_that_grows_with_the_load_is_a_coefficient(curves):
+    prior = ContactFriction(load=True, expected=0.2)
+    smooth = SPEED / np.sqrt(SPEED**2 + 0.04**2)
+    given = {"friction_smoothing": 0.04, "coulomb_coefficient": 0.25}
+    law = curves(prior, friction="coulomb", **given)["sliding"]
+    np.testing.assert_allclose(law(SPEED), 0.25 * smooth, rtol=1e-12)
+    law = curves(prior, friction="stribeck", static_coefficient=0.6, stribeck_velocity=0.2, **given)["sliding"]
+    np.testing.assert_allclose(law(SPEED), (0.25 + 0.35 * np.exp(-((SPEED / 0.2) ** 2))) * smooth, rtol=1e-12)
+
+
+def test_viscous_friction_is_a_force_and_per_speed_a_constant(curves):
+    law = curves(ContactFriction(), viscous_coefficient=1.7)["sliding"]
+    np.testing.assert_allclose(law(SPEED), 1.7 * SPEED, rtol=1e-12)
+    law = curves(ContactFriction(viscous=True), viscous_coefficient=1.7)["sliding"]
+    np.testing.assert_allclose(law(SPEED), 1.7 * np.ones(40), rtol=1e-12)
+
+
+def test_joints_resist_by_the_law_of_each(curves):
+    changes = {"joint_friction": "stribeck", "joint_smoothing": 0.08, "joint_stribeck_velocity": 0.3}
+    found = curves(JointFriction() + ContactFriction(), **changes)
+    assert len(found) == 8
+    config = KukaSurfaceConfig()
+    for k in range(7):
+        coulomb, static, viscous = config.joint_coulomb[k], config.joint_static[k], config.joint_viscous[k]
+        level = coulomb + (static - coulomb) * np.exp(-((V / 0.3) ** 2))
+        expected = np.tanh(V / 0.08) * level + viscous * V
+        np.testing.assert_allclose(found[f"joint-friction lbr_iiwa_joint_{k + 1}"](V), expected, rtol=1e-12)
+        assert bool((expected * V > 0.0).all())
+
+
+def test_one_joint_alone_has_its_own_law(curves):
+    whole = curves(JointFriction(), joint_friction="stribeck")
+    (alone,) = curves(JointFriction(("lbr_iiwa_joint_3",)), joint_friction="stribeck").values()
+    assert np.array_equal(alone(V), whole["lbr_iiwa_joint_3"](V))
+    assert not np.array_equal(alone(V), whole["lbr_iiwa_joint_5"](V))
+
+
+def test_joints_without_friction_resist_nothing(curves):
+    found = curves(JointFriction(("lbr_iiwa_joint_2",)))
+    assert np.array_equal(found["lbr_iiwa_joint_2"](V), np.zeros(40))
+
+
+@pytest.mark.parametrize(
+    ("prior", "changes"),
+    [
+        (ContactFriction(), {"friction": "stribeck"}),  # not proportional to the load
+        (ContactFriction(load=True, expected=0.2), {}),  # viscous friction does not grow with it
+        (ContactFriction(), {"patch_factor": 4.0}),
+        (ContactFriction(), {"contact": "bullet"}),
+        (ContactFriction(axes="two-axis"), {}),
+        (ContactFriction(viscous=True, inputs=("position",)), {}),
+        (ToolForces(), {}),
+    ],
+)
+def test_what_the_simulation_did_not_follow_has_no_law(curves, prior, changes):
+    assert curves(prior, **changes) == {}
+
+
+def test_models_without_forces_have_no_law(motion):
+    from forcegp.experiments.true_curves import true_curves
+
+    data = motion.rows(slice(0, None, 60))
+    assert true_curves(IndependentGP(data.system).fit(data, options=OptimizerOptions(iterations=0))) == {}
