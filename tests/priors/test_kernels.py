@@ -90,11 +90,12 @@ def test_friction_against_its_formula():
     sign.raw_width.data.fill_(math.log(0.2))
     level.kernels[0].constant = float64([0.7])
     level.kernels[1].outputscale = float64(0.4)
+    level.kernels[1].base_kernel.raw_width.data.fill_(math.log(0.3))
     level.kernels[1].base_kernel.lengthscale = float64([[0.6]])
     kernel.kernels[1].variance = float64([[0.9]])
     s = normal(7, 1)
-    phi = torch.tanh(s / 0.2)
-    expected = phi @ phi.mT * (0.7 + squared_exponential(s, s, float64(0.6), 0.4)) + 0.9 * s @ s.mT
+    phi, x = torch.tanh(s / 0.2), torch.asinh(s / 0.3)
+    expected = phi @ phi.mT * (0.7 + 0.4 * torch.exp(-(x - x.mT).abs() / 0.6)) + 0.9 * s @ s.mT
     torch.testing.assert_close(matrix(kernel, s), expected, rtol=1e-13, atol=1e-14)
 
 
@@ -244,9 +245,13 @@ def test_hyperpriors_are_normal_in_the_logarithm(expression, part, center, sprea
 def test_the_width_of_friction_has_a_hyperprior():
     latent = LatentKernels([kernel_of("friction", 1, 0.6)])
     start = latent.initial_parameters()
-    name = "kernels.0.kernels.0.kernels.0.raw_width"
-    assert float(start[name].exp()) == pytest.approx(0.1)
-    assert float(latent.log_prior(start) - latent.log_prior(start | {name: start[name] + 1.5})) == pytest.approx(1.125)
+    for name in (
+        "kernels.0.kernels.0.kernels.0.raw_width",
+        "kernels.0.kernels.0.kernels.1.kernels.1.base_kernel.raw_width",
+    ):
+        assert float(start[name].exp()) == pytest.approx(0.1)
+        moved = latent.log_prior(start | {name: start[name] + 1.5})
+        assert float(latent.log_prior(start) - moved) == pytest.approx(1.125)
 
 
 # ---------------------------------------------------------------- the kernel that learns where a force changes

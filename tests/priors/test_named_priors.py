@@ -33,6 +33,7 @@ NAMES = {
     "tool-forces": SURFACE_FORCES,
     "contact-friction": ContactFriction(),
     "load-friction": ContactFriction(load=True),
+    "friction-map": ContactFriction(viscous=True, inputs=("position",)),
     "payload:frame=hand": Payload("hand"),
     "joint-accelerations": JointAccelerations(),
     "none": NoForces(),

@@ -60,9 +60,10 @@ class _WidthKernel(Kernel):
     @property
     def width(self) -> Tensor:
         """As a positive number."""
-        constraint = self.raw_width_constraint
+        constraint, raw = self.raw_width_constraint, self.raw_width
         assert isinstance(constraint, Interval)
-        return constraint.transform(self.raw_width)
+        assert isinstance(raw, Tensor)
+        return constraint.transform(raw)
 
 
 class SmoothSignKernel(_WidthKernel):
@@ -79,7 +80,9 @@ class SmoothSignKernel(_WidthKernel):
         return torch.tanh(z / self.width)
 
     @override
-    def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: Any) -> Tensor:
+    def forward(
+        self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **params: Any
+    ) -> Tensor:
         left, right = self.weight_features(x1), self.weight_features(x2)
         return (left * right).sum(-1) if diag else left @ right.mT
 
