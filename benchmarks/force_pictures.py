@@ -20,7 +20,21 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from benchmarks.force_recordings import F64, TOOL, Law, fitted, recording, slow_motions, turntable, with_force
+from benchmarks.force_recordings import (
+    F64,
+    TOOL,
+    Law,
+    across_the_strip,
+    fitted,
+    mass_and_place,
+    plane_of,
+    recording,
+    roughness,
+    slow_motions,
+    turntable,
+    visited,
+    with_force,
+)
 from forcegp import (
     ContactFriction,
     JointAccelerations,
@@ -44,7 +58,6 @@ from forcegp.evaluation.figure_style import (
     quiet,
     window,
 )
-from forcegp.mechanics import surface_axes
 from forcegp.priors.expected_friction import ExpectedFriction
 
 BAND = 1.959963984540054
@@ -76,11 +89,6 @@ def finish(figure: Any, *axes: Any) -> Any:
         known.values(), known.keys(), loc="outside lower center", ncols=len(known), fontsize=NORMAL, frameon=False
     )
     return figure
-
-
-def visited(posterior: Any, latent: int, feature: int = 0) -> np.ndarray:
-    features = posterior.model.prior.features(posterior.likelihood.dynamics())
-    return features[latent][:, feature].numpy()
 
 
 def joint_forces() -> Any:
@@ -130,11 +138,11 @@ def tool_forces() -> Any:
     curve = plain.curve("force-tangent-1", features)
     draw_curve(left, curve, lambda v: -v, visited(plain, 0))
     quiet(left, title="tool-friction, 20 points", x="velocity along tangent-1 in m/s", y="force along tangent-1 in N")
-    tangents, visited_x = _plane(posterior)
-    x, place = _across()
+    tangents, visited_x = plane_of(posterior)
+    x, place = across_the_strip()
     one_along = torch.tensor([1.0, 0.0], dtype=F64).expand(len(x), 2)
     curve = posterior.curve("force-tangent-1", torch.cat([one_along, place @ tangents], -1))
-    draw_curve(right, _Line(x, curve.mean, curve.std), lambda p: -_roughness(p), visited_x)
+    draw_curve(right, _Line(x, curve.mean, curve.std), lambda p: -roughness(p), visited_x)
     quiet(
         right,
         title="tool-forces across a rough strip, 300 points",
@@ -208,7 +216,7 @@ def payload() -> Any:
     mass, place = 1.5, torch.tensor([0.04, -0.02, 0.10], dtype=F64)
     data = slow_motions(mass, place)
     counts = [3, 5, 10, 20, 50, 100]
-    found = [_mass_and_place(fitted(data, Payload(TOOL), count)) for count in counts]
+    found = [mass_and_place(fitted(data, Payload(TOOL), count)) for count in counts]
     figure = new_figure(10.0, 3.2)
     left, right = figure.subplots(1, 2)
     left.axhline(mass, color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
@@ -287,12 +295,12 @@ def friction_map() -> Any:
     rough = recording(1, patch_factor=4.0)
     figure = new_figure(11.0, 3.2)
     grid = figure.subplots(1, 3)
-    x, place = _across()
+    x, place = across_the_strip()
     for axes, kernel in zip(grid, ("squared-exponential", "matern-3/2", "deep"), strict=True):
         posterior = fitted(rough, ContactFriction(viscous=True, inputs=("position",), kernel=kernel), 100)
-        tangents, visited_x = _plane(posterior)
+        tangents, visited_x = plane_of(posterior)
         curve = posterior.curve("sliding", place @ tangents)
-        draw_curve(axes, _Line(x, curve.mean, curve.std), _roughness, visited_x)
+        draw_curve(axes, _Line(x, curve.mean, curve.std), roughness, visited_x)
         axes.set_ylim(0.0, 6.0)
         quiet(axes, title=f"{kernel}, 100 points", x="place x in m", y="coefficient in N/(m/s)")
     return finish(figure, *grid)
@@ -303,37 +311,6 @@ class _Line:
 
     def __init__(self, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> None:
         self.features, self.mean, self.std = features, mean, std
-
-
-def _across() -> tuple[torch.Tensor, torch.Tensor]:
-    """Places x (201, 1) across the strip, and the points (201, 3) on the plane at y = 0.5 m."""
-    x = torch.linspace(-0.5, 0.5, 201, dtype=F64)
-    return x[:, None], torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.055)], -1)
-
-
-def _roughness(x: torch.Tensor) -> torch.Tensor:
-    """Viscous coefficient in N/(m/s) of a patch of factor 4."""
-    return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25))
-
-
-def _plane(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
-    """The two tangents (3, 2) of the plane, of which the first is x, and where the tool was in x."""
-    dynamics = posterior.likelihood.dynamics()
-    tool = dynamics.state.kinematics.frame_pose(TOOL)
-    points = tool[:, :3, 3] + 0.1 * tool[:, :3, 2]
-    return surface_axes(dynamics.normals[:1, 0, :])[0, :, :2], points[:, 0].numpy()
-
-
-def _mass_and_place(posterior: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of m and c = (m c) / m, the latter to first order."""
-    rows = posterior.training
-    latents = posterior.components(rows.q[:1], rows.v[:1], rows.u[:1])["payload"].latents
-    mean, covariance = latents.mean[0], latents.covariance[0]
-    center = mean[1:] / mean[0]
-    derivative = torch.cat([-center[:, None], torch.eye(3, dtype=F64)], -1) / mean[0]
-    derivative = torch.cat([torch.eye(1, 4, dtype=F64), derivative])
-    spread = (derivative @ covariance @ derivative.mT).diagonal().sqrt()
-    return torch.cat([mean[:1], center]).numpy(), spread.numpy()
 
 
 PICTURES: dict[str, Callable[[], Any]] = {

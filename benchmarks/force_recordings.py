@@ -1,4 +1,4 @@
-"""Recordings with forces of which the truth is known, for the pictures of docs/forces.md."""
+"""Recordings with forces of which the truth is known, and what models of them say (pictures of docs/forces.md)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from forcegp import Dataset, KukaSurfaceConfig, MechanicalSystem, Robot, StructuredGP, simulate_kuka_surface
+from forcegp.mechanics import surface_axes
 from forcegp.priors import ForcePrior
 from forcegp.robots import parameters_from_physical
 
@@ -65,6 +66,42 @@ def slow_motions(mass: float, place: torch.Tensor) -> Dataset:
     v, a = 0.1 * rng.standard_normal((2, 300, 7))
     u = carrying.inverse_dynamics(torch.tensor(q), torch.tensor(v), torch.tensor(a)).numpy()
     return _dataset(MechanicalSystem(known.robot), q, v, u, a, rng)
+
+
+def across_the_strip() -> tuple[torch.Tensor, torch.Tensor]:
+    """Places x (201, 1) across the strip, and the points (201, 3) on the plane at y = 0.5 m."""
+    x = torch.linspace(-0.5, 0.5, 201, dtype=F64)
+    return x[:, None], torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.055)], -1)
+
+
+def roughness(x: torch.Tensor) -> torch.Tensor:
+    """Viscous coefficient in N/(m/s) of a patch of factor 4."""
+    return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25))
+
+
+def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
+    """The two tangents (3, 2) of the plane, of which the first is x, and where the tool was in x."""
+    dynamics = posterior.likelihood.dynamics()
+    tool = dynamics.state.kinematics.frame_pose(TOOL)
+    points = tool[:, :3, 3] + 0.1 * tool[:, :3, 2]
+    return surface_axes(dynamics.normals[:1, 0, :])[0, :, :2], points[:, 0].numpy()
+
+
+def visited(posterior: Any, latent: int, feature: int = 0) -> np.ndarray:
+    features = posterior.model.prior.features(posterior.likelihood.dynamics())
+    return features[latent][:, feature].numpy()
+
+
+def mass_and_place(posterior: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of m and c = (m c) / m, the latter to first order."""
+    rows = posterior.training
+    latents = posterior.components(rows.q[:1], rows.v[:1], rows.u[:1])["payload"].latents
+    mean, covariance = latents.mean[0], latents.covariance[0]
+    center = mean[1:] / mean[0]
+    derivative = torch.cat([-center[:, None], torch.eye(3, dtype=F64)], -1) / mean[0]
+    derivative = torch.cat([torch.eye(1, 4, dtype=F64), derivative])
+    spread = (derivative @ covariance @ derivative.mT).diagonal().sqrt()
+    return torch.cat([mean[:1], center]).numpy(), spread.numpy()
 
 
 def _dataset(
