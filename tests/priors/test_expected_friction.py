@@ -206,6 +206,8 @@ class TestRefinedLoads:
             ContactFriction(),
             ContactFriction(load=True, expected=0.3),
             ContactFriction(load=True, axes="two-axis"),
+            ContactFriction(load=True, viscous=True),
+            ContactFriction(load=True, inputs=("velocity", "position")),
             JointFriction() + ContactFriction(load=True, expected=0.0),
         ],
     )
