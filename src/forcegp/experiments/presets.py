@@ -28,7 +28,7 @@ PAPER_SEEDS = (101, 102, 103, 104, 105)
 
 # Seeds that served no choice of a prior or kernel.
 FORCE_SEEDS = (301, 302, 303, 304, 305)
-FORCE_DATA = DataSettings(train_seconds=60.0, rows=400, test_seconds=24.0, every=12)
+FORCE_DATA = DataSettings(train_seconds=60.0, rows=400, test_seconds=60.0, every=4)
 FORCE_SMOKE_DATA = DataSettings(train_seconds=5.0, rows=200, test_seconds=5.0, every=12)
 
 PAPER_POINTS = (100, 200, 400, 600, 800, 1000)
