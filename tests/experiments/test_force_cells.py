@@ -54,6 +54,7 @@ def test_scores_are_what_they_say(rubbing):
     mean = prediction.mean.numpy()
     assert found["mae"] == pytest.approx(np.abs(mean - test.a).mean(), rel=1e-9)
     assert found["mae_noise_free"] == pytest.approx(np.abs(mean - test.truth["a"]).mean(), rel=1e-9)
+    assert found["mae_of_truth"] == pytest.approx(np.abs(test.truth["a"] - test.a).mean(), rel=1e-12)
     force, std = prediction.multiplier.mean.numpy(), prediction.multiplier.std.numpy()
     error = force - test.truth["lambda"]
     relative = np.sqrt(np.mean(error**2) / np.mean(test.truth["lambda"] ** 2))
@@ -101,7 +102,7 @@ def test_black_boxes_are_scored_on_accelerations_alone(rubbing):
     _, test = rubbing
     black_box = IndependentGP(test.system).fit(test, options=OptimizerOptions(iterations=0))
     found = force_cells.scores(black_box, test)
-    assert set(found) == {"mae", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae"}
+    assert set(found) == {"mae", "mae_of_truth", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae"}
     assert force_cells.curve_scores(black_box) == {}
 
 

@@ -81,7 +81,7 @@ class DataEfficiency(ForceExperiment):
             [
                 f"The paper's scenario, analytical mean, {len(self.seeds)} seeds. The paper's best model has an MAE of "
                 f"{best} with 1000 points. A perfect one has the mean of the noise: 0.0798 in the long run, on these "
-                f"test rows {shown(only_test(inside[0])['mae_of_truth'])}.",
+                f"test rows {shown(only_test(inside[0]).get('mae_of_truth'))}.",
                 score_table(inside, columns),
                 "**Extrapolation**: trained on rows with the tool at x < 0, tested at x > 0.1 m.",
                 score_table(outside, columns[:4]),
