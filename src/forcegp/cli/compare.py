@@ -76,6 +76,7 @@ class Compare(LearningOptions):
         dataset = Dataset.load(self.data)
         system = self._system(dataset)
         priors = self._priors(system)
+        dataset = self._rows(terminal, dataset, system)
         test = None if self.test is None else Dataset.load(self.test)
         comparison = self._compare(terminal, dataset, system, priors, test)
         for warning in comparison.warnings:

@@ -104,7 +104,9 @@ class Fit(FitOptions):
 
         start = time.monotonic()
         dataset = Dataset.load(self.data)
-        model = make_model(command, self._system(dataset), dataset)
+        system = self._system(dataset)
+        dataset = self._rows(terminal, dataset, system)
+        model = make_model(command, system, dataset)
         points = min(command.points, len(dataset))
         posterior = fit(terminal, model, dataset, points=points, **search_arguments(command))
         summary = fit_summary(posterior, time.monotonic() - start)

@@ -74,6 +74,7 @@ class Identify(FitOptions):
         begin = time.monotonic()
         dataset = Dataset.load(self.data)
         system, added = with_learned_forces(self._system(dataset), learn)
+        dataset = self._rows(terminal, dataset, system)
         prior = NoForces() if self.model == "analytical" else JointForces()
         model = StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
         posterior = fit(

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from forcegp.cli.command import Command
+from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from forcegp.cli.terminal import Terminal
     from forcegp.data import Dataset
     from forcegp.mechanics import MechanicalSystem
     from forcegp.robots import Robot
@@ -60,6 +62,9 @@ class LearningOptions(Command):
     ] = ()
     """The complete list of known forces, instead of the dataset's: actuation, rigid-body-bias,
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
+    rows: Annotated[RowsChoice, arg(metavar="auto|in-contact|all")] = "auto"
+    """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
+    every row. auto: in-contact where the tool leaves the surface at times, and says so."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
 
@@ -87,6 +92,10 @@ class LearningOptions(Command):
         if self.known_force:
             system = _with_known_forces(system, self.known_force)
         return system
+
+    def _rows(self, terminal: Terminal, dataset: Dataset, system: MechanicalSystem) -> Dataset:
+        """The rows to learn from."""
+        return rows_to_learn(terminal, dataset, system, self.rows)
 
     def _given(self) -> dict[str, Any]:
         """Options and data, as a folder remembers them."""

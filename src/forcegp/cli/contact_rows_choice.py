@@ -1,0 +1,46 @@
+"""`--rows`: which rows of a recording are learned from, where its contacts may open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from forcegp.cli.terminal import Terminal
+    from forcegp.data import Dataset
+    from forcegp.mechanics import MechanicalSystem
+
+RowsChoice = Literal["auto", "in-contact", "all"]
+
+NEARLY_ALL = 0.995
+"""Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
+HARDLY_ANY = 0.2
+"""Share below which something is wrong with the contact, rather than the tool in the air."""
+
+
+def rows_to_learn(terminal: Terminal, dataset: Dataset, system: MechanicalSystem, choice: RowsChoice) -> Dataset:
+    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; says what was done.
+
+    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all and says what it saw.
+    Raises ContactError with "in-contact" if there are none.
+    """
+    from forcegp.data import rows_in_contact
+    from forcegp.errors import ContactError
+
+    if choice == "all" or not system.contacts:
+        return dataset
+    try:
+        touching = rows_in_contact(replace(dataset, system=system))
+    except ContactError:
+        if choice == "in-contact":
+            raise
+        return dataset  # the fit has more to say about it
+    share = len(touching) / len(dataset)
+    if choice == "auto" and share >= NEARLY_ALL:
+        return dataset
+    told = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+    if choice == "auto" and share < HARDLY_ANY:
+        terminal.note(f"{told}; all are learned from. Check the contact, or give --rows in-contact.")
+        return dataset
+    terminal.note(f"{told}; learning from these alone (--rows all takes every row)")
+    return replace(touching, system=dataset.system)
