@@ -197,6 +197,22 @@ class TestContactFriction:
         isotropic = (ContactFriction().mixing(dynamics) @ ContactFriction().features(dynamics)[0][..., None])[..., 0]
         torch.testing.assert_close(-viscous, isotropic, rtol=1e-8, atol=1e-8)
 
+    @pytest.mark.parametrize(
+        "how",
+        [{"viscous": True}, {"viscous": True, "inputs": ("position",)}, {"inputs": ("position",)}],
+        ids=["viscous", "viscous-map", "dry-map"],
+    )
+    def test_two_axes_whose_latents_do_not_know_the_direction_resist_in_all(self, system, rows, how):
+        """Positive coefficients take power, the force turns round with the motion, and equal ones are isotropic."""
+        q, v, u = rows
+        prior = ContactFriction(axes="two-axis", **how)
+        there, back = system.dynamics(q, v, u), system.dynamics(q, -v, u)
+        joint_force, force = self.friction(there, prior, 0.7, 2.5)
+        assert bool(((v * joint_force).sum(-1) < -1e-4).all())
+        torch.testing.assert_close(self.friction(back, prior, 0.7, 2.5)[1], -force, rtol=1e-12, atol=1e-12)
+        one = self.friction(there, ContactFriction(**how), 2.5)
+        torch.testing.assert_close(self.friction(there, prior, 2.5, 2.5), one, rtol=1e-12, atol=1e-12)
+
 
 def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
     prior = JointFriction(("tilt", "slide"))

@@ -39,13 +39,15 @@ class ContactFriction(ForcePrior):
     """Q_U = -J_t^T f: tangential friction of contact number `contact`, positive latents resist the motion.
 
     Isotropic: f = g(|v_t|) v_t / |v_t| with one latent g on the sliding speed. Two-axis: one latent per tangent, each
-    on the velocity along its own. With `load` the friction is proportional to the nominal normal force (what the
-    contact would carry under the known forces alone, `nominal_normal_force`), and the latents are friction coefficients
-    without unit. Friction changes the normal force in turn: `expected` counts with a friction coefficient (a number, or
-    `ExpectedFriction`), which stays as it is given; where it is None, `StructuredGP.fit` finds it for isotropic
-    friction by itself, by fitting again with what it has learned (`refined_loads`). The kernel "friction" is Coulomb,
-    Stribeck and viscous friction with a learned velocity scale (see `JointFriction`). Without the contact there is no
-    friction.
+    on the velocity v_k along its own, f_k = g_k(v_k). Viscous: g v_t, and g_k v_k along every tangent. Without the
+    velocity among the inputs dry friction along two axes is g_k v_k / |v_t|, so that it turns with the motion.
+
+    With `load` the friction is proportional to the nominal normal force (what the contact would carry under the known
+    forces alone, `nominal_normal_force`), and the latents are friction coefficients without unit. Friction changes the
+    normal force in turn: `expected` counts with a friction coefficient (a number, or `ExpectedFriction`), which stays
+    as it is given; where it is None, `StructuredGP.fit` finds it for isotropic friction by itself, by fitting again
+    with what it has learned (`refined_loads`). The kernel "friction" is Coulomb, Stribeck and viscous friction with a
+    learned velocity scale (see `JointFriction`). Without the contact there is no friction.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -107,12 +109,13 @@ class ContactFriction(ForcePrior):
         if not has_contact(dynamics, self.contact):
             return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, self._count)
         tangents, sliding = self._sliding(dynamics)
+        motion = sliding[..., None] if self.viscous else _direction(sliding)
         if self.axes == "isotropic":
-            directions = tangents @ _direction(sliding)
+            directions = tangents @ motion
+        elif "velocity" in self.inputs and not self.viscous:
+            directions = tangents  # the latents are functions of the velocity, and know its sign
         else:
-            directions = tangents
-        if self.viscous:
-            directions = _speed(sliding)[..., None] * directions
+            directions = tangents * motion.mT
         if self.load:
             directions = self._normal_force(dynamics, tangents, sliding)[..., None, None] * directions
         return -directions
