@@ -115,7 +115,7 @@ def test_mistakes_are_explained(expression):
         ("joint-ripple:joints=pna", UnknownJoint, "did you mean 'pan'"),
         ("payload:frame=hnad", UnknownFrame, "did you mean 'hand'"),
         ("payload:frame=base", InvalidInput, "fixed in the world .* give a frame of a moving link: upper, fore, hand"),
-        ("tool-friction:contact=1", InvalidInput, "contact 1, but the system has 1 contacts"),
+        ("tool-friction:contact=1", InvalidInput, "contact 1, but the system has only contact 0"),
     ],
 )
 def test_with_a_system_they_are_checked_against_it(expression, error, message):
@@ -162,6 +162,7 @@ def test_people_add_their_own(monkeypatch):
         (lambda: SumPrior(()), "has 0 terms"),
         (lambda: SumPrior(JointForces()), "has 1 terms"),
         (lambda: SumPrior((JointForces(), "friction")), "terms of a SumPrior are JointForces, str; give priors"),
+        (lambda: JointForces() + "friction", "terms of a SumPrior are JointForces, str; give priors"),
         (lambda: JointFriction() + Payload("hand") + JointFriction(), "the sum has 'joint-friction' twice"),
     ],
 )

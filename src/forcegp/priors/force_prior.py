@@ -86,7 +86,9 @@ class ForcePrior(ABC):
         return (self,)
 
     def __add__(self, other: ForcePrior) -> SumPrior:
-        """Q_U is the sum of what both describe."""
+        """Q_U is the sum of what both describe. Raises InvalidInput for what is no prior, as `SumPrior`."""
+        if not isinstance(other, ForcePrior):
+            return SumPrior((self, other))
         return SumPrior((*self.summands(), *other.summands()))
 
 
