@@ -191,6 +191,7 @@ def test_the_same_contacts_change_nothing(posterior, states):
     assert torch.equal(back.predict(*states).mean, mine.mean)
     assert posterior.with_contacts([]).predict(*states).multiplier.mean.shape == (4, 0)
     assert posterior.system.contacts  # nothing happened to the first
+    assert again.latent is posterior.latent  # and nothing was factorised again
 
 
 def test_it_moves_to_a_surface_that_has_no_normal_where_all_joints_are_zero(posterior, states):

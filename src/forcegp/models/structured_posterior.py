@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -213,7 +214,9 @@ class StructuredPosterior(Posterior):
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
         self.model.prior.mixing(system.dynamics(q, v, u, inertials_of(self.parameters) or None))
-        return replace(self, target=system)
+        moved = copy.copy(self)  # with what is factorised: the training rows and their system stay
+        object.__setattr__(moved, "target", system)
+        return moved
 
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
