@@ -18,6 +18,7 @@ from forcegp.priors.force_prior import ForcePrior, Scaling
 from forcegp.priors.joint_friction import chosen_joints, joint_columns, joint_indices
 from forcegp.priors.joint_units import joint_labels, joint_units
 from forcegp.priors.kernel_parameters import log_scale, register_log_normal_prior
+from forcegp.priors.stationary_kernels import LOG_LENGTHSCALE_SPREAD
 from forcegp.robots import Robot
 
 PERIOD_SPREAD = 0.02
@@ -82,6 +83,8 @@ class PeriodicJointForces(ForcePrior):
         base = PeriodicKernel(lengthscale_constraint=log_scale(), period_length_constraint=log_scale())
         kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
         register_log_normal_prior(base, "period_length", self.period, PERIOD_SPREAD)
+        # a joint without ripple would run off to a constant of boundless variance
+        register_log_normal_prior(base, "lengthscale", 1.0, LOG_LENGTHSCALE_SPREAD)
         base.period_length = torch.tensor(self.period, dtype=torch.float64)
         base.lengthscale = torch.tensor(1.0, dtype=torch.float64)
         kernel.outputscale = variance
