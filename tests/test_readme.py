@@ -31,7 +31,8 @@ def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "your-robot.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    noise, error, *_ = done.stdout.splitlines()
+    noise, error, *_, any_force, friction = done.stdout.splitlines()
+    assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
     assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
     assert float(error) < 0.3
 

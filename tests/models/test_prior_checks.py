@@ -173,7 +173,7 @@ def test_a_tool_that_never_moves_has_no_friction(data, prior):
         (ToolForces("tool", axes="tool"), UnknownFrame, "no frame 'tool'"),
         (JointFriction(("pna",)), UnknownJoint, "did you mean 'pan'"),
         (PeriodicJointForces(joints=("elbow",)), UnknownJoint, "Valid joints: bend, lift, pan"),
-        (ContactFriction(contact=1), InvalidInput, "contact 1, but the system has 1 contacts .numbered from 0."),
+        (ContactFriction(contact=1), InvalidInput, "contact 1, but the system has only contact 0"),
         (JointFriction() + ToolForces(contact=2), InvalidInput, "acts at contact 2"),
     ],
     ids=lambda value: value.title if hasattr(value, "title") else "",

@@ -68,7 +68,8 @@ def is_contact_number(value: object) -> bool:
 def require_contact(prior: str, contact: int, system: MechanicalSystem) -> None:
     """Raise InvalidInput if the system has no such contact."""
     if contact >= len(system.contacts):
-        have = f"{len(system.contacts)} contacts (numbered from 0)" if system.contacts else "no contact"
+        numbers = ", ".join(map(str, range(len(system.contacts))))
+        have = f"only contact {numbers}" if system.contacts else "no contact"
         raise InvalidInput(
             f"{prior} acts at contact {contact}, but the system has {have}; give the contact (--contact), or use a "
             "prior that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."
