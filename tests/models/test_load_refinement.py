@@ -117,6 +117,29 @@ def test_it_ends_where_nothing_changes_any_more(fits):
     assert refined.negative_log_likelihood < nominal.negative_log_likelihood
 
 
+def test_beyond_the_visited_speeds_it_expects_what_the_curve_says():
+    """Where accelerations are noisy, the ends of a curve are rough, and their slopes mean nothing."""
+    clean = sliding_data(60, 1)
+    a = clean.truth["a"] + 20 * NOISE * np.random.default_rng(3).standard_normal(clean.a.shape)
+    data = replace(clean, a=a, noise_std=np.full(3, 20 * NOISE))
+    first = first_fit(StructuredGP(data.system, LOAD), data)
+    fastest = float(first.curve("sliding").visited[1, 0])
+    expected: list[ContactFriction] = []
+
+    def again(prior, last):
+        expected.append(prior)
+        return first
+
+    with pytest.warns(NumericalWarning, match="still change"):
+        fit_with_refined_loads(first, again, rounds=1)
+    speeds = fastest * torch.linspace(0.0, 5.0, 80, dtype=torch.float64)
+    curve = first.curve("sliding", speeds).mean
+    assert expected[0].expected is not None
+    error = (expected[0].expected.sliding(speeds) - curve)[speeds > fastest].abs().max()
+    assert float(error) < 0.02
+    assert float(curve.std()) > 1e-3  # it is no constant, which any continuation would meet
+
+
 def test_the_refined_fit_comes_back_from_a_folder(fits, tmp_path):
     refined, test = fits[1], sliding_data(5, 8)
     save_posterior(refined, tmp_path / "run")
@@ -135,7 +158,7 @@ def test_joint_friction_beside_it_counts_for_the_normal_force():
     assert [name for name, _ in friction.expected.joints] == list(data.system.robot.joint_names)
     for _, curve in friction.expected.joints:
         at, values = (torch.tensor(part, dtype=torch.float64) for part in (curve.at, curve.values))
-        assert float((values - 1.5 * at).abs().max()) < 0.02
+        assert float((values - 1.5 * at).abs().max()) < 0.01 * float(at.abs().max())
     assert errors(refined, test)["acceleration"] < 0.1 * nominal["acceleration"]
 
 

@@ -21,7 +21,11 @@ ROUNDS = 8
 SETTLED = 1e-3
 """Relative change of the mixing vectors (root mean square over training rows) below which the loads have settled."""
 PLACES = 60
-"""Velocities at which a curve is tabulated."""
+"""Velocities at which a curve is tabulated, of those that the data visited."""
+BEYOND = (1.2, 1.5, 2.0, 3.0, 5.0)
+"""Multiples of the largest and smallest visited velocity at which it is tabulated as well: continued from the last two
+of `PLACES`, whose difference is noise, it would soon be far from what the curve itself says.
+"""
 
 
 def fit_with_refined_loads(
@@ -60,11 +64,15 @@ def fit_with_refined_loads(
 
 
 def _table(posterior: StructuredPosterior, latent: str) -> TabulatedCurve:
-    """The posterior mean of a friction curve over the velocities that the data visited, 0 included."""
+    """The posterior mean of a friction curve over the velocities that the data visited, 0 included, and beyond."""
     visited = posterior.curve(latent, points=2).visited[:, 0]
     low, high = float(visited[0].clamp_max(0.0)), float(visited[1].clamp_min(0.0))
-    at = torch.linspace(low, max(high, low + 1e-6), PLACES, dtype=torch.float64)
-    return TabulatedCurve(tuple(at.tolist()), tuple(posterior.curve(latent, at).mean.tolist()))
+    high = max(high, low + 1e-6)
+    at = torch.linspace(low, high, PLACES, dtype=torch.float64)
+    below, above = ([end * factor for factor in BEYOND] if end else [] for end in (low, high))
+    places = [*reversed(below), *at.tolist(), *above]
+    mean = posterior.curve(latent, torch.tensor(places, dtype=torch.float64)).mean
+    return TabulatedCurve(tuple(places), tuple(mean.tolist()))
 
 
 def _change(posterior: StructuredPosterior, prior: ForcePrior) -> float:
