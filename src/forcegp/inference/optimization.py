@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from forcegp.errors import FitError, InvalidInput, NumericalError
+from forcegp.errors import FitError, InvalidInput, NumericalError, NumericalWarning
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
 ProgressCallback = Callable[[int, float], None]
@@ -96,7 +97,9 @@ class _Search:
         parameters = {name: value.requires_grad_() for name, value in self.unflatten(point).items()}
         gradients: Sequence[Tensor | None] = [None] * len(parameters)
         try:
-            with torch.enable_grad():
+            # Trial points far out may need jitter; whether the result does, the factorisation at the end says.
+            with torch.enable_grad(), warnings.catch_warnings():
+                warnings.simplefilter("ignore", NumericalWarning)
                 value = self.objective(parameters)
             if parameters and value.requires_grad:
                 gradients = torch.autograd.grad(value, list(parameters.values()), allow_unused=True)
