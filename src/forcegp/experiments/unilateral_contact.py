@@ -21,7 +21,6 @@ MODELS = {
     "tool friction": "tool-friction",
     "contact friction": "contact-friction",
     "load friction": "load-friction",
-    "load friction + joint forces": "load-friction+joint",
 }
 
 
