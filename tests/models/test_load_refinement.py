@@ -10,11 +10,11 @@ import torch
 from tests.models.arm import NOISE, arm_data
 
 from forcegp.data import Dataset
-from forcegp.errors import NumericalWarning
+from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.inference import OptimizerOptions
 from forcegp.models import StructuredGP, load_posterior, save_posterior
 from forcegp.models.load_refinement import SETTLED, fit_with_refined_loads
-from forcegp.priors import ContactFriction, JointFriction, SumPrior
+from forcegp.priors import ContactFriction, JointFriction, Payload, SumPrior
 
 COULOMB, SLOWLY = 0.35, 0.1  # coefficient, and the speed (m/s) below which it falls to zero
 OPTIONS = OptimizerOptions(iterations=60)
@@ -160,6 +160,14 @@ def test_joint_friction_beside_it_counts_for_the_normal_force():
         at, values = (torch.tensor(part, dtype=torch.float64) for part in (curve.at, curve.values))
         assert float((values - 1.5 * at).abs().max()) < 0.01 * float(at.abs().max())
     assert errors(refined, test)["acceleration"] < 0.1 * nominal["acceleration"]
+
+
+def test_what_the_data_do_not_show_is_said_once():
+    data = sliding_data(20, 0)
+    with pytest.warns(DataWarning, match="'payload moment-y' moves no joint") as told:
+        posterior = StructuredGP(data.system, LOAD + Payload("hand")).fit(data, restarts=1, options=OPTIONS)
+    assert len(told) == 1
+    assert posterior.settings["load_refinements"] >= 1
 
 
 def test_an_expectation_that_was_given_stays():

@@ -142,7 +142,9 @@ class StructuredGP(Model):
             return first
 
         def again(prior: ForcePrior, last: StructuredPosterior) -> StructuredPosterior:
-            return replace(self, prior=prior)._fit(rows, dataset, 1, last.parameters, None, 0.0, **how)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)  # the first fit has said it of the same rows
+                return replace(self, prior=prior)._fit(rows, dataset, 1, last.parameters, None, 0.0, **how)
 
         return fit_with_refined_loads(first, again)
 
