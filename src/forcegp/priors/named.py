@@ -15,6 +15,7 @@ from forcegp.priors.force_prior import ForcePrior, SumPrior
 from forcegp.priors.joint_accelerations import JointAccelerations
 from forcegp.priors.joint_forces import JointForces
 from forcegp.priors.joint_friction import JointFriction
+from forcegp.priors.kernels import KERNELS
 from forcegp.priors.no_forces import NoForces
 from forcegp.priors.payload import Payload
 from forcegp.priors.periodic_joint_forces import PeriodicJointForces
@@ -75,6 +76,11 @@ def named_prior(expression: str, system: MechanicalSystem | None = None) -> Forc
 def _one(text: str, expression: str) -> ForcePrior:
     name, colon, options = text.partition(":")
     name = name.strip()
+    if name not in NAMED_PRIORS and name in KERNELS:
+        raise InvalidInput(
+            f"{name!r} in {expression!r} is a kernel, not a prior; a '+' inside of a kernel needs parentheses, as in "
+            f"tool-friction:kernel=(linear + {name})"
+        )
     if name not in NAMED_PRIORS:
         raise InvalidInput(unknown_name_message("prior", name, f"{expression!r}", NAMED_PRIORS))
     named = NAMED_PRIORS[name]
