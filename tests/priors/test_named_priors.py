@@ -84,7 +84,7 @@ MISTAKES = {
     "joint-friction:kernel=frictoin": "did you mean 'friction'",
     "joint-friction:kernel=(linear + ": "a parenthesis is not closed|ends where a name is expected",
     "joint-friction:joints=pan/pan": "each once, or None for all",
-    "joint:kernel=linear + deep": r"'deep' in .* is a kernel, not a prior; .*kernel=\(linear \+ deep\)",
+    "joint:kernel=linear + deep": "is a kernel, not a prior; a '+' inside of a kernel needs parentheses",
     "joint + joint": "the sum has 'joint-forces' twice",
 }
 
