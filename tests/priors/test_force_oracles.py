@@ -240,6 +240,25 @@ def test_periodic_forces_repeat(dynamics):
             assert float(kernel(z[c], half[c]).to_dense().diagonal().max()) < 0.5 * (c + 1.0)
 
 
+def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
+    """A unit step of the search, such as a restart takes, is one standard deviation of the prior: 2 %."""
+    given = torch.tensor(0.3, dtype=torch.float64)
+    robot = dynamics.state.kinematics.robot
+    kernels = LatentKernels(PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()))
+    start = kernels.initial_parameters()
+    name = "kernels.1.base_kernel.raw_period_length"
+    torch.testing.assert_close(start[name], torch.zeros(1, 1).double(), rtol=0.0, atol=1e-9)
+    moved = {name: torch.full((1, 1), 1.5, dtype=torch.float64, requires_grad=True)}
+    there = list(kernels.at(start | moved))[1].base_kernel
+    torch.testing.assert_close(there.period_length[0, 0], given * math.exp(1.5 * 0.02), rtol=1e-12, atol=0.0)
+    there.period_length = 0.9 * there.period_length  # by value, as start values are
+    torch.testing.assert_close(there.period_length[0, 0], 0.9 * given * math.exp(1.5 * 0.02), rtol=1e-12, atol=0.0)
+    density = kernels.log_prior(start | moved)
+    torch.testing.assert_close(density - kernels.log_prior(start), torch.tensor(-0.5 * 1.5**2).double())
+    density.backward()
+    torch.testing.assert_close(moved[name].grad, torch.full((1, 1), -1.5, dtype=torch.float64), rtol=1e-9, atol=0.0)
+
+
 def test_sines_and_cosines_do_not_see_a_full_turn_and_keep_sliding_joints(system, rows):
     prior = JointForces(("q", "v"), angles="sin-cos")
     robot = system.robot

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
+from gpytorch.constraints import Positive
 from gpytorch.kernels import Kernel, PeriodicKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
@@ -80,7 +82,8 @@ class PeriodicJointForces(ForcePrior):
         return tuple(self._kernel(variance) for variance in variances)
 
     def _kernel(self, variance: Tensor) -> Kernel:
-        base = PeriodicKernel(lengthscale_constraint=log_scale(), period_length_constraint=log_scale())
+        near = Positive(partial(_period, self.period), partial(_spreads, self.period))  # type: ignore[arg-type]  # stubs
+        base = PeriodicKernel(lengthscale_constraint=log_scale(), period_length_constraint=near)
         kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
         register_log_normal_prior(base, "period_length", self.period, PERIOD_SPREAD)
         # a joint without ripple would run off to a constant of boundless variance
@@ -93,3 +96,12 @@ class PeriodicJointForces(ForcePrior):
     @override
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
+
+
+def _period(given: float, spreads: Tensor) -> Tensor:
+    """A period that is searched in standard deviations of its prior, so that restarts begin near the one given, too."""
+    return given * (PERIOD_SPREAD * spreads).exp()
+
+
+def _spreads(given: float, period: Tensor) -> Tensor:
+    return (period / given).log() / PERIOD_SPREAD
