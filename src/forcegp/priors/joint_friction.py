@@ -25,10 +25,10 @@ from forcegp.robots import Robot
 class JointFriction(ForcePrior):
     """Q_U,j = -f_j(v_j): what resists joint j, positive for positive velocity, an independent function per joint.
 
-    The kernel "friction" gives f_j(v) = tanh(v / w) g(v) + d v with a learned velocity scale w and an unknown smooth
-    g: Coulomb, Stribeck and viscous friction, zero at rest, and different in the two directions if the data say so
-    (Armstrong-Helouvry, Dupont & Canudas de Wit 1994 list these parts). Velocities are only scaled, never shifted,
-    so that zero stays zero. `joints` restricts the prior to some joints, by name.
+    The kernel "friction" gives f_j(v) = tanh(v / w) g(v) + d v with a learned velocity scale w and an unknown level g
+    (`priors/friction_kernel.py`): Coulomb, Stribeck and viscous friction, zero at rest, and different in the two
+    directions if the data say so (Armstrong-Helouvry, Dupont & Canudas de Wit 1994 list these parts). Velocities are
+    only scaled, never shifted, so that zero stays zero. `joints` restricts the prior to some joints, by name.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
