@@ -20,6 +20,8 @@ ROUNDS = 8
 """Most fits after the first; measured on the `stribeck` scenario, 3 to 5 are enough."""
 SETTLED = 1e-3
 """Relative change of the mixing vectors (root mean square over training rows) below which the loads have settled."""
+NOTICEABLE = 2.0
+"""Nats that rounds differ by without telling anything."""
 PLACES = 60
 """Velocities at which a curve is tabulated, of those that the data visited."""
 BEYOND = (1.2, 1.5, 2.0, 3.0, 5.0)
@@ -33,7 +35,9 @@ def fit_with_refined_loads(
     again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior],
     rounds: int = ROUNDS,
 ) -> StructuredPosterior:
-    """`first` itself, or the most likely of the fits that follow it with the normal forces of the one before.
+    """`first` itself, or the last of the fits that follow it with the normal forces of the one before.
+
+    Where an earlier one is more likely by more than `NOTICEABLE`, or the loads have not settled, the most likely one.
 
     Every round is an exact fit of a legitimate prior: friction proportional to a given function of the state. What
     changes from round to round is that function, towards the normal force under the friction that was found.
@@ -48,7 +52,8 @@ def fit_with_refined_loads(
             return first
         change = _change(last, prior)
         if change < SETTLED:
-            break
+            # the last expects what its own curves say; an earlier one would have to earn that it does not
+            return last if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE else best
         if fits == rounds:
             warnings.warn(
                 f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
