@@ -25,6 +25,7 @@ MEANINGS = {
     "nll_speedup_n400": (">= 4.5", "NLL + all gradients, N = 400, one contact: dense time / deflated time"),
     "nll_speedup_n1000": (">= 5", "the same at N = 1000"),
     "nll_speedup_n400_three_constraints": (">= 12", "the same at N = 400 with three constraints"),
+    "nll_speedup_n400_tool_friction": (">= 40", "the same at N = 400, one contact, prior tool-friction (rank 2)"),
     "nll_memory_ratio_n1000": ("<= 0.333", "peak memory at N = 1000: deflated / dense"),
     "mass_bias_vs_pinocchio_b1000": ("<= 6", "mass matrix + bias of 1000 states: our CPU time / a C++ Pinocchio loop"),
     "forward_dynamics_single_ms": ("<= 1", "forward dynamics of a single state [ms]"),
