@@ -36,7 +36,7 @@ def test_the_table_has_a_line_per_candidate_and_the_verdict_follows(forcegp, fol
     done = forcegp("compare", "train.h5", *words, "--test", "test.h5", *QUICK, folder=folder)
     assert done.returncode == 0, done.stderr
     for name, functions in (("joint", 3), ("joint-friction", 3), ("joint-friction + joint-ripple", 6)):
-        numbers = r"\s+(\d+)\s+\d+\s+-?\d+\.\d((?:\s+\S+){4,6})\s*$"
+        numbers = r"\s+(\d+), \d+\s+-?\d+((?:\s+\S+){4,6})\s*$"
         row = re.search(rf"^\s*{re.escape(name)}{numbers}", done.stdout, re.M)
         assert row, done.stdout
         assert int(row[1]) == functions

@@ -157,7 +157,7 @@ class Compare(LearningOptions):
 
         from forcegp.cli.tables import columns
 
-        header = ["prior", "func-\ntions", "para-\nmeters", "NLL", "row\nout", "stretch\nout", "below\nthe best"]
+        header = ["prior", "latents,\nparam.", "NLL", "row\nout", "stretch\nout", "below\nthe best"]
         header += [] if self.test is None else ["MAE,\ntest"]
         title = (
             f"{comparison.points} points of {self.data}, {comparison.blocks} stretches of "
@@ -182,14 +182,18 @@ class Compare(LearningOptions):
         best = score is comparison.best
         return [
             score.name,
-            str(score.latents),
-            str(score.parameters),
-            f"{score.nll:.1f}",
-            f"{score.leave_one_out:.3f}",
-            f"{score.leave_block_out:.3f}",
-            NONE if best else f"{-score.difference:.3f} ± {score.standard_error:.3f}",
+            f"{score.latents}, {score.parameters}",
+            f"{score.nll:.0f}",
+            _density(score.leave_one_out),
+            _density(score.leave_block_out),
+            NONE if best else f"{_density(-score.difference)} ± {_density(score.standard_error)}",
             *([] if self.test is None else [number(score.mae)]),
         ]
+
+
+def _density(value: float) -> str:
+    """Three decimals, none where the whole number says enough: the table has to fit into 80 columns."""
+    return f"{value:.3f}" if abs(value) < 100.0 else f"{value:.0f}"
 
 
 def _folders(comparison: PriorComparison) -> dict[str, str]:
