@@ -28,7 +28,7 @@ from forcegp.models.noise import ACCELERATION
 from forcegp.models.prediction import Prediction
 from forcegp.models.protocol import Posterior
 from forcegp.models.search import blas_threads
-from forcegp.priors.joint_forces import kernels_of
+from forcegp.priors.expressed_kernels import kernels_of
 
 if TYPE_CHECKING:
     from forcegp.models.independent_gp import IndependentGP

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
@@ -14,8 +13,9 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expected_friction import ExpectedFriction
-from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_forces import chosen_inputs, kernels_of
+from forcegp.priors.expressed_kernels import ExpressedKernels
+from forcegp.priors.force_prior import Scaling
+from forcegp.priors.joint_forces import chosen_inputs
 from forcegp.priors.joint_friction import joint_indices
 from forcegp.priors.kernels import check_kernel
 from forcegp.priors.tool_point import (
@@ -35,7 +35,7 @@ SMALLEST_SPEED = 1e-6
 
 
 @dataclass(frozen=True)
-class ContactFriction(ForcePrior):
+class ContactFriction(ExpressedKernels):
     """Q_U = -J_t^T f: tangential friction of contact number `contact`, positive latents resist the motion.
 
     Isotropic: f = g(|v_t|) v_t / |v_t| with one latent g on the sliding speed. Two-axis: one latent per tangent, each
@@ -71,10 +71,11 @@ class ContactFriction(ForcePrior):
             raise InvalidInput("ContactFriction has an expected friction but no load; give load=True, or leave it out")
         object.__setattr__(self, "expected", ExpectedFriction.of(self.expected))
         object.__setattr__(self, "inputs", chosen_inputs("ContactFriction", self.inputs, CONTACT_INPUTS))
-        check_kernel(self._kernel)
+        check_kernel(self.kernel_expression)
 
     @property
-    def _kernel(self) -> str:
+    @override
+    def kernel_expression(self) -> str:
         if self.kernel is not None:
             return self.kernel
         return "friction" if self.inputs == ("velocity",) and not self.viscous else "squared-exponential"
@@ -154,14 +155,6 @@ class ContactFriction(ForcePrior):
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
         per_speed = "N/(m/s)" if self.viscous else "N"
         return (per_speed.replace("N", "", 1).replace("/(m/s)", "s/m") if self.load else per_speed,) * self._count
-
-    @override
-    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return kernels_of(self._kernel, dimensions, variances)
-
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
     @property
     def _count(self) -> int:

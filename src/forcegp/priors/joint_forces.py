@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.priors.force_prior import ForcePrior
+from forcegp.priors.expressed_kernels import ExpressedKernels
 from forcegp.priors.joint_units import joint_labels, joint_units
-from forcegp.priors.kernels import check_kernel, kernel_of
+from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
 
 INPUTS = ("q", "v", "u")
@@ -24,7 +23,7 @@ ANGLES = ("plain", "sin-cos")
 
 
 @dataclass(frozen=True)
-class JointForces(ForcePrior):
+class JointForces(ExpressedKernels):
     """Q_U = f(x) with independent f_j ~ GP(0, k_j), one per joint (Rath et al. 2021, eqs. 5-7).
 
     `inputs` chooses which of q, v and u the force may depend on. With `angles="sin-cos"` the position of every joint
@@ -81,14 +80,6 @@ class JointForces(ForcePrior):
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("u", robot.joint_names, robot)
 
-    @override
-    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return kernels_of(self.kernel, dimensions, variances)
-
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def chosen_inputs(prior: str, given: object, allowed: tuple[str, ...]) -> tuple[str, ...]:
     """`given` as a tuple of names from `allowed`, each once. Raises InvalidInput for anything else."""
@@ -104,13 +95,6 @@ def as_names(given: object) -> tuple[Any, ...]:
     if isinstance(given, str):
         return (given,)
     return tuple(given) if isinstance(given, Iterable) else ()
-
-
-def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-    """One kernel per latent from the same expression."""
-    return tuple(
-        kernel_of(expression, dimension, variance) for dimension, variance in zip(dimensions, variances, strict=True)
-    )
 
 
 def _turns(robot: Robot) -> Tensor:

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_forces import as_names, kernels_of
+from forcegp.priors.expressed_kernels import ExpressedKernels
+from forcegp.priors.force_prior import Scaling
+from forcegp.priors.joint_forces import as_names
 from forcegp.priors.joint_units import joint_labels, joint_units
 from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
 
 
 @dataclass(frozen=True)
-class JointFriction(ForcePrior):
+class JointFriction(ExpressedKernels):
     """Q_U,j = -f_j(v_j): what resists joint j, positive for positive velocity, an independent function per joint.
 
     The kernel "friction" gives f_j(v) = tanh(v / w) g(v) + d v with a learned velocity scale w and an unknown level g
@@ -69,14 +69,6 @@ class JointFriction(ForcePrior):
     @override
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("u", self.latent_names(robot), robot)
-
-    @override
-    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return kernels_of(self.kernel, dimensions, variances)
-
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def chosen_joints(prior: str, given: object) -> tuple[str, ...] | None:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_forces import chosen_inputs, kernels_of
+from forcegp.priors.expressed_kernels import ExpressedKernels
+from forcegp.priors.force_prior import Scaling
+from forcegp.priors.joint_forces import chosen_inputs
 from forcegp.priors.joint_units import joint_labels
 from forcegp.priors.kernels import check_kernel
 from forcegp.priors.tool_point import (
@@ -38,7 +38,7 @@ TORQUE_NAMES = {**NAMES, "surface": ("tangent-1", "tangent-2", "normal")}
 
 
 @dataclass(frozen=True)
-class ToolForces(ForcePrior):
+class ToolForces(ExpressedKernels):
     """Q_U = J_p^T E f(z): a force (N) with components f along the axes E at a point, and a torque (Nm) with `torque`.
 
     Parameters
@@ -167,14 +167,6 @@ class ToolForces(ForcePrior):
     @override
     def latent_unit(self, robot: Robot) -> tuple[str, ...]:
         return tuple("N" if name.startswith("force") else "Nm" for name in self.latent_names(robot))
-
-    @override
-    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return kernels_of(self.kernel, dimensions, variances)
-
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
     @property
     def _count(self) -> int:
