@@ -76,7 +76,7 @@ class Compare(LearningOptions):
         dataset = Dataset.load(self.data)
         system = self._system(dataset)
         priors = self._priors(system)
-        dataset = self._rows(terminal, dataset, system)
+        dataset, rows_note = self._rows(dataset, system)
         test = None if self.test is None else Dataset.load(self.test)
         comparison = self._compare(terminal, dataset, system, priors, test)
         for warning in comparison.warnings:
@@ -86,6 +86,8 @@ class Compare(LearningOptions):
         folders = _folders(comparison)
         if self.out is not None:
             self._write(self.out, comparison, content, folders)
+        if rows_note is not None:
+            terminal.note(rows_note)
         terminal.say(*self._report(comparison, folders))
         return content
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from forcegp.cli.terminal import Terminal
     from forcegp.data import Dataset
     from forcegp.mechanics import MechanicalSystem
 
@@ -18,29 +17,30 @@ HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
 
 
-def rows_to_learn(terminal: Terminal, dataset: Dataset, system: MechanicalSystem, choice: RowsChoice) -> Dataset:
-    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; says what was done.
+def rows_to_learn(dataset: Dataset, system: MechanicalSystem, choice: RowsChoice) -> tuple[Dataset, str | None]:
+    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and what to say of it.
 
     "auto" leaves rows out where a plausible share of them is not in contact, and else takes all and says what it saw.
-    Raises ContactError with "in-contact" if there are none.
+    The sentence is for after the fit: an error before that shall stand alone. Raises ContactError with "in-contact" if
+    there are none.
     """
     from forcegp.data import rows_in_contact
     from forcegp.errors import ContactError
 
     if choice == "all" or not system.contacts:
-        return dataset
+        return dataset, None
     try:
         touching = rows_in_contact(replace(dataset, system=system))
     except ContactError:
         if choice == "in-contact":
             raise
-        return dataset  # the fit has more to say about it
+        return dataset, None  # the fit has more to say about it
     share = len(touching) / len(dataset)
     if choice == "auto" and share >= NEARLY_ALL:
-        return dataset
+        return dataset, None
     told = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
     if choice == "auto" and share < HARDLY_ANY:
-        terminal.note(f"{told}; all are learned from. Check the contact, or give --rows in-contact.")
-        return dataset
-    terminal.note(f"{told}; learning from these alone (--rows all takes every row)")
-    return replace(touching, system=dataset.system)
+        return dataset, f"{told}; all were learned from. Check the contact, or give --rows in-contact."
+    return replace(
+        touching, system=dataset.system
+    ), f"{told}; these alone were learned from (--rows all takes every row)"

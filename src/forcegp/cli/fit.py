@@ -105,13 +105,15 @@ class Fit(FitOptions):
         start = time.monotonic()
         dataset = Dataset.load(self.data)
         system = self._system(dataset)
-        dataset = self._rows(terminal, dataset, system)
+        dataset, rows_note = self._rows(dataset, system)
         model = make_model(command, system, dataset)
         points = min(command.points, len(dataset))
         posterior = fit(terminal, model, dataset, points=points, **search_arguments(command))
         summary = fit_summary(posterior, time.monotonic() - start)
         with folder_written_whole(self.out) as folder:
             command._write(folder, posterior, KIND)
+        if rows_note is not None:
+            terminal.note(rows_note)
         terminal.say(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 

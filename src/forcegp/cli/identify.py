@@ -74,7 +74,7 @@ class Identify(FitOptions):
         begin = time.monotonic()
         dataset = Dataset.load(self.data)
         system, added = with_learned_forces(self._system(dataset), learn)
-        dataset = self._rows(terminal, dataset, system)
+        dataset, rows_note = self._rows(dataset, system)
         prior = NoForces() if self.model == "analytical" else JointForces()
         model = StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
         posterior = fit(
@@ -102,6 +102,8 @@ class Identify(FitOptions):
             self._write(folder, posterior, KIND, {"identification.json": told, "identified.urdf": urdf})
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
+        if rows_note is not None:
+            terminal.note(rows_note)
         terminal.say(*_report(self, found, summary))
         del content["history"]
         return {"run": str(self.out), "data": str(self.data), **summary, **content}

@@ -15,7 +15,6 @@ from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from forcegp.cli.terminal import Terminal
     from forcegp.data import Dataset
     from forcegp.mechanics import MechanicalSystem
     from forcegp.robots import Robot
@@ -93,9 +92,9 @@ class LearningOptions(Command):
             system = _with_known_forces(system, self.known_force)
         return system
 
-    def _rows(self, terminal: Terminal, dataset: Dataset, system: MechanicalSystem) -> Dataset:
-        """The rows to learn from."""
-        return rows_to_learn(terminal, dataset, system, self.rows)
+    def _rows(self, dataset: Dataset, system: MechanicalSystem) -> tuple[Dataset, str | None]:
+        """The rows to learn from, and what to say of them after the fit."""
+        return rows_to_learn(dataset, system, self.rows)
 
     def _given(self) -> dict[str, Any]:
         """Options and data, as a folder remembers them."""
