@@ -118,7 +118,7 @@ class PriorConformance:
         scalings, labels, units = (
             self.prior.scalings(robot),
             self.prior.feature_names(robot),
-            self.prior.latent_unit(robot),
+            self.prior.latent_units(robot),
         )
         assert len(features) == len(scalings) == len(units) == len(names)
         assert all(isinstance(text, str) for text in (*names, *units))
@@ -220,7 +220,7 @@ class PriorConformance:
         assert names[count].startswith("periodic-joint-forces")
         assert names[count].endswith(" pan")
         assert len(set(total.term_names)) == len(total.terms)
-        assert total.latent_unit(system.robot)[:count] == self.prior.latent_unit(system.robot)
+        assert total.latent_units(system.robot)[:count] == self.prior.latent_units(system.robot)
         assert total.scalings(system.robot) == self.prior.scalings(system.robot) + other.scalings(system.robot)
         kernels = total.kernels(system.robot, tuple(z.shape[-1] for z in given), torch.ones(count + 3).double())
         assert len(kernels) == count + 3

@@ -75,7 +75,7 @@ class TestPayload:
         dynamics = MechanicalSystem(robot).dynamics(*rows)
         whole, point = Payload(FRAME), Payload(FRAME, moments=False)
         torch.testing.assert_close(point.mixing(dynamics), whole.mixing(dynamics)[..., :1], rtol=0.0, atol=0.0)
-        assert whole.latent_unit(robot) == ("kg", "kg m", "kg m", "kg m")
+        assert whole.latent_units(robot) == ("kg", "kg m", "kg m", "kg m")
         assert torch.equal(point.point_force(dynamics)[0, :, 0], torch.tensor(GRAVITY, dtype=torch.float64))
 
 

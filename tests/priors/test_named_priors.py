@@ -195,13 +195,13 @@ def test_units_are_those_of_the_joints():
     from tests.priors.prior_conformance import bent_arm
 
     robot = bent_arm().robot  # its last joint slides
-    assert JointForces().latent_unit(robot) == ("Nm", "Nm", "N")
-    assert JointFriction(("bend",)).latent_unit(robot) == ("N",)
-    assert PeriodicJointForces().latent_unit(robot) == ("Nm", "Nm", "N")
-    assert JointAccelerations().latent_unit(robot) == ("rad/s^2", "rad/s^2", "m/s^2")
-    assert ContactFriction().latent_unit(robot) == ("N",)
-    assert ContactFriction(load=True, axes="two-axis").latent_unit(robot) == ("", "")
-    assert ToolForces(torque=True, axes="tool").latent_unit(robot) == ("N",) * 3 + ("Nm",) * 3
+    assert JointForces().latent_units(robot) == ("Nm", "Nm", "N")
+    assert JointFriction(("bend",)).latent_units(robot) == ("N",)
+    assert PeriodicJointForces().latent_units(robot) == ("Nm", "Nm", "N")
+    assert JointAccelerations().latent_units(robot) == ("rad/s^2", "rad/s^2", "m/s^2")
+    assert ContactFriction().latent_units(robot) == ("N",)
+    assert ContactFriction(load=True, axes="two-axis").latent_units(robot) == ("", "")
+    assert ToolForces(torque=True, axes="tool").latent_units(robot) == ("N",) * 3 + ("Nm",) * 3
     assert JointFriction().feature_names(robot)[1:] == (("velocity of lift [rad/s]",), ("velocity of bend [m/s]",))
     assert PeriodicJointForces().feature_names(robot)[2] == ("position of bend [m]",)
     names = JointForces(angles="sin-cos").feature_names(robot)[0]

@@ -38,7 +38,7 @@ class AirDrag(ForcePrior):
     def feature_names(self, robot):
         return ((f"speed of {self.frame} [m/s]",),)
 
-    def latent_unit(self, robot):
+    def latent_units(self, robot):
         return ("N s^2/m^2",)
 
     def point_force(self, dynamics):

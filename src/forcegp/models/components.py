@@ -104,7 +104,7 @@ def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Lat
         parts[name] = ForceComponent(
             name,
             term.latent_names(robot),
-            term.latent_unit(robot),
+            term.latent_units(robot),
             Gaussian(own.mean, own.covariance),
             joint_force=own.through(mixing),
             acceleration=own.through(dynamics.H @ mixing),

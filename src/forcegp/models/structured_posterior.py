@@ -161,7 +161,7 @@ class StructuredPosterior(Posterior):
         plain = tuple(f"feature {k}" for k in range(z.shape[-1]))
         return Curve(
             latent,
-            prior.latent_unit(robot)[index],
+            prior.latent_units(robot)[index],
             plain if labels is None else labels[index],
             z,
             mean,

@@ -152,7 +152,7 @@ class ContactFriction(ExpressedKernels):
         )
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         per_speed = "N/(m/s)" if self.viscous else "N"
         return (per_speed.replace("N", "", 1).replace("/(m/s)", "s/m") if self.load else per_speed,) * self._count
 

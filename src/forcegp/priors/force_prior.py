@@ -61,7 +61,7 @@ class ForcePrior(ABC):
         """A readable name with its unit for every feature of every latent, for messages and plots; None without."""
         return None
 
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         """The unit of each latent."""
         return ("Nm or N",) * len(self.latent_names(robot))
 
@@ -169,8 +169,8 @@ class SumPrior(ForcePrior):
         return tuple(entry for part in known for entry in part) if len(known) == len(names) else None
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
-        return self._joined(lambda term: term.latent_unit(robot))
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
+        return self._joined(lambda term: term.latent_units(robot))
 
     @override
     def check(self, system: MechanicalSystem) -> None:

@@ -29,5 +29,5 @@ class JointAccelerations(JointForces):
         return dynamics.M
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("a", robot.joint_names, robot)

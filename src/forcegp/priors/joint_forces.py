@@ -77,7 +77,7 @@ class JointForces(ExpressedKernels):
         return (tuple(entry for name in self.inputs for entry in named[name]),) * robot.nv
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("u", robot.joint_names, robot)
 
 

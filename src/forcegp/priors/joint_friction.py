@@ -67,7 +67,7 @@ class JointFriction(ExpressedKernels):
         return tuple((label,) for label in joint_labels("velocity", "v", self.latent_names(robot), robot))
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("u", self.latent_names(robot), robot)
 
 

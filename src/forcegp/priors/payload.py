@@ -72,7 +72,7 @@ class Payload(ForcePrior):
         return ((),) * len(self.latent_names(robot))
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return ("kg", "kg m", "kg m", "kg m") if self.moments else ("kg",)
 
     @override

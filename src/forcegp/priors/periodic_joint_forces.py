@@ -74,7 +74,7 @@ class PeriodicJointForces(ForcePrior):
         return tuple((label,) for label in joint_labels("position", "q", self.latent_names(robot), robot))
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("u", self.latent_names(robot), robot)
 
     @override

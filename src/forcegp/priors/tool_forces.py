@@ -165,7 +165,7 @@ class ToolForces(ExpressedKernels):
         return (tuple(entry for name in self.inputs for entry in named[name]),) * self._count
 
     @override
-    def latent_unit(self, robot: Robot) -> tuple[str, ...]:
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return tuple("N" if name.startswith("force") else "Nm" for name in self.latent_names(robot))
 
     @property
