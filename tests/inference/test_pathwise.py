@@ -6,7 +6,7 @@ import torch
 from gpytorch.kernels import CosineKernel, LinearKernel, MaternKernel, RBFKernel, ScaleKernel
 
 from forcegp.errors import InvalidInput
-from forcegp.inference import LatentKernels, LatentPosterior
+from forcegp.inference import ExactPosterior, LatentKernels
 from forcegp.inference.kernels import kernel_cross, kernel_matrix
 from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
 from forcegp.priors.kernels import kernel_of
@@ -14,7 +14,7 @@ from forcegp.priors.kernels import kernel_of
 POINTS, OUTPUTS = 9, 3
 
 
-def conditioned(kernels: list, dimensions: tuple[int, ...]) -> LatentPosterior:
+def conditioned(kernels: list, dimensions: tuple[int, ...]) -> ExactPosterior:
     """A posterior from random numbers; W has rank 2 of 3 at every point, as with one contact."""
     generator = torch.Generator().manual_seed(0)
     features = [torch.randn(POINTS, d, dtype=torch.float64, generator=generator) for d in dimensions]
@@ -26,7 +26,7 @@ def conditioned(kernels: list, dimensions: tuple[int, ...]) -> LatentPosterior:
     residual = torch.randn(POINTS, OUTPUTS, dtype=torch.float64, generator=generator)
     noise = torch.full((1, OUTPUTS), 0.09, dtype=torch.float64)
     latent = LatentKernels([kernel.double() for kernel in kernels])
-    return LatentPosterior.condition(latent.at(latent.initial_parameters()), features, W, residual, noise)
+    return ExactPosterior.condition(latent.at(latent.initial_parameters()), features, W, residual, noise)
 
 
 def scaled_rbf(dimension: int, lengthscale: float, variance: float) -> ScaleKernel:
@@ -37,7 +37,7 @@ def scaled_rbf(dimension: int, lengthscale: float, variance: float) -> ScaleKern
 
 
 @pytest.fixture(scope="module")
-def latent() -> LatentPosterior:
+def latent() -> ExactPosterior:
     """Latents with one and with three features."""
     return conditioned([scaled_rbf(3, 1.5, 0.7), scaled_rbf(1, 0.9, 1.4), scaled_rbf(3, 0.8, 0.3)], (3, 1, 3))
 

@@ -9,7 +9,7 @@ from tests.inference.dense import dense_posterior
 from tests.inference.problems import Problem, normal, problem
 
 from forcegp.errors import NumericalError
-from forcegp.inference import LatentKernels, LatentPosterior, posterior
+from forcegp.inference import ExactPosterior, LatentKernels, posterior
 
 SHAPES = {
     "no constraint": {"constraints": 0},
@@ -21,8 +21,8 @@ SHAPES = {
 }
 
 
-def condition(given_problem: Problem) -> LatentPosterior:
-    return LatentPosterior.condition(given_problem.kernels, given_problem.features, *given_problem.data)
+def condition(given_problem: Problem) -> ExactPosterior:
+    return ExactPosterior.condition(given_problem.kernels, given_problem.features, *given_problem.data)
 
 
 def new_features(given_problem: Problem, points: int = 6) -> list[torch.Tensor]:

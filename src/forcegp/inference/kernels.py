@@ -47,6 +47,9 @@ class LatentKernels(torch.nn.Module):
     def __iter__(self) -> Iterator[Kernel]:
         return iter(cast("list[Kernel]", list(self.kernels)))
 
+    def __getitem__(self, index: int) -> Kernel:
+        return cast(Kernel, self.kernels[index])
+
     def forward(self, features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
         """One dense matrix per latent."""
         return [kernel_matrix(kernel, z) for kernel, z in zip(self, features, strict=True)]

@@ -1,9 +1,10 @@
 """Pathwise conditioning: functions drawn from the posterior, and its mean, evaluated fast at few points many times.
 
 A drawn function is a prior sample plus an update by the data (Matheron's rule; Wilson et al. 2020, "Efficiently
-sampling functions from Gaussian process posteriors", eq. 10), here in deflated coordinates:
+sampling functions from Gaussian process posteriors", eq. 10), here with the
+centres z_j of the posterior, whose weights `LatentPosterior.function_weights` finds:
 
-    f_s(z) = g_s(z) + sum_j k(z, z_j) beta_s,j,      beta_s = C^T T^-1 (t - C g_s(Z) - eps_s),   eps_s ~ N(0, I)
+    f_s(z) = g_s(z) + sum_j k(z, z_j) beta_s,j
 
 with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
 many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
@@ -13,7 +14,6 @@ batched operation (`FunctionSamples`); sums and products of other kernels are dr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,10 +37,10 @@ BLOCK_BYTES = 16 * 2**20
 
 @dataclass(frozen=True, eq=False)
 class StackedKernels:
-    """The squared exponentials of all latents as one batched operation, with their training points.
+    """The squared exponentials of all latents as one batched operation, with the centres of the posterior.
 
     Features are divided by their length scales; latents with fewer features are padded with zeros, which changes no
-    distance.
+    distance, and latents with fewer centres with some at zero, whose weights must be 0 (`stacked`).
     """
 
     lengthscales: tuple[Float[Tensor, " _"], ...]
@@ -79,19 +79,20 @@ class StackedFunctions:
 
     latent: LatentPosterior
     kernels: StackedKernels | None
+    weights: Float[Tensor, "C N"]
 
     @classmethod
     def mean_of(cls, latent: LatentPosterior) -> StackedFunctions:
         """Prepared once for a posterior; kernels that cannot be stacked are evaluated one by one."""
         with torch.no_grad():
-            return cls(latent, StackedKernels.of(latent))
+            return cls(latent, StackedKernels.of(latent), stacked(latent.weights))
 
     def __call__(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
         """E f_c at the points."""
         if self.kernels is None:
             return self.latent.mean(features)
         cross = self.kernels.cross(self.kernels.scaled(features))
-        return (cross @ self.latent.system.beta.mT[..., None])[..., 0].mT
+        return (cross @ self.weights[..., None])[..., 0].mT
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +124,11 @@ class FunctionSamples:
             omega = torch.randn(samples, latents, dimension, frequencies, **like)
             scale = (kernels.variances / frequencies).sqrt()[:, None]
             amplitudes = scale * torch.randn(2, samples, latents, frequencies, **like)
-            noise = _noise(latent, samples, generator)
             prior = torch.stack(  # one function at a time, for all its cosines at all points are many numbers
-                [_cosines(kernels.training, omega[s], amplitudes[:, s]) for s in range(samples)]
+                [_cosines(kernels.training, omega[s], amplitudes[:, s]) for s in range(samples)], dim=1
             )
-            beta = _update_weights(latent, prior, noise)
+            at_centers = [values[:, : len(z)] for values, z in zip(prior, latent.features, strict=True)]
+            beta = stacked(latent.function_weights(at_centers, generator)).transpose(0, 1)
         return cls(kernels, omega, amplitudes, beta)
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
@@ -147,7 +148,7 @@ class ComposedSamples:
 
     latent: LatentPosterior
     terms: tuple[tuple[DrawnTerm, ...], ...]
-    beta: Float[Tensor, "S C N"]
+    beta: tuple[Float[Tensor, "S _"], ...]
 
     @classmethod
     def draw(cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES) -> ComposedSamples:
@@ -156,7 +157,7 @@ class ComposedSamples:
         Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
         """
         with torch.no_grad():
-            generator = torch.Generator(device=latent.system.beta.device).manual_seed(seed)
+            generator = torch.Generator(device=latent.features[0].device).manual_seed(seed)
             terms = tuple(
                 tuple(
                     DrawnTerm.draw(term, z.new_zeros(1, z.shape[-1]), samples, frequencies, generator)
@@ -164,11 +165,10 @@ class ComposedSamples:
                 )
                 for kernel, z in zip(latent.kernels, latent.features, strict=True)
             )
-            noise = _noise(latent, samples, generator)
             prior = [
                 _at_same_points(drawn, z, samples, frequencies) for drawn, z in zip(terms, latent.features, strict=True)
             ]
-            return cls(latent, terms, _update_weights(latent, torch.stack(prior, dim=1), noise))
+            return cls(latent, terms, latent.function_weights(prior, generator))
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
         """Every function at points of its own: f_s,c(z_s,i)."""
@@ -178,7 +178,7 @@ class ComposedSamples:
         ):
             flat = z.flatten(0, 1)
             cross = kernel_cross(kernel, flat, training).unflatten(0, z.shape[:2])
-            update = (cross @ self.beta[:, c, :, None])[..., 0]
+            update = (cross @ self.beta[c][..., None])[..., 0]
             columns.append(_sum(self.terms[c], flat, slice(None)) + update)
         return torch.stack(columns, dim=-1)
 
@@ -207,23 +207,6 @@ def _at_same_points(
     return torch.cat([_sum(drawn, z.repeat(part.stop - part.start, 1), part) for part in parts])
 
 
-def _noise(latent: LatentPosterior, samples: int, generator: torch.Generator) -> Float[Tensor, "S N r"]:
-    count, rank, _ = latent.system.deflation.C.shape
-    noise = torch.randn(samples, count, rank, generator=generator, dtype=torch.float64, device=generator.device)
-    return math.sqrt(1.0 + latent.system.factor.jitter) * noise
-
-
-def _update_weights(
-    latent: LatentPosterior, prior: Float[Tensor, "S C N"], noise: Float[Tensor, "S N r"]
-) -> Float[Tensor, "S C N"]:
-    """beta_s = C^T T^-1 (t - C g_s(Z) - eps_s)."""
-    system = latent.system
-    count, rank, _ = system.deflation.C.shape
-    residual = system.deflation.t - torch.einsum("jac,scj->sja", system.deflation.C, prior) - noise
-    alpha = system.factor.solve(residual.reshape(len(prior), -1).mT.contiguous()).mT
-    return torch.einsum("jac,sja->scj", system.deflation.C, alpha.reshape(len(prior), count, rank))
-
-
 def _cosines(
     points: Float[Tensor, "*batch n d"],
     frequencies: Float[Tensor, "*batch d P"],
@@ -236,9 +219,18 @@ def _cosines(
 
 def _scaled(features: Sequence[Tensor], lengthscales: Sequence[Tensor]) -> Float[Tensor, "C n d"]:
     widest = max(z.shape[-1] for z in features)
+    most = max(len(z) for z in features)
     return torch.stack(
         [
-            torch.nn.functional.pad(z / scale, (0, widest - z.shape[-1]))
+            torch.nn.functional.pad(z / scale, (0, widest - z.shape[-1], 0, most - len(z)))
             for z, scale in zip(features, lengthscales, strict=True)
         ]
     )
+
+
+def stacked(weights: Sequence[Float[Tensor, "*S _"]]) -> Float[Tensor, "C *S N"]:
+    """Weights of all latents as one tensor, with zeros for the centres that a latent has not."""
+    if not weights:
+        return torch.zeros(0, 0, dtype=torch.float64)
+    most = max(w.shape[-1] for w in weights)
+    return torch.stack([torch.nn.functional.pad(w, (0, most - w.shape[-1])) for w in weights])

@@ -1,14 +1,22 @@
-"""Posterior of the latent functions given the deflated data: mean (n, C) and covariance (n, C, C) at new points."""
+"""Posterior of the latent functions given the data: mean (n, C) and covariance (n, C, C) at new points.
+
+Whatever computes it, its mean is a sum of kernel functions about some centres: E f_c(z) = sum_j k_c(z, z_j) w_cj. The
+exact posterior has the training points as centres; others may have fewer.
+"""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
+from forcegp.errors import InvalidInput
 from forcegp.inference.deflation import deflate, whiten
 from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
 from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
@@ -17,9 +25,52 @@ BLOCK_BYTES = 64 * 2**20
 """Working memory of one block of test points."""
 
 
+class LatentPosterior(ABC):
+    """p(f_1(z_1), ..., f_C(z_C) | data); `features` are the centres of each latent's kernel functions."""
+
+    kernels: LatentKernels
+    features: tuple[Float[Tensor, "_ _"], ...]
+
+    @property
+    @abstractmethod
+    def weights(self) -> tuple[Float[Tensor, " _"], ...]:
+        """The weight w_cj of every centre of each latent."""
+
+    @abstractmethod
+    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+        """Cov(f_c, f_d) at the same point, for n points."""
+
+    @abstractmethod
+    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
+        """Variance of one latent at points of its own features."""
+
+    @abstractmethod
+    def function_weights(
+        self, prior: Sequence[Float[Tensor, "S _"]], generator: torch.Generator
+    ) -> tuple[Float[Tensor, "S _"], ...]:
+        """Weights of S functions drawn from the posterior, given the values of S functions of the prior at the centres.
+
+        f_s,c(z) = prior function + sum_j k_c(z, z_j) w_s,cj (Matheron's rule; Wilson et al. 2020, eq. 10).
+        """
+
+    def mean(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
+        """E f_c = sum_j k_c(z, z_j) w_cj (Rasmussen & Williams 2006, eq. 2.25); differentiable in the features."""
+        return torch.stack([self._mean_of(index, z) for index, z in enumerate(features)], dim=-1)
+
+    def one(self, index: int, z: Float[Tensor, "n _"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Mean and variance of one latent at points of its own features."""
+        return self._mean_of(index, z), self.variance_of(index, z)
+
+    def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
+        kernel, centers, weights = self.kernels[index], self.features[index], self.weights[index]
+        height = max(1, BLOCK_BYTES // max(1, 8 * len(centers)))
+        blocks = [kernel_cross(kernel, z[i : i + height], centers) @ weights for i in range(0, len(z), height)]
+        return torch.cat(blocks) if blocks else z.new_zeros(0)
+
+
 @dataclass(frozen=True, eq=False)
-class LatentPosterior:
-    """p(f_1(z_1), ..., f_C(z_C) | data), exact."""
+class ExactPosterior(LatentPosterior):
+    """The posterior from the factorised covariance of all training points."""
 
     kernels: LatentKernels
     features: tuple[Float[Tensor, "N _"], ...]
@@ -33,27 +84,21 @@ class LatentPosterior:
         W: Float[Tensor, "N D C"],
         residual: Float[Tensor, "N D"],
         noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
-    ) -> LatentPosterior:
+    ) -> ExactPosterior:
         """Condition on residual = y - m; the arguments are those of `negative_log_likelihood`."""
         with torch.no_grad():
             W_white, y_white, _ = whiten(W, residual, noise)
             system = solve_deflated(deflate(W_white, y_white), kernels(features))
         return cls(kernels, tuple(z.detach() for z in features), system)
 
-    def mean(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
-        """E f_c = sum_j k_c(z, z_j) beta_jc (Rasmussen & Williams 2006, eq. 2.25); differentiable in the features."""
-        beta = self.system.beta
-        columns = [
-            kernel_cross(kernel, z, z_train) @ beta[:, c]
-            for c, (kernel, z, z_train) in enumerate(zip(self.kernels, features, self.features, strict=True))
-        ]
-        return torch.stack(columns, dim=-1)
+    @property
+    @override
+    def weights(self) -> tuple[Float[Tensor, " N"], ...]:
+        return self.system.beta.unbind(-1)
 
+    @override
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        """Cov(f_c, f_d) = k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 [k_c(z, z_j) C_jac].
-
-        Source: Rasmussen & Williams (2006), eq. 2.26.
-        """
+        # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 [k_c(z, z_j) C_jac] (Rasmussen & Williams 2006, eq. 2.26)
         C = self.system.deflation.C
         count, rank, latents = C.shape
         points = features[0].shape[0]
@@ -63,13 +108,24 @@ class LatentPosterior:
         ]
         return torch.cat(blocks) if blocks else C.new_zeros(0, latents, latents)
 
-    def one(self, index: int, z: Float[Tensor, "n _"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Mean and variance of one latent at points of its own features."""
-        kernel, C = list(self.kernels)[index], self.system.deflation.C
+    @override
+    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
+        kernel, C = self.kernels[index], self.system.deflation.C
         cross = kernel_cross(kernel, z, self.features[index])
         V = (cross.mT[:, None, :] * C[:, :, index, None]).flatten(0, 1)
-        explained = self.system.factor.solve_lower(V).square().sum(0)
-        return cross @ self.system.beta[:, index], kernel_diagonal(kernel, z) - explained
+        return kernel_diagonal(kernel, z) - self.system.factor.solve_lower(V).square().sum(0)
+
+    @override
+    def function_weights(
+        self, prior: Sequence[Float[Tensor, "S N"]], generator: torch.Generator
+    ) -> tuple[Float[Tensor, "S N"], ...]:
+        # beta_s = C^T T^-1 (t - C g_s(Z) - eps_s) with eps_s ~ N(0, I)
+        C, t = self.system.deflation.C, self.system.deflation.t
+        residual = t - torch.einsum("jac,csj->sja", C, torch.stack(list(prior)))
+        noise = torch.randn(residual.shape, generator=generator, dtype=C.dtype, device=C.device)
+        residual = residual - math.sqrt(1.0 + self.system.factor.jitter) * noise
+        alpha = self.system.factor.solve(residual.flatten(1).mT.contiguous()).mT.reshape(residual.shape)
+        return torch.einsum("jac,sja->csj", C, alpha).unbind(0)
 
     def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         C = self.system.deflation.C
@@ -82,3 +138,13 @@ class LatentPosterior:
         V = self.system.factor.solve_lower(V).reshape(count * rank, latents, points).permute(2, 1, 0)
         prior = torch.stack([kernel_diagonal(k, z) for k, z in zip(self.kernels, features, strict=True)], dim=-1)
         return torch.diag_embed(prior) - V @ V.mT
+
+
+def exact(latent: LatentPosterior, what: str) -> ExactPosterior:
+    """`latent` itself where it is exact. Raises InvalidInput, saying what is impossible, where it is not."""
+    if isinstance(latent, ExactPosterior):
+        return latent
+    raise InvalidInput(
+        f"{what} needs the factorised covariance of all rows, which a {type(latent).__name__} does not have; fit with "
+        "engine='exact' (and fewer points, where memory does not suffice)."
+    )

@@ -14,8 +14,8 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import (
+    ExactPosterior,
     LatentKernels,
-    LatentPosterior,
     LeaveOut,
     OptimizationResult,
     leave_blocks_out,
@@ -84,15 +84,15 @@ class IndependentLikelihood:
         matrices = kernels.matrices(parameters, [self._training_features])
         return negative_log_likelihood(*self._terms(joint, parameters), matrices)
 
-    def condition(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> LatentPosterior:
+    def condition(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> ExactPosterior:
         """The posterior of one joint's function at fixed parameters."""
         terms = self._terms(joint, parameters)
-        return LatentPosterior.condition(kernels.at(parameters), [self._training_features], *terms)
+        return ExactPosterior.condition(kernels.at(parameters), [self._training_features], *terms)
 
     def leave_out(
         self,
         joint: int,
-        latent: LatentPosterior,
+        latent: ExactPosterior,
         parameters: Mapping[str, Tensor],
         blocks: Sequence[Sequence[int]] | None,
     ) -> LeaveOut:
@@ -133,7 +133,7 @@ class IndependentPosterior(Posterior):
     settings: Mapping[str, Any]
 
     @cached_property
-    def latents(self) -> tuple[LatentPosterior, ...]:
+    def latents(self) -> tuple[ExactPosterior, ...]:
         """The posterior of every joint's function."""
         kernels = self.likelihood.kernels()
         return tuple(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.inference import LatentKernels, LatentPosterior, negative_log_likelihood
+from forcegp.inference import ExactPosterior, LatentKernels, LatentPosterior, negative_log_likelihood
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.priors import ForcePrior, Scaling
@@ -187,7 +187,7 @@ class MarginalLikelihood:
         """The posterior of the latent functions at fixed parameters."""
         with torch.no_grad():
             features, W, residual, noise = self.terms(parameters)
-            return LatentPosterior.condition(kernels.at(parameters), features, W, residual, noise)
+            return ExactPosterior.condition(kernels.at(parameters), features, W, residual, noise)
 
 
 def inertials_of(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message
-from forcegp.inference import LatentKernels, LatentPosterior, LeaveOut, OptimizationResult, leave_blocks_out
+from forcegp.inference import LatentKernels, LatentPosterior, LeaveOut, OptimizationResult, exact, leave_blocks_out
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
 from forcegp.models.components import Components, Curve, Latents, components_of, term_slices
@@ -244,7 +244,7 @@ class StructuredPosterior(Posterior):
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
         with torch.no_grad(), blas_threads(self.training.q.numel()):
             *_, noise = self.likelihood.terms(self.parameters)
-            return leave_blocks_out(self.latent.system, noise, blocks)
+            return leave_blocks_out(exact(self.latent, "leaving rows out").system, noise, blocks)
 
     @cached_property
     def negative_log_likelihood(self) -> float:

@@ -1,0 +1,136 @@
+"""Learning from more rows without starting again: the exact posterior with rows appended or left out.
+
+Appending m rows to N costs O(N^2 m) instead of O((N + m)^3), by the block Cholesky factorisation of T in deflated
+coordinates (Golub & Van Loan 2013, section 4.2.9),
+
+    [T11 T12]   [L11    ] [L11^T L21^T]      L21 = (L11^-1 T12)^T,
+    [T21 T22] = [L21 L22] [      L22^T],     L22 L22^T = T22 - L21 L21^T.
+
+Which rows are worth keeping is told by the precision P = T^-1 (`row_losses`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.inference.cholesky import CholeskyFactor, factorize
+from forcegp.inference.deflation import Deflation, deflate, whiten
+from forcegp.inference.kernels import LatentKernels, kernel_cross
+from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, deflated_covariance
+from forcegp.inference.posterior import ExactPosterior
+
+
+def with_rows(
+    latent: ExactPosterior,
+    features: Sequence[Float[Tensor, "m _"]],
+    W: Float[Tensor, "m D C"],
+    residual: Float[Tensor, "m D"],
+    noise: Float[Tensor, "#m D"] | Float[Tensor, "#m D D"],
+) -> ExactPosterior:
+    """The posterior of the old rows and m more, at the same kernels; the old posterior stays valid.
+
+    Equals `ExactPosterior.condition` on all rows but for rounding. The arguments are those of the new rows. Raises
+    NumericalError where they are not finite or the covariance cannot be factorised.
+    """
+    with torch.no_grad():
+        W_white, y_white, _ = whiten(W, residual, noise)
+        added, old = deflate(W_white, y_white), latent.system.deflation
+        rank = max(old.rank, added.rank)
+        factor = _with_rank(latent.system.factor, len(old.t), old.rank, rank)
+        old, added = _padded(old, rank), _padded(added, rank)
+        cross = _cross_covariance(latent.kernels, features, added.C, latent.features, old.C)
+        own = deflated_covariance(added.C, latent.kernels(features))
+        factor = appended(factor, cross, own)
+        joined = Deflation(*(torch.cat([getattr(part, name) for part in (old, added)]) for name in _PARTS))
+        joint = tuple(torch.cat([z, new.detach()]) for z, new in zip(latent.features, features, strict=True))
+        return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
+
+
+def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
+    """The posterior of some of the rows, in the order given: their covariance is factorised anew.
+
+    Raises NumericalError where it cannot be.
+    """
+    with torch.no_grad():
+        deflation = Deflation(*(getattr(latent.system.deflation, name)[rows] for name in _PARTS))
+        features = tuple(z[rows] for z in latent.features)
+        matrices = latent.kernels(features)
+        factor = factorize(lambda: deflated_covariance(deflation.C, matrices))
+        return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
+
+
+def appended(
+    factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]
+) -> CholeskyFactor:
+    """The factor of [[T11, cross^T], [cross, own]] from that of T11, which is copied; `own` is overwritten.
+
+    Only the lower triangle of `own` is read. Jitter is added to the new rows alone, as `factorize` does.
+    """
+    size, more = factor.lower.shape[0], own.shape[0]
+    lower = factor.lower.new_empty(size + more, size + more)
+    lower[:size, :size] = factor.lower
+    below = factor.solve_lower(cross.mT).mT if size else cross
+    lower[size:, :size] = below
+    own.sub_(below @ below.mT)
+    corner = factorize(own.clone)
+    lower[size:, size:] = corner.lower
+    return CholeskyFactor(lower, max(factor.jitter, corner.jitter))
+
+
+_PARTS = ("U", "C", "t", "remainder")
+
+
+def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:
+    """alpha = T^-1 t and beta from a factor of T."""
+    alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(deflation.t.shape)
+    return DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
+
+
+def _padded(deflation: Deflation, rank: int) -> Deflation:
+    """The same with zeros in place of the directions that rows of higher rank have; nothing depends on them."""
+    more = rank - deflation.rank
+    if not more:
+        return deflation
+    pad = torch.nn.functional.pad
+    U, C, t = pad(deflation.U, (0, more)), pad(deflation.C, (0, 0, 0, more)), pad(deflation.t, (0, more))
+    return Deflation(U, C, t, deflation.remainder)
+
+
+def _with_rank(factor: CholeskyFactor, count: int, rank: int, wanted: int) -> CholeskyFactor:
+    """The factor of T where every row has `wanted` directions; the new ones have variance 1, of noise alone."""
+    if rank == wanted:
+        return factor
+    lower = torch.eye(count * wanted, dtype=factor.lower.dtype, device=factor.lower.device)
+    place = torch.arange(count * wanted, device=lower.device).reshape(count, wanted)[:, :rank].reshape(-1)
+    lower[place[:, None], place] = factor.lower.tril()
+    return CholeskyFactor(lower, factor.jitter)
+
+
+def _cross_covariance(
+    kernels: LatentKernels,
+    features: Sequence[Tensor],
+    C: Float[Tensor, "m r C"],
+    old_features: Sequence[Tensor],
+    old_C: Float[Tensor, "N r C"],
+) -> Float[Tensor, "mr Nr"]:
+    """T21 of size (rm, rN), point-major, in panels of new rows."""
+    more, rank, latents = C.shape
+    count = len(old_C)
+    cross = C.new_zeros(more * rank, count * rank)
+    if not latents:
+        return cross
+    by_latent = old_C.permute(2, 0, 1).contiguous()
+    height = max(1, PANEL_BYTES // max(1, 8 * latents * count * rank))
+    for start in range(0, more, height):
+        part = slice(start, min(more, start + height))
+        kernel = torch.stack(
+            [kernel_cross(k, z[part], old) for k, z, old in zip(kernels, features, old_features, strict=True)], dim=1
+        )
+        weighted = (kernel[..., None] * by_latent).reshape(len(kernel), latents, count * rank)
+        cross[part.start * rank : part.stop * rank] = torch.bmm(C[part], weighted).reshape(-1, count * rank)
+    return cross
