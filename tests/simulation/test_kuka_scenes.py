@@ -19,6 +19,7 @@ SCENES = {
     "tilted": {"surface": "tilted", "friction": "stribeck"},
     "sphere": {"surface": "sphere", "friction": "coulomb"},
     "none": {"surface": "none", "joint_friction": "stribeck"},
+    "coulomb-joints": {"joint_friction": "coulomb"},
     "bullet": {"contact": "bullet", "seconds": 6.0},
     "bullet-sphere": {"contact": "bullet", "surface": "sphere"},
 }
@@ -92,10 +93,11 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
     assert 10.0 < np.median(load) < 40.0
 
 
-def test_joint_friction_is_its_law(scenes):
-    data, made = scenes["none"], config("none")
+@pytest.mark.parametrize(("scene", "near_rest"), [("none", "joint_static"), ("coulomb-joints", "joint_coulomb")])
+def test_joint_friction_is_its_law(scenes, scene, near_rest):
+    data, made = scenes[scene], config(scene)
     law = JointStribeckFriction(
-        *map(np.array, (made.joint_coulomb, made.joint_static, made.joint_viscous)),
+        *map(np.array, (made.joint_coulomb, getattr(made, near_rest), made.joint_viscous)),
         stribeck_velocity=made.joint_stribeck_velocity,
         smoothing=made.joint_smoothing,
     )

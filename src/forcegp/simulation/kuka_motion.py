@@ -165,7 +165,8 @@ def joint_friction_of(config: KukaSurfaceConfig) -> JointStribeckFriction | None
     """The law of the joints beyond what is subtracted from `u`; None without one."""
     if config.joint_friction == "none":
         return None
-    coulomb, static, viscous = map(np.array, (config.joint_coulomb, config.joint_static, config.joint_viscous))
+    near_rest = config.joint_static if config.joint_friction == "stribeck" else config.joint_coulomb
+    coulomb, static, viscous = map(np.array, (config.joint_coulomb, near_rest, config.joint_viscous))
     return JointStribeckFriction(coulomb, static, viscous, config.joint_stribeck_velocity, config.joint_smoothing)
 
 

@@ -18,7 +18,7 @@ from forcegp.simulation.checked_numbers import (
 )
 
 Friction = Literal["viscous", "coulomb", "stribeck"]
-JointFriction = Literal["none", "stribeck"]
+JointFriction = Literal["none", "coulomb", "stribeck"]
 Surface = Literal["plane", "tilted", "sphere", "none"]
 ContactKind = Literal["ideal", "bullet"]
 
@@ -104,12 +104,13 @@ class KukaSurfaceConfig:
     patch_x: tuple[float, float] = (0.0, 0.25)
     """The patch is the strip of the surface with x in this range [m]."""
     joint_friction: JointFriction = "none"
-    """Friction of the joints that is not part of `u`, in addition to the force at the tool."""
+    """Friction of the joints that is not part of `u`, in addition to the force at the tool: Coulomb friction and
+    viscous friction, with "stribeck" more near rest."""
     joint_coulomb: tuple[float, float, float, float, float, float, float] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)
     """Coulomb friction of every joint [Nm]; small in the wrist, whose inertia carries no motors here: explicit steps
     would oscillate under more."""
     joint_static: tuple[float, float, float, float, float, float, float] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)
-    """Friction of every joint near rest [Nm]."""
+    """Friction of every joint near rest [Nm] (stribeck only)."""
     joint_viscous: tuple[float, float, float, float, float, float, float] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)
     """Viscous friction of every joint [Nms/rad] beyond `joint_damping`."""
     joint_stribeck_velocity: float = 0.2
