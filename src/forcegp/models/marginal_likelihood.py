@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -31,13 +31,18 @@ excite can still grow.
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """States and measured accelerations (N, nv), float64; `noise_std` where the data state the noise of every row."""
+    """States and measured accelerations (N, nv), float64; `noise_std` where the data state the noise of every row.
+
+    `reference` holds the rows that features are standardised by and that the level of the noise refers to, where they
+    are not these rows themselves: then parameters mean the same as for the reference, on which they were fitted.
+    """
 
     q: Float[Tensor, "N nv"]
     v: Float[Tensor, "N nv"]
     u: Float[Tensor, "N nv"]
     a: Float[Tensor, "N nv"]
     noise_std: Float[Tensor, "N nv"] | None = None
+    reference: TrainingData | None = None
 
     @classmethod
     def of(cls, rows: Dataset, device: torch.device) -> TrainingData:
@@ -49,8 +54,17 @@ class TrainingData:
 
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:
-        """The noise of every row over its root mean square, joint by joint; None where all rows are equally noisy."""
-        return None if self.noise_std is None else self.noise_std / self.noise_std.square().mean(0).sqrt()
+        """The noise of every row over its root mean square, joint by joint; None where all rows are equally noisy.
+
+        Raises InvalidInput where only these rows or only their reference state the noise of every row.
+        """
+        level = self.noise_std if self.reference is None else self.reference.noise_std
+        if (self.noise_std is None) != (level is None):
+            raise InvalidInput(
+                "only some of the rows state the noise of every row (noise_std of shape (rows, nv)); state it for all "
+                "rows or for none, since the fitted noise is relative to it."
+            )
+        return None if level is None or self.noise_std is None else self.noise_std / level.square().mean(0).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +135,17 @@ class MarginalLikelihood:
 
     @cached_property
     def standardization(self) -> Standardization:
-        """From the features of the training states, at the nominal inertial parameters."""
+        """From the features of the reference states, at the nominal inertial parameters."""
+        if self._reference is not None:
+            return self._reference.standardization
         scalings = self.prior.scalings(self.system.robot)
         return Standardization.of(self.prior.features(self._nominal_dynamics), scalings)
+
+    @cached_property
+    def _reference(self) -> MarginalLikelihood | None:
+        """The same model on the rows that standardise features, where they are others than the training rows."""
+        rows = self.training.reference
+        return None if rows is None else replace(self, training=rows)
 
     @cached_property
     def _nominal_features(self) -> list[Tensor]:
@@ -142,7 +164,9 @@ class MarginalLikelihood:
             return self._nominal_features, self._nominal_mixing, self.training.a - offset, noise
         # shifted and scaled at these parameters, as a posterior does that has them in its system
         given = self.prior.features(dynamics)
-        features = Standardization.of(given, self.prior.scalings(self.system.robot))(given)
+        rows = self if self._reference is None else self._reference
+        by = given if rows is self else self.prior.features(rows.dynamics(parameters))
+        features = Standardization.of(by, self.prior.scalings(self.system.robot))(given)
         return features, dynamics.H @ self.prior.mixing(dynamics), self.training.a - offset, noise
 
     def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
