@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, get_args
 
-import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import ContactError, DataWarning, FitError, InvalidInput
+from forcegp.errors import DataWarning, FitError, InvalidInput
 from forcegp.inference import (
     LatentKernels,
     OptimizationResult,
@@ -45,10 +44,8 @@ from forcegp.models.search import (
     with_steps_before,
 )
 from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.surface_distance import check_distance
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
-
-FAR_FROM_SURFACE = 0.01
-"""Median distance of the training points from a contact's surface, in m, beyond which a warning is given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +169,7 @@ class StructuredGP(Model):
         training = TrainingData.of(rows, self.system.robot.device)
         likelihood = self._likelihood(training)
         self.system.check_states(training.q, training.v, training.u)
-        _check_distance(self.system, training)
+        check_distance(self.system, training)
         check_prior(likelihood)
         noise_parameters = noise.parameters(self.system.robot.nv)
         learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
@@ -281,27 +278,3 @@ class _Search:
             return minimize_objective(self.objective, first, self.options, note)
         except FitError as error:
             return error
-
-
-def _check_distance(system: MechanicalSystem, training: TrainingData) -> None:
-    """Refuse a surface that no training state touches, and warn where half of them are far from it."""
-    kinematics = system.robot.kinematics(training.q)
-    for index, contact in enumerate(system.contacts):
-        # divided by |s_p|, which is 1 for signed distances, the value of any surface is a distance near it
-        size = torch.linalg.vector_norm(contact.surface.gradient(contact.position(kinematics)), dim=-1)
-        distances = (contact.distance(kinematics) / size).abs()
-        distance = float(distances.median())
-        what = f"the surface of contact {index} (frame {contact.frame!r})"
-        remedy = "check its surface, point and units (m), or leave the contact out"
-        if float(distances.min()) > FAR_FROM_SURFACE:
-            raise ContactError(
-                f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away, half of them "
-                f"more than {distance:.3g} m; {remedy}"
-            )
-        if distance > FAR_FROM_SURFACE:
-            warnings.warn(
-                f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
-                "rows in contact only (forcegp.data.rows_in_contact)",
-                DataWarning,
-                stacklevel=4,
-            )
