@@ -6,7 +6,15 @@ coordinates (Golub & Van Loan 2013, section 4.2.9),
     [T11 T12]   [L11    ] [L11^T L21^T]      L21 = (L11^-1 T12)^T,
     [T21 T22] = [L21 L22] [      L22^T],     L22 L22^T = T22 - L21 L21^T.
 
-Which rows are worth keeping is told by the precision P = T^-1 (`row_losses`).
+What a row is worth is how far the posterior moves with it: the Kullback-Leibler divergence from the posterior without
+the row to the one with it. With P = T^-1 and alpha = P t it needs the row's own blocks only,
+
+    1/2 (tr P_ii - log|P_ii| - r + alpha_i^T (P_ii^-1 - I) alpha_i),
+
+for P_ii^-1 is the covariance of t_i given all other rows, noise I included, and P_ii^-1 alpha_i what these predict
+wrongly of it (`leave_out`). Rows that others tell already are worth nothing; surprising ones are worth more. (Csato &
+Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a score.) Leaving a row out of P is a
+step of Cholesky's algorithm on P, so that rows can be left out one after the other without another inversion.
 """
 
 from __future__ import annotations
@@ -17,7 +25,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.deflation import Deflation, deflate, whiten
 from forcegp.inference.kernels import LatentKernels, kernel_cross
@@ -64,9 +72,52 @@ def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPoster
         return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
 
 
-def appended(
-    factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]
-) -> CholeskyFactor:
+def rows_to_keep(latent: ExactPosterior, budget: int) -> Int[Tensor, " kept"]:
+    """The rows that are left when the one that is worth least is left out again and again; ascending.
+
+    Costs an inversion of T and, for d rows left out of N, O(N d^2) more. Raises InvalidInput for a budget below 1.
+    """
+    if budget < 1:
+        raise InvalidInput(f"budget is {budget}; keep at least 1 row")
+    system = latent.system
+    count, rank = system.alpha.shape
+    surplus = max(0, count - budget)
+    if not surplus or not rank:
+        return torch.arange(surplus, count, device=system.alpha.device)  # of rows that say nothing the newest
+    with torch.no_grad():
+        lower = CholeskyFactor(system.factor.lower.clone(), system.factor.jitter).into_inverse().tril_()
+        precision = (lower + lower.tril(-1).mT).reshape(count, rank, count * rank)
+        blocks = lower.reshape(count, rank, count, rank).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+        blocks = blocks + blocks.tril(-1).mT
+        alpha = system.alpha.clone()
+        left_out = torch.zeros(count, dtype=torch.bool, device=alpha.device)
+        steps = alpha.new_zeros(surplus * rank, count * rank)
+        identity = torch.eye(rank, dtype=alpha.dtype, device=alpha.device)
+        for done in range(surplus):
+            row = int(_losses(blocks, alpha).masked_fill(left_out, torch.inf).argmin())
+            before, here = steps[: done * rank], slice(row * rank, (row + 1) * rank)
+            own = torch.linalg.cholesky(blocks[row])
+            step = torch.linalg.solve_triangular(own, precision[row] - before[:, here].mT @ before, upper=False)
+            error = torch.linalg.solve_triangular(own, alpha[row][:, None], upper=False)
+            steps[done * rank : (done + 1) * rank] = step
+            by_row = step.reshape(rank, count, rank).permute(1, 2, 0)
+            blocks -= by_row @ by_row.mT
+            alpha -= (by_row @ error)[..., 0]
+            left_out[row] = True
+            blocks[left_out] = identity  # what is left of them is rounding, which has no inverse
+        return torch.nonzero(~left_out)[:, 0]
+
+
+def _losses(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> Float[Tensor, " N"]:
+    """What every row is worth to the posterior, in nats, from its blocks P_ii and alpha_i."""
+    factor, _ = torch.linalg.cholesky_ex(blocks)
+    logdet = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    error = torch.linalg.solve_triangular(factor, alpha[..., None], upper=False).square().sum((-2, -1))
+    trace = blocks.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return 0.5 * (trace - logdet - blocks.shape[-1] + error - alpha.square().sum(-1))
+
+
+def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]) -> CholeskyFactor:
     """The factor of [[T11, cross^T], [cross, own]] from that of T11, which is copied; `own` is overwritten.
 
     Only the lower triangle of `own` is read. Jitter is added to the new rows alone, as `factorize` does.

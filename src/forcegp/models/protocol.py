@@ -188,6 +188,26 @@ class Posterior(ABC):
             "another recording instead, or use a Gaussian process."
         )
 
+    def update(self, rows: Dataset, budget: int | None = None) -> Posterior:
+        """A new posterior that has learned from more rows, too; this one stays as it is.
+
+        Parameters, noise level and standardization stay those of the fit, so the result is exactly that of
+        conditioning on all rows at once, in time O(N^2) for N rows instead of O(N^3).
+
+        Parameters
+        ----------
+        rows: with the same joints, measured on the system that the model was trained on.
+        budget: keep this many rows at most: those that the posterior would change most without (docs/incremental.md).
+            The result is then exactly that of conditioning on these. None keeps all.
+
+        Raises InvalidInput for rows that do not fit and for models that would have to be trained again, ContactError
+        for rows at which the contacts cannot hold.
+        """
+        raise InvalidInput(
+            f"a {self.description} cannot learn from more rows without another fit: fit it again to all rows, or use "
+            "a StructuredGP with engine='exact'."
+        )
+
     def with_system(self, system: MechanicalSystem) -> Posterior:
         """The same knowledge in another system (robot, contacts, known forces) with the same joints.
 

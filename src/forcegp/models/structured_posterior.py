@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.inference import LatentKernels, LatentPosterior, LeaveOut, OptimizationResult, exact, leave_blocks_out
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
@@ -25,6 +26,7 @@ from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.search import blas_threads
+from forcegp.models.updating import updated
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots import Robot
 
@@ -217,6 +219,10 @@ class StructuredPosterior(Posterior):
         moved = copy.copy(self)  # with what is factorised: the training rows and their system stay
         object.__setattr__(moved, "target", system)
         return moved
+
+    @override
+    def update(self, rows: Dataset, budget: int | None = None) -> StructuredPosterior:
+        return updated(self, rows, budget)
 
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:

@@ -1,0 +1,97 @@
+"""A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.inference import ExactPosterior, exact
+from forcegp.inference.growing import rows_to_keep, with_only, with_rows
+from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
+from forcegp.models.search import blas_threads
+from forcegp.models.surface_distance import check_distance
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_posterior import StructuredPosterior
+
+Keep = Callable[[ExactPosterior, int], Tensor]
+"""(posterior, budget) -> numbers of the rows to keep, ascending."""
+
+SHARE_AT_ONCE = 4
+"""With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
+
+
+def updated(
+    posterior: StructuredPosterior, rows: Dataset, budget: int | None, keep: Keep = rows_to_keep
+) -> StructuredPosterior:
+    """`StructuredPosterior.update`; `keep` is another rule for the rows that stay."""
+    checked_update(posterior, rows, budget)
+    likelihood, parameters = posterior.likelihood, posterior.parameters
+    training, latent = likelihood.training, exact(posterior.latent, "learning from more rows")
+    reference = training if training.reference is None else training.reference
+    added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
+    likelihood.system.check_states(added.q, added.v, added.u)
+    check_distance(likelihood.system, added)
+    height = len(added.q) if budget is None else max(1, budget // SHARE_AT_ONCE)
+    with torch.no_grad(), blas_threads(training.q.numel()):
+        features, W, residual, noise = _on(likelihood, added).terms(parameters)
+        noise = noise.expand(len(W), *noise.shape[1:])
+        for start in range(0, len(W), height):
+            part = slice(start, start + height)
+            latent = with_rows(latent, [z[part] for z in features], W[part], residual[part], noise[part])
+            training = _joined(training, _selected(added, part))
+            if budget is not None and len(training.q) > budget:
+                kept = keep(latent, budget)
+                latent, training = with_only(latent, kept), _selected(training, kept)
+    training = replace(training, reference=reference)
+    settings = dict(posterior.settings)
+    settings |= {"points": len(training.q), "rows_added": settings.get("rows_added", 0) + len(rows), "budget": budget}
+    learned = replace(posterior, likelihood=_on(likelihood, training), settings=settings)
+    vars(learned)["latent"] = latent  # where the cached property looks first
+    return learned
+
+
+def checked_update(posterior: StructuredPosterior, rows: Dataset, budget: int | None) -> None:
+    """Raises InvalidInput for rows of other joints, a budget below 2, and a posterior that was carried elsewhere."""
+    joints = posterior.model.system.robot.joint_names
+    if tuple(rows.joint_names) != tuple(joints):
+        raise InvalidInput(f"the new rows have joints {', '.join(rows.joint_names)}; the model has {', '.join(joints)}")
+    if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 2):
+        raise InvalidInput(f"budget is {budget!r}; it is the number of rows to keep, 2 or more, or None for all")
+    if posterior.target is not None:
+        raise InvalidInput(
+            "the posterior was carried to another system than the one that its rows were measured on; update it "
+            "before it is carried there: posterior.update(rows).with_system(system)."
+        )
+
+
+def _on(likelihood: MarginalLikelihood, training: TrainingData) -> MarginalLikelihood:
+    """The same model on other rows, with the standardization at hand instead of computed anew."""
+    other = replace(likelihood, training=training)
+    vars(other)["standardization"] = likelihood.standardization
+    return other
+
+
+def _with_row_noise(rows: Dataset, reference: TrainingData) -> Dataset:
+    """Rows that state one noise for all of them say it for every row, where the training rows did so."""
+    if reference.noise_std is None or rows.noise_std is None or rows.noise_std.ndim == 2:
+        return rows
+    return replace(rows, noise_std=np.tile(rows.noise_std, (len(rows), 1)))
+
+
+def _selected(training: TrainingData, index: Tensor | slice) -> TrainingData:
+    values = (getattr(training, name) for name in ("q", "v", "u", "a", "noise_std"))
+    return TrainingData(*(None if value is None else value[index] for value in values))  # type: ignore[arg-type]  # noise_std alone may be None
+
+
+def _joined(first: TrainingData, second: TrainingData) -> TrainingData:
+    states = (torch.cat([getattr(first, name), getattr(second, name)]) for name in ("q", "v", "u", "a"))
+    stated = [part.noise_std for part in (first, second) if part.noise_std is not None]
+    return TrainingData(*states, noise_std=torch.cat(stated) if stated else None)
