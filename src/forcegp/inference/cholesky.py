@@ -48,6 +48,10 @@ class CholeskyFactor:
         """L^-1 right."""
         return torch.linalg.solve_triangular(self.lower, right, upper=False)
 
+    def solve_upper(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """L^-T right."""
+        return torch.linalg.solve_triangular(self.lower.mT, right, upper=True)
+
     def into_inverse(self) -> Float[Tensor, "n n"]:
         """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
         if not _is_for_lapack(self.lower):

@@ -173,7 +173,7 @@ def _cross_covariance(
     more, rank, latents = C.shape
     count = len(old_C)
     cross = C.new_zeros(more * rank, count * rank)
-    if not latents:
+    if not cross.numel():
         return cross
     by_latent = old_C.permute(2, 0, 1).contiguous()
     height = max(1, PANEL_BYTES // max(1, 8 * latents * count * rank))

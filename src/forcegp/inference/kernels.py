@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from typing import cast
+from typing import Any, cast
 
 import torch
 from gpytorch.kernels import Kernel
@@ -58,11 +58,26 @@ class LatentKernels(torch.nn.Module):
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
     ) -> list[Float[Tensor, "N N"]]:
         """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
-        return functional_call(self, {name: parameters[name] for name, _ in self.named_parameters()}, (features,))
+        return self._at(parameters, self, features)
+
+    def crosses(
+        self,
+        parameters: Mapping[str, Tensor],
+        left: Sequence[Float[Tensor, "n _"]],
+        right: Sequence[Float[Tensor, "m _"]],
+    ) -> list[Float[Tensor, "n m"]]:
+        """k_c(left_i, right_j) of every latent at `parameters`, differentiable in them."""
+        return self._at(parameters, _Crosses(self), left, right)
+
+    def diagonals(
+        self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "n _"]]
+    ) -> list[Float[Tensor, " n"]]:
+        """k_c(z_i, z_i) of every latent at `parameters`, differentiable in them."""
+        return self._at(parameters, _Diagonals(self), features)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density of the GPyTorch priors registered on the kernels, at `parameters`; 0 where there are none."""
-        return functional_call(_LogPrior(self), {n: parameters[n] for n, _ in self.named_parameters()}, ())
+        return self._at(parameters, _LogPrior(self))
 
     def initial_parameters(self) -> dict[str, Tensor]:
         """The unconstrained parameters by name, detached copies."""
@@ -75,6 +90,32 @@ class LatentKernels(torch.nn.Module):
             value.data = parameters[name].detach().clone().reshape(value.shape)
             value.requires_grad_(False)
         return copy
+
+    def _at(self, parameters: Mapping[str, Tensor], what: torch.nn.Module, *arguments: object) -> Any:
+        """`what(*arguments)`, a module that holds these kernels under the same names, at `parameters`."""
+        return functional_call(what, {name: parameters[name] for name, _ in self.named_parameters()}, arguments)
+
+
+class _Crosses(torch.nn.Module):
+    def __init__(self, latent: LatentKernels) -> None:
+        super().__init__()
+        self.kernels = latent.kernels
+
+    def forward(self, left: Sequence[Tensor], right: Sequence[Tensor]) -> list[Tensor]:
+        kernels = cast("list[Kernel]", list(self.kernels))
+        return [kernel_cross(kernel, x, y) for kernel, x, y in zip(kernels, left, right, strict=True)]
+
+
+class _Diagonals(torch.nn.Module):
+    def __init__(self, latent: LatentKernels) -> None:
+        super().__init__()
+        self.kernels = latent.kernels
+
+    def forward(self, features: Sequence[Tensor]) -> list[Tensor]:
+        return [
+            kernel_diagonal(kernel, z)
+            for kernel, z in zip(cast("list[Kernel]", list(self.kernels)), features, strict=True)
+        ]
 
 
 class _LogPrior(torch.nn.Module):

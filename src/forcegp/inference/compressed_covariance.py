@@ -1,0 +1,100 @@
+"""The posterior covariance from few linear combinations of the data, for control rates.
+
+The exact covariance of the latents is k(z, z) - V^T V with V = L^-1 K(z), where K(z) (n, C) is the covariance of the
+whitened data with f(z) and L L^T = T theirs. With orthonormal columns B (n, R),
+
+    k(z, z) - (B^T V)^T (B^T V)
+
+is the covariance given only the R numbers (L^-T B)^T t of the data t: that of a Gaussian process which has seen less. So
+it is never below the exact one (the difference V^T (I - B B^T) V is positive semidefinite) and needs R instead of n
+numbers per latent and centre. B holds the leading left singular vectors of V at sample states, each weighted by what
+it does to the standard deviations there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.inference.kernels import kernel_cross, kernel_diagonal
+from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior
+
+ROUNDING = 1e-7
+"""Standard deviations below this fraction of the prior's are rounding: nothing there can be uncertain."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """States at which covariances are compared: features of all latents and y = W f (n, k, C), the quantity of interest."""
+
+    features: Sequence[Float[Tensor, "n _"]]
+    W: Float[Tensor, "n k C"]
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedCovariance:
+    """Cov(f(z)) = k(z, z) - P P^T with P_c = k_c(z, Z) factors_c (n, R).
+
+    `inflation` holds the standard deviations of y over the exact ones, minus 1, at states that did not choose B.
+    """
+
+    factors: Float[Tensor, "C N R"]
+    inflation: Float[Tensor, " _"]
+
+    @property
+    def rank(self) -> int:
+        """R: how many combinations of the data are used."""
+        return self.factors.shape[-1]
+
+    def explained_root(self, cross: Float[Tensor, "n C N"]) -> Float[Tensor, "n C R"]:
+        """P for what the kernels say."""
+        return torch.bmm(cross.transpose(0, 1), self.factors).transpose(0, 1)
+
+
+def compress(
+    latent: ExactPosterior, sample: Sample, check: Sample, *, tolerance: float, largest: int
+) -> CompressedCovariance:
+    """The smallest rank at which no standard deviation at the states of `check` is more than 1 + `tolerance` times too
+    large; `largest` where that needs more.
+    """
+    with torch.no_grad():
+        D, _ = _directions(latent, sample)
+        _, vectors = torch.linalg.eigh(D.mT @ D)
+        columns = D @ vectors.flip(-1)[:, : min(largest, *D.shape)]
+        B, _ = torch.linalg.qr(columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300))
+        at, total = _directions(latent, check)
+        seen = (B.mT @ at).square_().cumsum_(0)
+        # in units of the exact variance; the exact one is 1 where nothing is missing
+        excess = (total - seen).clamp_min_(0.0).amax(1)
+        enough = torch.nonzero((1.0 + excess).sqrt() - 1.0 <= tolerance)
+        rank = int(enough[0]) + 1 if len(enough) else len(seen)
+        inflation = (1.0 + (total - seen[rank - 1]).clamp_min_(0.0)).sqrt() - 1.0
+        S = latent.system.factor.solve_lower_transposed(B[:, :rank].contiguous())
+        C = latent.system.deflation.C
+        factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], rank))
+    return CompressedCovariance(factors.contiguous(), inflation)
+
+
+def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "n _"], Float[Tensor, " _"]]:
+    """V W^T over the exact standard deviations, one column per state and entry of y, and the squared columns' sums."""
+    C = latent.system.deflation.C
+    count, rank, latents = C.shape
+    points, height = len(sample.W), max(1, BLOCK_BYTES // max(1, 8 * count * rank * latents))
+    found = []
+    for start in range(0, points, height):
+        features, W = [z[start : start + height] for z in sample.features], sample.W[start : start + height]
+        cross = torch.stack([kernel_cross(*of) for of in zip(latent.kernels, features, latent.features, strict=True)])
+        V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, -1)
+        V = latent.system.factor.solve_lower(V).reshape(count * rank, latents, -1)
+        y = torch.einsum("acn,nkc->ank", V, W)
+        prior = torch.stack([kernel_diagonal(*of) for of in zip(latent.kernels, features, strict=True)], dim=-1)
+        variance = torch.einsum("nkc,nc->nk", W.square(), prior)
+        left = (variance - y.square().sum(0)).sqrt()
+        counts = left > ROUNDING * variance.sqrt()  # False where NaN
+        found.append((y / torch.where(counts, left, 1.0))[:, counts])
+    D = torch.cat(found, dim=1)
+    return D, D.square().sum(0)

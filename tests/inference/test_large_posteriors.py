@@ -1,0 +1,191 @@
+"""Posteriors for many points, against the exact one of few."""
+
+import pytest
+import torch
+from tests.inference.problems import Problem, normal, problem
+
+from forcegp.errors import NumericalError
+from forcegp.inference import ExactPosterior, negative_log_likelihood
+from forcegp.inference.deflation import deflate, whiten
+from forcegp.inference.inducing import InducingPosterior, collapsed_bound, inducing_pivots
+from forcegp.inference.iterative import IterativePosterior, LowRankPlusDiagonal
+from forcegp.inference.pivots import pivoted_cholesky
+
+SHAPES = {
+    "no constraint": {"constraints": 0},
+    "one constraint": {"constraints": 1},
+    "fewer latents than outputs": {"latents": 2},
+    "more latents than outputs": {"latents": 6, "outputs": 3},
+}
+COUNT = 40
+
+
+def made(**shape) -> Problem:
+    return problem(count=COUNT, **shape)
+
+
+def new_features(given: Problem, points: int = 5) -> list[torch.Tensor]:
+    return [normal(points, z.shape[1], seed=100 + c) for c, z in enumerate(given.features)]
+
+
+def exact(given: Problem) -> ExactPosterior:
+    return ExactPosterior.condition(given.kernels, given.features, *given.data)
+
+
+def iterative(given: Problem, **changes) -> IterativePosterior:
+    how = {"points": 10, "tolerance": 1e-11, "iterations": 400, "memory": 0, **changes}
+    return IterativePosterior.condition(given.kernels, given.features, *given.data, **how)
+
+
+def inducing(given: Problem, points: int = COUNT, tolerance: float = 0.0) -> InducingPosterior:
+    return InducingPosterior.condition(given.kernels, given.features, *given.data, points=points, tolerance=tolerance)
+
+
+MAKERS = {
+    "iterative": lambda given: iterative(given, solve_covariance=True),
+    "iterative, matrices kept": lambda given: iterative(given, memory=10**9, solve_covariance=True),
+    "inducing points everywhere": inducing,
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+@torch.no_grad()
+def test_equals_the_exact_posterior(make, shape):
+    given = made(**shape)
+    features = new_features(given)
+    posterior, expected = make(given), exact(given)
+    torch.testing.assert_close(posterior.mean(features), expected.mean(features), rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(posterior.covariance(features), expected.covariance(features), rtol=1e-6, atol=1e-7)
+    for index, z in enumerate(features):
+        torch.testing.assert_close(posterior.one(index, z), expected.one(index, z), rtol=1e-6, atol=1e-7)
+
+
+@torch.no_grad()
+def test_few_weights_know_less_than_all_data():
+    given = made()
+    features = new_features(given)
+    few, expected = inducing(given, points=8), exact(given)
+    surplus = few.covariance(features).diagonal(dim1=-2, dim2=-1).sum(-1) - expected.covariance(features).diagonal(
+        dim1=-2, dim2=-1
+    ).sum(-1)
+    assert (surplus > 0).all()
+    assert few.left_out > 1.0
+    assert inducing(given).left_out == pytest.approx(0.0, abs=1e-6)
+
+
+@torch.no_grad()
+def test_tolerance_sets_the_number_of_inducing_points():
+    given = made()
+    loose, tight = inducing(given, tolerance=1e4), inducing(given, tolerance=1e-2)
+    assert loose.left_out <= 1e4
+    assert tight.left_out <= 1e-2
+    assert sum(map(len, loose.features)) < sum(map(len, tight.features))
+
+
+@torch.no_grad()
+def test_drawn_functions_of_conjugate_gradients_are_those_of_the_exact_posterior():
+    given = made()
+    prior = [normal(3, COUNT, seed=200 + c) for c in range(len(given.features))]
+    drawn = [p.function_weights(prior, torch.Generator().manual_seed(1)) for p in (iterative(given), exact(given))]
+    for weights, expected in zip(*drawn, strict=True):
+        torch.testing.assert_close(weights, expected, rtol=1e-6, atol=1e-6)
+
+
+@torch.no_grad()
+def test_drawn_functions_of_inducing_points_have_the_posterior_moments():
+    given, samples = made(latents=2), 40000
+    posterior = inducing(given, points=12)
+    points = [z[:4] for z in posterior.features]
+    lowers = [lower.clone() for lower in posterior.space.lowers]
+    prior = [(lower @ normal(len(lower), samples, seed=300 + c)).mT.contiguous() for c, lower in enumerate(lowers)]
+    weights = posterior.function_weights(prior, torch.Generator().manual_seed(2))
+    values = torch.stack(
+        [
+            prior[c][:, :4] + w @ given.kernels[c](posterior.features[c], points[c]).to_dense()
+            for c, w in enumerate(weights)
+        ],
+        dim=-1,
+    )  # S 4 C
+    mean, covariance = posterior.mean(points), posterior.covariance(points)
+    centred = values - values.mean(0)
+    sampled = torch.einsum("snc,snd->ncd", centred, centred) / samples
+    scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((values.mean(0) - mean).abs() < 5.0 * scale / samples**0.5 + 1e-9).all()
+    assert ((sampled - covariance).abs() < 0.05 * scale[..., :, None] * scale[..., None, :]).all()
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_the_bound_is_the_likelihood_with_all_points_and_above_it_with_few(shape):
+    given = made(**shape)
+    parameters = given.kernels.initial_parameters()
+
+    def bound(points: int) -> float:
+        W_white, y_white, _ = whiten(*given.data)
+        pivots = inducing_pivots(given.kernels, given.features, deflate(W_white, y_white).C, points)
+        inside = [z[p.indices] for z, p in zip(given.features, pivots, strict=True)]
+        with torch.no_grad():
+            return float(collapsed_bound(*given.data, given.kernels, parameters, given.features, inside))
+
+    expected = float(negative_log_likelihood(*given.data, given.kernels.matrices(parameters, given.features)))
+    assert bound(COUNT) == pytest.approx(expected, abs=1e-3)
+    values = [bound(points) for points in (4, 12, 25)]
+    assert values[0] > values[1] > values[2] > expected
+
+
+@pytest.mark.parametrize("chunk", [1, 10**9], ids=["a row at a time", "all at once"])
+def test_the_bound_has_the_gradients_of_its_values(chunk, monkeypatch):
+    monkeypatch.setattr("forcegp.inference.inducing.CHUNK_BYTES", chunk)
+    given = problem(count=7, outputs=3, constraints=1, dimension=2)
+    points = [z[:4].clone() for z in given.features]
+    names = list(given.kernels.initial_parameters())
+
+    def bound(W, residual, noise, *values):
+        parameters = dict(zip(names, values, strict=True))
+        return collapsed_bound(W, residual, noise, given.kernels, parameters, given.features, points)
+
+    inputs = [x.clone().requires_grad_() for x in (*given.data, *given.kernels.initial_parameters().values())]
+    assert torch.autograd.gradcheck(bound, inputs, rtol=1e-5, atol=1e-6)
+
+
+@torch.no_grad()
+def test_the_preconditioner_inverts_its_own_model():
+    given = made()
+    W_white, y_white, _ = whiten(*given.data)
+    C = deflate(W_white, y_white).C
+    count, rank, _ = C.shape
+    model = LowRankPlusDiagonal.of(given.kernels, given.features, C, points=6)
+    dense = torch.zeros(count, rank, count, rank, dtype=torch.float64)
+    for c, found in enumerate(model.pivots):
+        low_rank = found.rows.mT @ found.rows
+        dense += torch.einsum("ia,ij,jb->iajb", C[..., c], low_rank + found.remainder.diag(), C[..., c])
+    dense = dense.reshape(count * rank, -1) + torch.eye(count * rank, dtype=torch.float64)
+    right = normal(count * rank, 3)
+    torch.testing.assert_close(model.solve(dense @ right), right, rtol=1e-8, atol=1e-8)
+    exact_covariance = [k(z, z).to_dense() for k, z in zip(given.kernels, given.features, strict=True)]
+    for found, K in zip(model.pivots, exact_covariance, strict=True):
+        torch.testing.assert_close((found.rows.mT @ found.rows).diagonal() + found.remainder, K.diagonal())
+
+
+@torch.no_grad()
+def test_pivots_reproduce_the_matrix_that_they_are_made_of():
+    given = made()
+    z, kernel = given.features[0], given.kernels[0]
+    K = kernel(z, z).to_dense()
+    found = pivoted_cholesky(kernel, z, torch.ones(COUNT, dtype=torch.float64), COUNT)
+    torch.testing.assert_close(found.rows.mT @ found.rows, K, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found.lower @ found.lower.mT, K[found.indices][:, found.indices])
+    assert len(set(found.indices.tolist())) == len(found.indices)
+
+
+def test_a_missed_tolerance_is_an_error():
+    with pytest.raises(NumericalError, match=r"relative residual of .* in 3 iterations, not 1e-11"):
+        iterative(made(), iterations=3)
+
+
+def test_a_good_start_saves_iterations():
+    given = made()
+    first = iterative(given, tolerance=1e-8)
+    again = iterative(given, tolerance=1e-8, start=first.solved.solution.reshape(COUNT, -1))
+    assert again.solved.iterations == 0
+    assert first.solved.iterations > 5
