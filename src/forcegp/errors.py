@@ -109,6 +109,10 @@ class SimulationError(ForceGPError):
     """A simulated motion that diverged or left the robot's limits, so that its data are of no use."""
 
 
+class CompilerError(ForceGPError):
+    """Dynamics that cannot be compiled or loaded: no C compiler, one that failed, or a folder that cannot be used."""
+
+
 class MissingExtra(ForceGPError, ImportError):
     """An optional dependency is not installed; the message holds the pip command."""
 

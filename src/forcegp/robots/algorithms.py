@@ -27,6 +27,11 @@ from torch import Tensor
 from forcegp.errors import NumericalError
 from forcegp.robots.tree import Tree
 
+NOT_POSITIVE_DEFINITE = (
+    "the mass matrix is not positive definite: either q or the inertial parameters hold NaN or infinity, or "
+    "all mass that a joint moves lies on its axis; check the inputs, or give that joint armature."
+)
+
 
 def product(
     left: Float[Tensor, "*#joints rows inner #batch"], right: Float[Tensor, "*#joints inner columns #batch"]
@@ -138,8 +143,5 @@ def solve_mass_matrix(mass: Float[Tensor, "*batch n n"], force: Float[Tensor, "*
     try:
         factor = torch.linalg.cholesky(mass)
     except torch.linalg.LinAlgError as error:
-        raise NumericalError(
-            "the mass matrix is not positive definite: either q or the inertial parameters hold NaN or infinity, or "
-            "all mass that a joint moves lies on its axis; check the inputs, or give that joint armature."
-        ) from error
+        raise NumericalError(NOT_POSITIVE_DEFINITE) from error
     return torch.cholesky_solve(force[..., None], factor).squeeze(-1)

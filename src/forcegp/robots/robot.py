@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -29,6 +30,9 @@ from forcegp.robots.tree import Tree, compile_tree, merged_inertias
 from forcegp.robots.urdf import RobotDescription, parse_urdf
 from forcegp.robots.urdf_file import read_text, write_text
 from forcegp.robots.urdf_writer import replace_inertial
+
+if TYPE_CHECKING:
+    from forcegp.robots.compiled import CompiledRobot
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -127,6 +131,12 @@ class Robot:
         device = torch.device(device)
         frames = {name: (body, offset.to(device)) for name, (body, offset) in self._frames.items()}
         return replace(self, tree=self.tree.to(device), _frames=frames)
+
+    def compile(self, folder: str | Path | None = None) -> CompiledRobot:
+        """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""
+        from forcegp.robots.compiled import CompiledRobot
+
+        return CompiledRobot(self, folder)
 
     def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> Robot:
         robot = Robot.from_urdf_text(
@@ -299,11 +309,7 @@ class Robot:
         return self.kinematics(q).frame_jacobian(frame, point)
 
     def frame_bias_acceleration(
-        self,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        frame: str,
-        point: Vector | None = None,
+        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], frame: str, point: Vector | None = None
     ) -> Float[Tensor, "... 6"]:
         """Acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``, classical, without gravity.
 

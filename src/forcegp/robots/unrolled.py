@@ -19,12 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from forcegp.errors import InvalidInput
 from forcegp.robots.layout import WORLD
-from forcegp.robots.robot import Robot
 from forcegp.robots.scalar_algebra import (
     Matrix,
     Scalar,
@@ -47,6 +47,9 @@ from forcegp.robots.scalar_algebra import (
     symmetric_product,
     transpose,
 )
+
+if TYPE_CHECKING:
+    from forcegp.robots.robot import Robot
 
 # What is smaller in a rotation matrix or an inertia is rounding, of the turn onto the joint axis, say: sin(pi) = 1e-16.
 ROUNDING = 1e-15

@@ -1,0 +1,219 @@
+"""`CompiledRobot`: the dynamics of one robot as machine code made for it, with first derivatives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
+from forcegp.robots.arguments import Inertials, broadcast_batch
+from forcegp.robots.compiled_programs import CompiledProgram, compiled_program, default_folder
+from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, INERTIA_ENTRIES, Request
+from forcegp.robots.unrolled import UnrolledRobot
+
+if TYPE_CHECKING:
+    from forcegp.robots.robot import Robot
+
+ROWS, COLUMNS = (list(entries) for entries in zip(*INERTIA_ENTRIES, strict=True))
+
+
+class CompiledRobot:
+    """The dynamics of a robot, compiled for it; made by ``robot.compile()``.
+
+    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, and backward passes give the
+    derivatives with respect to all arguments and inertial parameters. Results agree to rounding. Not supported, with
+    an :class:`~forcegp.errors.InvalidInput` that says so: second derivatives, transforms of ``torch.func``,
+    forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
+
+    A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
+    ``folder`` (``~/.cache/forcegp/dynamics`` by default) holds them already; :meth:`prepare` does so ahead. Code from
+    that folder runs with the rights of the process. Several states are computed at once, and large batches by as many
+    threads as torch has.
+
+    Raises :class:`~forcegp.errors.CompilerError` where something must be compiled and no C compiler is there.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    def __init__(self, robot: Robot, folder: str | Path | None = None) -> None:
+        if robot.device.type != "cpu":
+            raise InvalidInput(
+                f"compiled dynamics runs on the CPU, and the robot is on {robot.device}; compile robot.to('cpu'), or "
+                "use the robot itself."
+            )
+        self.robot = robot
+        self.folder = default_folder() if folder is None else Path(folder).expanduser()
+        self._unrolled = UnrolledRobot(robot)
+        self._programs: dict[Request, CompiledProgram] = {}
+
+    def __reduce__(self) -> tuple[type[CompiledRobot], tuple[Robot, Path]]:
+        return CompiledRobot, (self.robot, self.folder)
+
+    def __repr__(self) -> str:
+        return f"CompiledRobot({self.robot!r}, folder={str(self.folder)!r})"
+
+    def prepare(self, *functions: str, inertials: bool = False, derivatives: bool = False) -> CompiledRobot:
+        """Compile functions now: those named, or all; returns the same object.
+
+        ``inertials``: for calls with ``inertials=``, which take the inertias as inputs; else for those without.
+        ``derivatives``: also those of a backward pass, with respect to the arguments, the inertias, or both.
+        """
+        unknown = [name for name in functions if name not in ARGUMENTS]
+        if unknown:
+            raise InvalidInput(f"no function {unknown[0]!r} to compile; there are: {', '.join(ARGUMENTS)}")
+        kinds = [(False, False)]
+        if derivatives:
+            kinds += [(True, False), *([(False, True), (True, True)] if inertials else [])]
+        for name in functions or ARGUMENTS:
+            for states, inertias in kinds:
+                self.program(Request(name, inertials, states, inertias))
+        return self
+
+    # ------------------------------------------------------------------ dynamics
+
+    def mass_matrix(
+        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> Float[Tensor, "... nv nv"]:
+        """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
+        return self._evaluate("mass_matrix", inertials, q=q)[0]
+
+    def bias_forces(
+        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> Float[Tensor, "... nv"]:
+        """As :meth:`Robot.bias_forces <forcegp.robots.Robot.bias_forces>`."""
+        return self._evaluate("bias_forces", inertials, q=q, v=v)[0]
+
+    def mass_matrix_and_bias(
+        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+        """As :meth:`Robot.mass_matrix_and_bias <forcegp.robots.Robot.mass_matrix_and_bias>`."""
+        mass, bias = self._evaluate("mass_matrix_and_bias", inertials, q=q, v=v)
+        return mass, bias
+
+    def gravity_forces(
+        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+    ) -> Float[Tensor, "... nv"]:
+        """As :meth:`Robot.gravity_forces <forcegp.robots.Robot.gravity_forces>`."""
+        return self._evaluate("gravity_forces", inertials, q=q)[0]
+
+    def inverse_dynamics(
+        self,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        a: Float[Tensor, "*#batch nv"],
+        inertials: Inertials | None = None,
+    ) -> Float[Tensor, "... nv"]:
+        """As :meth:`Robot.inverse_dynamics <forcegp.robots.Robot.inverse_dynamics>`."""
+        return self._evaluate("inverse_dynamics", inertials, q=q, v=v, a=a)[0]
+
+    def forward_dynamics(
+        self,
+        q: Float[Tensor, "*#batch nv"],
+        v: Float[Tensor, "*#batch nv"],
+        tau: Float[Tensor, "*#batch nv"],
+        inertials: Inertials | None = None,
+    ) -> Float[Tensor, "... nv"]:
+        """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
+        return self._evaluate("forward_dynamics", inertials, q=q, v=v, tau=tau)[0]
+
+    # ------------------------------------------------------------------ inside
+
+    def program(self, request: Request) -> CompiledProgram:
+        """The machine code of a request."""
+        found = self._programs.get(request)
+        if found is None:
+            found = self._programs[request] = compiled_program(self._unrolled, request, self.folder)
+        return found
+
+    def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
+        for name, value in arguments.items():
+            self.robot.check_input(name, value)
+        shapes = {name: value.shape[:-1] for name, value in arguments.items()}
+        tensors = list(arguments.values())
+        if inertials:
+            bodies = self.robot.body_inertias(inertials)  # (nv, 4, 4, *own)
+            own = bodies.shape[3:]
+            tensors.append(bodies[:, ROWS, COLUMNS].flatten(0, 1).movedim(0, -1))
+            shapes["inertials"] = own
+        _require_plain(tensors)
+        batch = broadcast_batch(shapes)
+        flat = [
+            value.reshape(1, -1)
+            if position == len(arguments) and value.dim() == 1  # one set of inertias serves all states
+            else value.expand(*batch, -1).reshape(batch.numel(), value.shape[-1]).contiguous()
+            for position, value in enumerate(tensors)
+        ]
+        request = Request(function, bool(inertials))
+        if torch.is_grad_enabled() and any(value.requires_grad for value in flat):
+            results = _Value.apply(self, request, *flat)
+        else:
+            results = run(self, request, batch.numel(), flat)
+        nv = self.robot.nv
+        dimensions = DIMENSIONS.get(function, (1,))
+        return tuple(x.reshape(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True))
+
+
+def run(owner: CompiledRobot, request: Request, count: int, tensors: list[Tensor]) -> tuple[Tensor, ...]:
+    """Results of a request, (count, size) each, from its inputs in order."""
+    nv = owner.robot.nv
+    q = tensors[0]
+    inputs = dict(zip(request.inputs, tensors, strict=True)) | {"sin q": q.sin(), "cos q": q.cos()}
+    if request.is_value:
+        sizes = zip(request.results, (nv**d for d in DIMENSIONS.get(request.function, (1,))), strict=True)
+        outputs = {name: q.new_empty(count, size) for name, size in sizes}
+    else:
+        outputs = {name: torch.empty_like(inputs[name]) for name in request.wanted}
+    if not owner.program(request)(count, inputs, outputs):
+        raise NumericalError(NOT_POSITIVE_DEFINITE)
+    return tuple(outputs.values())
+
+
+class _Value(torch.autograd.Function):
+    """A function of the robot; its backward pass is the program of its derivatives."""
+
+    @staticmethod
+    def forward(ctx: Any, owner: CompiledRobot, request: Request, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.owner, ctx.request = owner, request
+        ctx.save_for_backward(*tensors)
+        return run(owner, request, len(tensors[0]), list(tensors))
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        needed = dict(zip(ctx.request.inputs, ctx.needs_input_grad[2:], strict=True))
+        inertias = needed.pop("inertias", False)
+        request = Request(ctx.request.function, ctx.request.free_inertias, any(needed.values()), inertias)
+        tensors = *ctx.saved_tensors, *(cotangent.contiguous() for cotangent in cotangents)
+        found = dict(zip(request.wanted, _Derivative.apply(ctx.owner, request, *tensors), strict=True))
+        return None, None, *(found.get(name) for name in ctx.request.inputs)
+
+
+class _Derivative(torch.autograd.Function):
+    """Derivatives of a function of the robot, which have none themselves."""
+
+    @staticmethod
+    def forward(ctx: Any, owner: CompiledRobot, request: Request, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return run(owner, request, len(tensors[0]), list(tensors))
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
+        raise InvalidInput(
+            "compiled dynamics has first derivatives only; for second ones use the robot itself (compiled.robot), "
+            "whose results are the same."
+        )
+
+
+def _require_plain(tensors: list[Tensor]) -> None:
+    """:class:`~forcegp.errors.InvalidInput` under a transform of torch.func and in forward-mode differentiation."""
+    transformed = torch._C._are_functorch_transforms_active()
+    if transformed or any(forward_ad.unpack_dual(x).tangent is not None for x in tensors):
+        what = "transforms of torch.func (vmap, grad, jacrev, ...)" if transformed else "forward-mode differentiation"
+        raise InvalidInput(
+            f"compiled dynamics does not support {what}; use batch dimensions and backward passes, or the robot itself "
+            "(compiled.robot), whose results are the same."
+        )

@@ -1,0 +1,279 @@
+"""Compiled dynamics: the robot's results and first derivatives, kept in a folder, with errors that say what to do."""
+
+import os
+import pickle
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.robots.pinocchio_oracle import Oracle
+
+from forcegp.errors import CompilerError, InvalidInput, NumericalError
+from forcegp.robots import Robot
+
+# a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
+TEXT = """<robot name="small">
+  <link name="base"/>
+  <joint name="swing" type="revolute">
+    <origin xyz="0.1 0 0.4" rpy="0.3 0.2 -0.5"/><parent link="base"/><child link="arm"/><axis xyz="1 2 -1"/>
+    <limit lower="-2" upper="2" effort="50" velocity="3"/>
+  </joint>
+  <joint name="slide" type="prismatic">
+    <origin xyz="0.2 0.1 0" rpy="0 0.7 0"/><parent link="arm"/><child link="cart"/><axis xyz="0 1 1"/>
+    <limit lower="-1" upper="1" effort="50" velocity="3"/>
+  </joint>
+  <joint name="turn" type="continuous">
+    <origin xyz="-0.2 0.1 0.3"/><parent link="arm"/><child link="hand"/>
+  </joint>
+  <joint name="mount" type="fixed">
+    <origin xyz="0 0.1 0.05" rpy="0.4 0 0"/><parent link="hand"/><child link="tool"/>
+  </joint>
+  <link name="arm"><inertial><origin xyz="0.1 0 0.2" rpy="0.1 0.2 0"/><mass value="3"/>
+    <inertia ixx="0.04" ixy="0.002" ixz="0" iyy="0.05" iyz="-0.003" izz="0.03"/></inertial></link>
+  <link name="cart"><inertial><origin xyz="0 0.1 0"/><mass value="1.2"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.012" iyz="0" izz="0.009"/></inertial></link>
+  <link name="hand"><inertial><origin xyz="0.03 0.02 0.1"/><mass value="0.8"/>
+    <inertia ixx="0.004" ixy="0" ixz="0.0005" iyy="0.005" iyz="0" izz="0.003"/></inertial></link>
+  <link name="tool"><inertial><origin xyz="0 0 0.05"/><mass value="0.3"/>
+    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.0012" iyz="0" izz="0.0008"/></inertial></link>
+</robot>
+"""
+ARMATURE = {"swing": 0.2, "slide": 0.4}
+LINKS = ("arm", "cart", "tool")  # one body keeps a link of the URDF: hand
+METHODS = {
+    "mass_matrix": 1,
+    "bias_forces": 2,
+    "mass_matrix_and_bias": 2,
+    "gravity_forces": 1,
+    "inverse_dynamics": 3,
+    "forward_dynamics": 3,
+}
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot.from_urdf_text(TEXT, armature=ARMATURE)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("compiled") / "dynamics"
+
+
+@pytest.fixture(scope="module")
+def compiled(robot, folder):
+    return robot.compile(folder)
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def results(of, method, arguments, inertials):
+    """Values, and the gradients of a random combination of them with respect to everything that requires one."""
+    values = getattr(of, method)(*arguments, inertials)
+    values = values if isinstance(values, tuple) else (values,)
+    total = sum((value * random(*value.shape, seed=9)).sum() for value in values)
+    leaves = [*arguments, *(inertials or {}).values()]
+    return [value.detach() for value in values], torch.autograd.grad(total, [x for x in leaves if x.requires_grad])
+
+
+def assert_equal_results(ours, theirs):
+    for mine, expected in zip(ours, theirs, strict=True):
+        scale = max(float(x.abs().max()) for x in expected)
+        for x, y in zip(mine, expected, strict=True):
+            torch.testing.assert_close(x, y, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("inertials", [None, (), (1, 6)], ids=["as they are", "one set", "in batches"])
+@pytest.mark.parametrize("method", METHODS)
+def test_values_and_gradients_equal_those_of_the_robot(robot, compiled, method, inertials):
+    arguments = [random(5, 6, 3, seed=k).requires_grad_() for k in range(METHODS[method])]
+    if inertials is not None:
+        names = enumerate(LINKS)
+        inertials = {name: (0.3 * random(*inertials, 10, seed=20 + k)).requires_grad_() for k, name in names}
+    assert_equal_results(*(results(of, method, arguments, inertials) for of in (compiled, robot)))
+
+
+def test_only_the_gradient_of_the_inertials(robot, compiled):
+    inertials = {name: (0.3 * random(10, seed=20 + k)).requires_grad_() for k, name in enumerate(LINKS)}
+    arguments = [random(6, 3, seed=k) for k in range(3)]
+    assert_equal_results(*(results(of, "forward_dynamics", arguments, inertials) for of in (compiled, robot)))
+
+
+def test_pinocchio_agrees(robot, compiled):
+    oracle = Oracle(TEXT, robot)
+    q, v, tau = random(3, 7, 3)
+    theirs = [oracle.forward_dynamics(*state) for state in zip(*(x.numpy() for x in (q, v, tau)), strict=True)]
+    np.testing.assert_allclose(compiled.forward_dynamics(q, v, tau), np.stack(theirs), rtol=1e-9)
+
+
+def test_gradients_against_differences(compiled):
+    inertials = [(0.3 * random(10, seed=20 + k)).requires_grad_() for k in range(3)]
+    states = [random(2, 3, seed=k).requires_grad_() for k in range(3)]
+
+    def accelerations(*x):
+        return compiled.forward_dynamics(*x[:3], dict(zip(LINKS, x[3:], strict=True)))
+
+    assert torch.autograd.gradcheck(accelerations, (*states, *inertials))
+
+
+def test_forward_dynamics_undoes_inverse_dynamics(compiled):
+    q, v, a = random(3, 9, 3)
+    torch.testing.assert_close(compiled.forward_dynamics(q, v, compiled.inverse_dynamics(q, v, a)), a)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 8, 9])
+def test_every_number_of_states(robot, compiled, count):
+    """Some fill the vector registers, some do not; sums over states count each once."""
+    q, v, tau = (random(count, 3, seed=k).requires_grad_() for k in range(3))
+    inertials = {"cart": random(10).requires_grad_()}
+    ours, theirs = (
+        torch.autograd.grad(of.forward_dynamics(q, v, tau, inertials).square().sum(), (q, *inertials.values()))
+        for of in (compiled, robot)
+    )
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_batches_broadcast_as_those_of_the_robot(robot, compiled):
+    q, v, tau = random(3), random(4, 1, 3), random(2, 3)
+    ours, theirs = compiled.forward_dynamics(q, v, tau), robot.forward_dynamics(q, v, tau)
+    assert ours.shape == (4, 2, 3)
+    torch.testing.assert_close(ours, theirs)
+    assert compiled.mass_matrix(q).shape == (3, 3)
+
+
+def test_large_batches_by_several_threads(robot, compiled):
+    q, v, tau = random(3, 5000, 3)
+    inertials = {"tool": (0.1 * random(10)).requires_grad_()}
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        values = compiled.forward_dynamics(q, v, tau, inertials)
+        (gradient,) = torch.autograd.grad(values.sum(), inertials.values())
+    finally:
+        torch.set_num_threads(threads)
+    expected = robot.forward_dynamics(q, v, tau, inertials)
+    torch.testing.assert_close(values, expected)
+    torch.testing.assert_close(gradient, torch.autograd.grad(expected.sum(), inertials.values())[0])
+
+
+def test_another_process_finds_the_code(robot, folder, compiled, repository):
+    compiled.forward_dynamics(*random(3, 1, 3))
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    script = """
+import pickle, sys, torch
+compiled = pickle.load(sys.stdin.buffer)
+q, v, tau = torch.full((3, 3), 0.3, dtype=torch.float64)
+print(compiled.forward_dynamics(q, v, tau).tolist())
+"""
+    environment = os.environ | {"CC": "no-compiler-at-all"}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, input=pickle.dumps(compiled), capture_output=True, check=True, env=environment)
+    assert eval(done.stdout) == compiled.forward_dynamics(*torch.full((3, 3), 0.3, dtype=torch.float64)).tolist()
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+    assert all(path.suffix == ".so" for path in before)  # nothing unfinished lies about
+
+
+def test_other_robots_have_code_of_their_own(robot, compiled, folder):
+    compiled.gravity_forces(random(3))
+    before = len(list(folder.iterdir()))
+    heavier = robot.with_inertials({"tool": robot.inertial_parameters("tool")["tool"] + 0.1})
+    q = random(2, 3)
+    torch.testing.assert_close(heavier.compile(folder).gravity_forces(q), heavier.gravity_forces(q))
+    assert len(list(folder.iterdir())) == before + 1
+
+
+def test_prepare_compiles_ahead(robot, tmp_path):
+    compiled = robot.compile(tmp_path / "new").prepare("gravity_forces", derivatives=True)
+    assert len(list((tmp_path / "new").iterdir())) == 2
+    with pytest.raises(InvalidInput, match="no function 'gravity' to compile; there are: mass_matrix, "):
+        compiled.prepare("gravity")
+
+
+def test_default_folder(robot, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert robot.compile().folder == tmp_path / "forcegp" / "dynamics"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert robot.compile().folder == Path.home() / ".cache" / "forcegp" / "dynamics"
+
+
+# ---------------------------------------------------------------------- what cannot be
+
+
+def test_inputs_are_checked_as_those_of_the_robot(compiled):
+    with pytest.raises(InvalidInput, match=r"tau is torch\.float32; the dynamics needs float64"):
+        compiled.forward_dynamics(random(3), random(3), random(3).float())
+    with pytest.raises(InvalidInput, match=r"batch shapes do not broadcast: q \(2,\), inertials \(3,\)"):
+        compiled.mass_matrix(random(2, 3), {"arm": random(3, 10)})
+    with pytest.raises(InvalidInput, match="'base' of small is fixed in the world"):
+        compiled.mass_matrix(random(3), {"base": random(10)})
+
+
+def test_states_that_are_not_finite(compiled):
+    q, v, tau = random(3, 5, 3)
+    q[3, 1] = torch.nan
+    with pytest.raises(NumericalError, match="mass matrix is not positive definite"):
+        compiled.forward_dynamics(q, v, tau)
+
+
+def test_what_is_not_supported_says_so(robot, compiled):
+    q = random(3).requires_grad_()
+    (gradient,) = torch.autograd.grad(compiled.gravity_forces(q).sum(), q, create_graph=True)
+    with pytest.raises(InvalidInput, match=r"first derivatives only; .*compiled\.robot"):
+        gradient.sum().backward()
+    with pytest.raises(InvalidInput, match=r"does not support transforms of torch\.func"):
+        torch.func.vmap(compiled.gravity_forces)(random(2, 3))
+    with (
+        torch.autograd.forward_ad.dual_level(),
+        pytest.raises(InvalidInput, match="does not support forward-mode differentiation"),
+    ):
+        compiled.gravity_forces(torch.autograd.forward_ad.make_dual(random(3), random(3)))
+    with pytest.raises(InvalidInput, match=r"runs on the CPU, .*robot\.to\('cpu'\)"):
+        robot.to("meta").compile()
+
+
+def test_no_compiler(robot, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler -O2")
+    with pytest.raises(CompilerError, match=r"looked for 'no-such-compiler', which .*CC names\); install one"):
+        robot.compile(tmp_path).gravity_forces(random(3))
+    monkeypatch.delenv("CC")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(CompilerError, match="looked for cc, gcc or clang"):
+        robot.compile(tmp_path).gravity_forces(random(3))
+
+
+def test_a_compiler_that_fails(robot, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(CompilerError, match="the C compiler failed: false: exit code 1"):
+        robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
+    assert list((tmp_path / "dynamics").iterdir()) == []
+
+
+def test_folders_that_others_can_write_to(robot, tmp_path):
+    tmp_path.chmod(0o777)
+    with pytest.raises(CompilerError, match=r"can be written to by others than you, .*chmod go-w"):
+        robot.compile(tmp_path).gravity_forces(random(3))
+    tmp_path.chmod(0o700)
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(CompilerError, match=r"cannot be made .*; choose another: robot\.compile\(folder=\.\.\.\)"):
+        robot.compile(file).gravity_forces(random(3))
+
+
+def test_files_that_are_not_whole_or_not_ones_own(robot, tmp_path):
+    robot.compile(tmp_path).gravity_forces(random(3))
+    (path,) = tmp_path.iterdir()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    path.chmod(0o722)
+    with pytest.raises(CompilerError, match="can be written to by others"):
+        robot.compile(tmp_path).gravity_forces(random(3))
+    other = tmp_path / "other"
+    other.mkdir(mode=0o700)
+    (other / path.name).write_bytes(b"half a library")
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*; delete it, and it is compiled anew"):
+        robot.compile(other).gravity_forces(random(3))
