@@ -171,9 +171,7 @@ def test_budgets_at_the_limits():
 
 
 @settings(max_examples=20)
-@given(
-    seed=st.integers(0, 10_000), cut=st.integers(1, 7), log_noise=st.floats(-6.0, 1.0), outputs=st.integers(1, 4)
-)
+@given(seed=st.integers(0, 10_000), cut=st.integers(1, 7), log_noise=st.floats(-6.0, 1.0), outputs=st.integers(1, 4))
 def test_more_rows_never_widen_and_their_order_does_not_matter(seed, cut, log_noise, outputs):
     whole = problem(count=8, outputs=outputs, constraints=0, seed=seed)
     whole.noise = torch.full((8, outputs), 10.0**log_noise, dtype=torch.float64)

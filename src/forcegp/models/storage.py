@@ -12,6 +12,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,13 @@ from forcegp.models.stored_models import KINDS, kind_of
 FORMAT_VERSION = 1
 TRANSFERRED = 2
 """Format of a model that was carried to another system: programs that only know 1 would predict for the old system."""
+UPDATED = 3
+"""Format of a model whose rows are standardised by others than those that it is conditioned on: programs that only know
+1 and 2 would standardise by the wrong ones.
+"""
 STATES = ("q", "v", "u", "a")
-NOISE = "training.noise_std"
+NOISE = "noise_std"
+TRAINING, REFERENCE = "training.", "reference."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
 
 
@@ -57,7 +63,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     result = posterior.result
     document = {
         "kind": kind,
-        "format_version": FORMAT_VERSION if target is None else TRANSFERRED,
+        "format_version": _version(posterior),
         "forcegp_version": __version__,
         "torch_version": torch.__version__,
         "joint_names": list(posterior.joint_names),
@@ -77,9 +83,9 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         "settings": dict(posterior.settings),
     }
     training = posterior.training
-    tensors = {f"training.{name}": getattr(training, name).detach().cpu().contiguous() for name in STATES}
-    if training.noise_std is not None:
-        tensors[NOISE] = training.noise_std.detach().cpu().contiguous()
+    tensors = _row_tensors(TRAINING, training)
+    if training.reference is not None:
+        tensors |= _row_tensors(REFERENCE, training.reference)
     tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +118,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     try:
         urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
         moved_to = None
-        if document["format_version"] == TRANSFERRED:
+        if document["format_version"] == TRANSFERRED or "target" in document:
             moved_to = _robot(path, TARGET, document.get("target_urdf_sha256"))
         tensors = load_file(path / "tensors.safetensors")
     except (OSError, SafetensorError, UnicodeDecodeError) as error:
@@ -123,8 +129,9 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         target = None
         if moved_to is not None:
             target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
-        states = {name: tensors[f"training.{name}"] for name in STATES}
-        training = TrainingData(**states, noise_std=tensors.get(NOISE))
+        training = _rows(TRAINING, tensors)
+        if document["format_version"] == UPDATED:
+            training = replace(training, reference=_rows(REFERENCE, tensors))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
         result = document["result"]
@@ -157,21 +164,49 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
 
 
+def _version(posterior: Posterior) -> int:
+    if posterior.training.reference is not None:
+        return UPDATED
+    return FORMAT_VERSION if posterior.target is None else TRANSFERRED
+
+
+def _row_tensors(prefix: str, rows: TrainingData) -> dict[str, torch.Tensor]:
+    """Tensors by their name in the file, which are contiguous copies: rows of one may share memory with another's."""
+    names = STATES if rows.noise_std is None else (*STATES, NOISE)
+    return {f"{prefix}{name}": getattr(rows, name).detach().cpu().clone().contiguous() for name in names}
+
+
+def _rows(prefix: str, tensors: Mapping[str, torch.Tensor]) -> TrainingData:
+    return TrainingData(*(tensors[prefix + name] for name in STATES), noise_std=tensors.get(prefix + NOISE))
+
+
 def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
-    states = {name: getattr(training, name) for name in STATES}
-    if training.noise_std is not None:
-        states["noise_std"] = training.noise_std
-        if not bool((training.noise_std > 0).all()):
-            raise FileFormatError(f"{file} is damaged: training noise_std has values that are not positive")
-    shape = (training.q.shape[0], model.system.robot.nv) if training.q.dim() == 2 else None
-    for name, value in {**states, **parameters}.items():
-        if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
-            raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
-        if name in states and value.shape != shape:
-            raise FileFormatError(f"{file} is damaged: training {name} has shape {tuple(value.shape)}")
+    for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
+        if rows is not None:
+            _check_rows(file, model, prefix, rows)
+    for name, value in parameters.items():
+        _check_numbers(file, name, value)
     given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
     if given != model.parameter_shapes(training):
         raise FileFormatError(f"{file} does not hold the parameters of its model")
+
+
+def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> None:
+    states = {name: getattr(rows, name) for name in STATES}
+    if rows.noise_std is not None:
+        states[NOISE] = rows.noise_std
+        if not bool((rows.noise_std > 0).all()):
+            raise FileFormatError(f"{file} is damaged: {prefix}noise_std has values that are not positive")
+    shape = (rows.q.shape[0], model.system.robot.nv) if rows.q.dim() == 2 else None
+    for name, value in states.items():
+        _check_numbers(file, prefix + name, value)
+        if value.shape != shape:
+            raise FileFormatError(f"{file} is damaged: {prefix}{name} has shape {tuple(value.shape)}")
+
+
+def _check_numbers(file: Path, name: str, value: torch.Tensor) -> None:
+    if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
+        raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -188,10 +223,10 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in KINDS:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in (FORMAT_VERSION, TRANSFERRED):
+    if version not in (FORMAT_VERSION, TRANSFERRED, UPDATED):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} and "
-            f"{TRANSFERRED}; use the version that wrote it ({document.get('forcegp_version')}) or fit again"
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} to {UPDATED}; "
+            f"use the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document
 
