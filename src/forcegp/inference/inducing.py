@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 from typing_extensions import override
@@ -27,12 +27,15 @@ from typing_extensions import override
 from forcegp.errors import NumericalError
 from forcegp.inference.deflation import deflate, whiten
 from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.pivots import Pivots, pivoted_cholesky
+from forcegp.inference.pivots import pivoted_cholesky
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.weight_space import WeightSpace
 
 CHUNK_BYTES = 64 * 2**20
 """Working memory of one block of rows."""
+
+CANDIDATES = 20_000
+"""Rows among which inducing points are sought."""
 
 JITTER = 1e-10
 """Added to the kernel matrices of inducing points, relative to their mean diagonal, where hyper-parameters move away
@@ -41,12 +44,10 @@ from those that the points were chosen at."""
 
 @dataclass(frozen=True, eq=False)
 class InducingPosterior(LatentPosterior):
-    """The variational posterior; `features` are the inducing points, `left_out` the sum above in nats."""
+    """The variational posterior; `features` are the inducing points."""
 
     kernels: LatentKernels
     space: WeightSpace
-    mean_weights: Float[Tensor, " P"]
-    left_out: float
 
     @classmethod
     def condition(
@@ -68,14 +69,14 @@ class InducingPosterior(LatentPosterior):
         with torch.no_grad():
             W_white, y_white, _ = whiten(W, residual, noise)
             deflation = deflate(W_white, y_white)
-            C = deflation.C
-            pivots = inducing_pivots(kernels, features, C, points, tolerance)
-            left_out = sum(float((C[..., c].square().sum(1) * f.remainder).sum()) for c, f in enumerate(pivots))
-            space = WeightSpace.of(kernels, features, pivots, C)
-            Ct = (C.mT @ deflation.t[..., None])[..., 0]
-            right = torch.cat([found.rows @ Ct[:, c] for c, found in enumerate(pivots)])
-            mean_weights = space.precision.solve(right[:, None])[:, 0]
-        return cls(kernels, space, mean_weights, left_out)
+            pivots = inducing_pivots(kernels, features, deflation.C, points, tolerance)
+            places = [z[found] for z, found in zip(features, pivots, strict=True)]
+            return cls(kernels, WeightSpace.of(kernels, features, places, deflation.C, deflation.t))
+
+    @property
+    def left_out(self) -> float:
+        """The sum above, in nats."""
+        return self.space.left_out
 
     @property
     @override
@@ -85,7 +86,7 @@ class InducingPosterior(LatentPosterior):
     @property
     @override
     def weights(self) -> tuple[Float[Tensor, " _"], ...]:
-        return tuple(w[:, 0] for w in self.space.center_weights(self.mean_weights[:, None]))
+        return tuple(w[:, 0] for w in self.space.center_weights(self.space.mean[:, None]))
 
     @override
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
@@ -102,9 +103,9 @@ class InducingPosterior(LatentPosterior):
         # the values at the points are drawn from their posterior, L_c w_c with w ~ N(mean, B^-1), and what the prior
         # functions have there is taken off
         samples = len(prior[0])
-        size = (len(self.mean_weights), samples)
-        draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.mean_weights.device)
-        drawn = self.mean_weights[:, None] + self.space.precision.solve_upper(draws)
+        size = (len(self.space.mean), samples)
+        draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.space.mean.device)
+        drawn = self.space.mean[:, None] + self.space.precision.solve_upper(draws)
         whitened = [
             torch.linalg.solve_triangular(lower, values.mT, upper=False)
             for lower, values in zip(self.space.lowers, prior, strict=True)
@@ -118,13 +119,20 @@ def inducing_pivots(
     C: Float[Tensor, "N r C"],
     points: int,
     tolerance: float = 0.0,
-) -> tuple[Pivots, ...]:
-    """Greedy inducing points of every latent, at most `points`, or as many as leave out `tolerance` nats in all."""
-    relevance, share = C.square().sum(1), tolerance / max(1, C.shape[-1])
-    return tuple(
-        pivoted_cholesky(kernel, z, relevance[:, c], points, share)
+) -> list[Int[Tensor, " m"]]:
+    """Numbers of the rows that are inducing points of each latent: greedy, at most `points` of them.
+
+    Fewer where every latent leaves out less than its share of `tolerance` nats. They are sought among `CANDIDATES` rows
+    at most, spread evenly over all.
+    """
+    count = len(C)
+    candidates = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
+    relevance = C.square().sum(1)[candidates]
+    share = tolerance / max(1, C.shape[-1]) * len(candidates) / max(1, count)
+    return [
+        candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share).indices]
         for c, (kernel, z) in enumerate(zip(kernels, features, strict=True))
-    )
+    ]
 
 
 def collapsed_bound(

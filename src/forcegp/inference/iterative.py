@@ -37,7 +37,12 @@ class LowRankPlusDiagonal:
 
     @classmethod
     def of(
-        cls, kernels: LatentKernels, features: Sequence[Float[Tensor, "N _"]], C: Float[Tensor, "N r C"], points: int
+        cls,
+        kernels: LatentKernels,
+        features: Sequence[Float[Tensor, "N _"]],
+        C: Float[Tensor, "N r C"],
+        t: Float[Tensor, "N r"],
+        points: int,
     ) -> LowRankPlusDiagonal:
         """With `points` weights for each latent, at greedy pivots."""
         relevance = C.square().sum(1)
@@ -49,7 +54,9 @@ class LowRankPlusDiagonal:
         identity = torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
         D = (C * left_out[:, None, :]) @ C.mT + identity
         noise_precision = torch.cholesky_inverse(torch.linalg.cholesky(D))
-        return cls(C, pivots, noise_precision, WeightSpace.of(kernels, features, pivots, C, noise_precision))
+        places = [z[found.indices] for z, found in zip(features, pivots, strict=True)]
+        weights = WeightSpace.of(kernels, features, places, C, t, noise_precision)
+        return cls(C, pivots, noise_precision, weights)
 
     def solve(self, x: Float[Tensor, "n S"]) -> Float[Tensor, "n S"]:
         """P^-1 x."""
@@ -113,7 +120,7 @@ class IterativePosterior(LatentPosterior):
             deflation = deflate(W_white, y_white)
             features = tuple(z.detach() for z in features)
             panels = KernelPanels(kernels, features, memory)
-            preconditioner = LowRankPlusDiagonal.of(kernels, features, deflation.C, points)
+            preconditioner = LowRankPlusDiagonal.of(kernels, features, deflation.C, deflation.t, points)
             first = None if start is None else start.reshape(-1, 1)
             solved = conjugate_gradients(
                 lambda x: _covariance_product(deflation.C, panels, x),
@@ -124,6 +131,7 @@ class IterativePosterior(LatentPosterior):
                 start=first,
                 report=report,
             )
+            panels.release()
         return cls(
             kernels, features, deflation, panels, preconditioner, solved, tolerance, iterations, solve_covariance
         )

@@ -42,6 +42,11 @@ class KernelPanels:
             start = stop
         return out
 
+    def release(self) -> None:
+        """Give the memory of the panels back; the next product makes them anew."""
+        self.kept.clear()
+        self.bytes_kept = 0
+
     def _panel(self, c: int, start: int, stop: int) -> Float[Tensor, "rows stop"]:
         found = self.kept.get((c, start))
         if found is not None:

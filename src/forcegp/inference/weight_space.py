@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float
@@ -23,7 +23,6 @@ from torch import Tensor
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
-from forcegp.inference.pivots import Pivots
 
 BLOCK_BYTES = 64 * 2**20
 """Working memory of one block of points."""
@@ -31,40 +30,66 @@ BLOCK_BYTES = 64 * 2**20
 
 @dataclass(frozen=True, eq=False)
 class WeightSpace:
-    """The weights of all latents, conditioned on deflated data.
+    """The weights of all latents, conditioned on deflated data; the weights of the latents follow each other.
 
-    `points` and `lowers` are p_c and L_c, `precision` the Cholesky factor of B; the weights of the latents follow each
-    other.
+    `points` and `lowers` are p_c and L_c, `precision` the Cholesky factor of B, `mean` the posterior mean of the
+    weights, `left_out` what they leave out of the prior variance in units of the noise, the sum over rows and latents of
+    |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2).
     """
 
     kernels: LatentKernels
     points: tuple[Float[Tensor, "_ _"], ...]
     lowers: tuple[Float[Tensor, "_ _"], ...]
     precision: CholeskyFactor
+    mean: Float[Tensor, " P"]
+    left_out: float
 
     @classmethod
     def of(
         cls,
         kernels: LatentKernels,
         features: Sequence[Float[Tensor, "N _"]],
-        pivots: Sequence[Pivots],
+        points: Sequence[Float[Tensor, "_ _"]],
         C: Float[Tensor, "N r C"],
+        t: Float[Tensor, "N r"],
         noise_precision: Float[Tensor, "N r r"] | None = None,
     ) -> WeightSpace:
-        """Condition on the points of `pivots`; the precision D^-1 of the noise is that of white noise for None."""
-        white = C if noise_precision is None else noise_precision @ C
+        """Condition on all rows; None for the noise precision D^-1 is white noise.
+
+        Time O(N P^2), memory O(P^2) and a block of rows. Raises NumericalError where the kernel matrix of the points
+        cannot be factorised.
+        """
+        points = tuple(z.detach() for z in points)
+        lowers = tuple(
+            factorize(partial(kernel_cross, kernel, z, z)).lower.tril()
+            for kernel, z in zip(kernels, points, strict=True)
+        )
+        prior = cls(kernels, points, lowers, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0), 0.0)
+        white, slices = C if noise_precision is None else noise_precision @ C, prior.slices
         pairs = (C[..., :, None] * white[..., None, :]).sum(1)  # C_i^T D_i^-1 C_i
-        slices = _slices([len(found.indices) for found in pivots])
+        target = (white * t[..., None]).sum(1)  # C_i^T D_i^-1 t_i
+        relevance = C.square().sum(1)
+        B = torch.eye(prior.count, dtype=C.dtype, device=C.device)
+        right, left_out = C.new_zeros(prior.count), C.new_zeros(())
+        height = max(1, BLOCK_BYTES // (8 * max(1, prior.count)))
+        for start in range(0, len(C), height):
+            rows = slice(start, start + height)
+            block = [z[rows] for z in features]
+            phi = prior.columns(block)
+            for c, left in enumerate(phi):
+                remainder = kernel_diagonal(kernels[c], block[c]) - left.square().sum(0)
+                left_out += relevance[rows, c] @ remainder.clamp_min(0.0)
+                right[slices[c]] += left @ target[rows, c]
+                for d, other in enumerate(phi[: c + 1]):
+                    B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
+        precision = factorize(B.clone)
+        mean = precision.solve(right[:, None])[:, 0] if prior.count else right
+        return cls(kernels, points, lowers, precision, mean, float(left_out))
 
-        def build() -> Tensor:
-            B = torch.eye(slices[-1].stop if slices else 0, dtype=C.dtype, device=C.device)
-            for c, left in enumerate(pivots):
-                for d, right in enumerate(pivots[: c + 1]):
-                    B[slices[c], slices[d]] += _weighted_product(left.rows, pairs[:, c, d], right.rows)
-            return B
-
-        points = tuple(z[found.indices].detach() for z, found in zip(features, pivots, strict=True))
-        return cls(kernels, points, tuple(found.lower for found in pivots), factorize(build))
+    @property
+    def count(self) -> int:
+        """The number of weights, P."""
+        return sum(len(lower) for lower in self.lowers)
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -89,7 +114,7 @@ class WeightSpace:
 
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         """Cov(f_c, f_d) at the same point: what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T."""
-        total, latents = self.slices[-1].stop, len(self.points)
+        total, latents = self.count, len(self.points)
         height = max(1, BLOCK_BYTES // max(1, 8 * total * latents))
         count = len(features[0])
         blocks = [self._covariance_block([z[i : i + height] for z in features]) for i in range(0, count, height)]
@@ -97,7 +122,7 @@ class WeightSpace:
 
     def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         count, latents = len(features[0]), len(self.points)
-        wide = features[0].new_zeros(self.slices[-1].stop, latents, count)
+        wide = features[0].new_zeros(self.count, latents, count)
         remainders = []
         for c, (part, phi) in enumerate(zip(self.slices, self.columns(features), strict=True)):
             wide[part, c] = phi
@@ -109,7 +134,7 @@ class WeightSpace:
     def variance_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         """Variance of one latent at points of its own features."""
         phi = self.column(index, z)
-        wide = phi.new_zeros(self.slices[-1].stop, len(z))
+        wide = phi.new_zeros(self.count, len(z))
         wide[self.slices[index]] = phi
         remainder = (kernel_diagonal(self.kernels[index], z) - phi.square().sum(0)).clamp_min(0.0)
         return remainder + self.precision.solve_lower(wide).square().sum(0)
@@ -121,15 +146,3 @@ def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
         parts.append(slice(start, start + size))
         start += size
     return tuple(parts)
-
-
-def _weighted_product(
-    left: Float[Tensor, "m N"], weights: Float[Tensor, " N"], right: Float[Tensor, "k N"]
-) -> Float[Tensor, "m k"]:
-    """left diag(weights) right^T, some columns at a time."""
-    width = max(1, BLOCK_BYTES // max(1, 8 * len(left)))
-    total = left.new_zeros(len(left), len(right))
-    for start in range(0, left.shape[1], width):
-        part = slice(start, start + width)
-        total.addmm_(left[:, part] * weights[part], right[:, part].mT)
-    return total
