@@ -20,7 +20,7 @@ README = FOLDER / "README.md"
 BEGIN, END = "<!-- table: written by `make bench` -->", "<!-- end of table -->"
 
 # Each question is a module with run() -> {key: number}; each key has a bound and a meaning.
-QUESTIONS = ("likelihood", "rigid_body", "learning")
+QUESTIONS = ("likelihood", "rigid_body", "learning", "incremental")
 MEANINGS = {
     "nll_speedup_n400": (">= 4.5", "NLL + all gradients, N = 400, one contact: dense time / deflated time"),
     "nll_speedup_n1000": (">= 5", "the same at N = 1000"),
@@ -36,6 +36,15 @@ MEANINGS = {
     "constraint_error_n100": ("<= 1e-10", "largest mean |A a - b| over both models and all seeds"),
     "coverage_95_lowest_n100": (">= 0.90", "lowest coverage of the 95 % interval over both models and all seeds"),
     "coverage_95_highest_n100": ("<= 0.99", "highest of the same"),
+    "update_10_rows_speedup_n1000": (">= 5", "10 rows more at N = 1000: time to condition on all / time of an update"),
+    "leave_20_rows_out_update_over_anew": ("", "20 of 220 rows left out: updating the factor / factorising anew"),
+    "stream_mae_first_rows_b200": ("", "2000 rows of kuka-surface: noise-free MAE after the first 200 [rad/s^2]"),
+    "stream_mae_newest_b200": ("", "the same after all, with a budget of 200: the newest rows kept"),
+    "stream_mae_random_b200": ("", "the same: random rows kept"),
+    "stream_mae_farthest_b200": ("", "the same: rows kept that lie far apart in (q, v, u)"),
+    "stream_mae_information_b200": ("", "the same: rows kept that tell most beyond the others"),
+    "stream_mae_divergence_b200": ("", "the same: rows kept that move the posterior most (the default)"),
+    "stream_mae_hindsight_b200": ("", "the same: conditioned at once on the 200 of 2000 rows that lie farthest apart"),
 }
 
 

@@ -9,7 +9,7 @@ from tests.inference.problems import Problem, normal, problem
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference import ExactPosterior, growing, likelihood
 from forcegp.inference.cholesky import factorize
-from forcegp.inference.growing import appended, rows_to_keep, with_only, with_rows
+from forcegp.inference.growing import appended, divergences, rows_to_keep, with_only, with_rows
 
 
 def rows_of(given_problem: Problem, index) -> Problem:
@@ -138,7 +138,7 @@ def test_what_a_row_is_worth_is_how_far_the_posterior_moves_with_it():
     P = torch.linalg.inv(latent.system.factor.lower.tril() @ latent.system.factor.lower.tril().mT)
     rank = latent.system.deflation.rank
     blocks = torch.stack([P[i * rank : (i + 1) * rank, i * rank : (i + 1) * rank] for i in range(6)])
-    losses = growing._losses(blocks, latent.system.alpha)
+    losses = divergences(blocks, latent.system.alpha)
     expected = [divergence(given_problem, row) for row in range(6)]
     assert losses.tolist() == pytest.approx(expected, rel=1e-6)
 

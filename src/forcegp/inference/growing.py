@@ -19,7 +19,7 @@ step of Cholesky's algorithm on P, so that rows can be left out one after the ot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -31,6 +31,10 @@ from forcegp.inference.deflation import Deflation, deflate, whiten
 from forcegp.inference.kernels import LatentKernels, kernel_cross
 from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, deflated_covariance
 from forcegp.inference.posterior import ExactPosterior
+
+
+COPIED_ROWS = 256
+"""Rows of a factor that are copied at once, without what lies beyond their diagonal."""
 
 
 def with_rows(
@@ -72,7 +76,24 @@ def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPoster
         return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
 
 
-def rows_to_keep(latent: ExactPosterior, budget: int) -> Int[Tensor, " kept"]:
+def divergences(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> Float[Tensor, " N"]:
+    """What every row is worth to the posterior, in nats, from its blocks P_ii and alpha_i."""
+    factor, _ = torch.linalg.cholesky_ex(blocks)
+    error = torch.linalg.solve_triangular(factor, alpha[..., None], upper=False).square().sum((-2, -1))
+    trace = blocks.diagonal(dim1=-2, dim2=-1).sum(-1)
+    surprise = 0.5 * (trace - blocks.shape[-1] + error - alpha.square().sum(-1))
+    return information(blocks, alpha) + surprise
+
+
+def information(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> Float[Tensor, " N"]:
+    """What every row tells beyond all others, whatever was measured there: -1/2 log|P_ii| in nats."""
+    factor, _ = torch.linalg.cholesky_ex(blocks)
+    return -factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def rows_to_keep(
+    latent: ExactPosterior, budget: int, worth: Callable[[Tensor, Tensor], Tensor] = divergences
+) -> Int[Tensor, " kept"]:
     """The rows that are left when the one that is worth least is left out again and again; ascending.
 
     Costs an inversion of T and, for d rows left out of N, O(N d^2) more. Raises InvalidInput for a budget below 1.
@@ -94,7 +115,7 @@ def rows_to_keep(latent: ExactPosterior, budget: int) -> Int[Tensor, " kept"]:
         steps = alpha.new_zeros(surplus * rank, count * rank)
         identity = torch.eye(rank, dtype=alpha.dtype, device=alpha.device)
         for done in range(surplus):
-            row = int(_losses(blocks, alpha).masked_fill(left_out, torch.inf).argmin())
+            row = int(worth(blocks, alpha).masked_fill(left_out, torch.inf).argmin())
             before, here = steps[: done * rank], slice(row * rank, (row + 1) * rank)
             own = torch.linalg.cholesky(blocks[row])
             step = torch.linalg.solve_triangular(own, precision[row] - before[:, here].mT @ before, upper=False)
@@ -108,15 +129,6 @@ def rows_to_keep(latent: ExactPosterior, budget: int) -> Int[Tensor, " kept"]:
         return torch.nonzero(~left_out)[:, 0]
 
 
-def _losses(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> Float[Tensor, " N"]:
-    """What every row is worth to the posterior, in nats, from its blocks P_ii and alpha_i."""
-    factor, _ = torch.linalg.cholesky_ex(blocks)
-    logdet = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    error = torch.linalg.solve_triangular(factor, alpha[..., None], upper=False).square().sum((-2, -1))
-    trace = blocks.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return 0.5 * (trace - logdet - blocks.shape[-1] + error - alpha.square().sum(-1))
-
-
 def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]) -> CholeskyFactor:
     """The factor of [[T11, cross^T], [cross, own]] from that of T11, which is copied; `own` is overwritten.
 
@@ -124,7 +136,9 @@ def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Ten
     """
     size, more = factor.lower.shape[0], own.shape[0]
     lower = factor.lower.new_empty(size + more, size + more)
-    lower[:size, :size] = factor.lower
+    for start in range(0, size, COPIED_ROWS):  # memory that is never touched, above the diagonal, costs nothing
+        stop = min(size, start + COPIED_ROWS)
+        lower[start:stop, :stop] = factor.lower[start:stop, :stop]
     below = factor.solve_lower(cross.mT).mT if size else cross
     lower[size:, :size] = below
     own.sub_(below @ below.mT)
@@ -138,7 +152,8 @@ _PARTS = ("U", "C", "t", "remainder")
 
 def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:
     """alpha = T^-1 t and beta from a factor of T."""
-    alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(deflation.t.shape)
+    white = factor.solve_lower(deflation.t.reshape(-1, 1))  # two solves of one column, 5 times as fast as LAPACK's
+    alpha = factor.solve_upper(white).reshape(deflation.t.shape)
     return DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
 
 

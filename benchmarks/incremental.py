@@ -1,0 +1,169 @@
+"""What does learning from more rows cost, and which rows are worth keeping?
+
+Three questions on `kuka-surface` (analytical mean, one process per joint):
+
+* 10 rows appended to N = 1000 (`posterior.update`) against conditioning on all 1010 rows, both with the dynamics of
+  their rows; wall seconds on one thread, medians.
+* 20 of 220 rows left out exactly: the covariance of the others factorised anew (what the library does) against the
+  blocked update of the factor.
+* A stream: 2000 rows of one trajectory (100 s, every 12th row). Hyper-parameters are fitted to its first 200 rows, the
+  others arrive 20 at a time under a budget of 200 rows, and the mean absolute error against the noise-free acceleration
+  is taken on another trajectory of 60 s. Rules: keep the newest rows; a random choice; rows that lie far apart in
+  (q, v, u); rows that tell most beyond the others (`information`); rows that move the posterior most (`divergence`, the
+  default). In hindsight: conditioning at once on the 200 of all 2000 rows that lie farthest apart. Three seeds, median.
+
+    python -m benchmarks incremental
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset, farthest_point_sampling, farthest_rows
+from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptions
+from forcegp.inference.growing import information, rows_to_keep, with_only
+from forcegp.models import Noise, StructuredGP, TrainingData
+from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.updating import updated
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+SEEDS = (1, 2, 3)
+BUDGET, BATCH, STREAM, FIRST = 200, 20, 2000, 200
+REPEATS = 5
+NO_SEARCH = OptimizationResult({}, math.nan, (), "not searched", False, 0, 0.0)
+
+
+def median_seconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
+
+
+def conditioned(data: Dataset) -> StructuredPosterior:
+    """On all rows, at the start values of a search."""
+    model = StructuredGP(data.system, noise=Noise(0.1))
+    training = TrainingData.of(data, torch.device("cpu"))
+    parameters = StructuredGP(data.system)._likelihood(training).kernels().initial_parameters()
+    return model.condition(training, parameters | Noise(0.1).parameters(data.nv), NO_SEARCH, {})
+
+
+def update_speed(data: Dataset) -> float:
+    posterior = conditioned(data.rows(slice(0, 1000)))
+    both, more = data.rows(slice(0, 1010)), data.rows(slice(1000, 1010))
+    _ = posterior.likelihood.standardization
+    update = median_seconds(lambda: posterior.update(more))
+    whole = median_seconds(lambda: conditioned(both), 3)
+    print(
+        f"10 rows appended to 1000: {update:.3f} s; all 1010 conditioned on: {whole:.3f} s; {whole / update:.1f} times"
+    )
+    return whole / update
+
+
+def left_out_of_factor(lower: torch.Tensor, kept: torch.Tensor, block: int = 96) -> torch.Tensor:
+    """The factor of the kept rows and columns of L L^T: their own columns, updated by those of the others."""
+    others = torch.ones(len(lower), dtype=torch.bool)
+    others[kept] = False
+    L, X = lower[kept][:, kept].tril(), lower[kept][:, others]
+    for start in range(0, len(L), block):
+        part, below = slice(start, start + block), slice(start + block, len(L))
+        top = torch.cat([L[part, part], X[part]], dim=1)
+        Q, R = torch.linalg.qr(top.mT, mode="complete")
+        width = top.shape[0]
+        L[part, part] = R[:width].mT
+        turned = torch.cat([L[below, part], X[below]], dim=1) @ Q
+        L[below, part], X[below] = turned[:, :width], turned[:, width:]
+    return L
+
+
+def deletion_speed(data: Dataset) -> float:
+    latent = conditioned(data.rows(slice(0, BUDGET + BATCH))).latent
+    assert isinstance(latent, ExactPosterior)
+    kept = rows_to_keep(latent, BUDGET)
+    rank = latent.system.deflation.rank
+    entries = (kept[:, None] * rank + torch.arange(rank)).reshape(-1)
+    anew = with_only(latent, kept).system.factor.lower.tril()
+    lower = latent.system.factor.lower.tril()
+    by_update = left_out_of_factor(lower, entries)
+    torch.testing.assert_close(by_update @ by_update.mT, anew @ anew.mT, rtol=1e-9, atol=1e-9)
+    again = median_seconds(lambda: with_only(latent, kept))
+    update = median_seconds(lambda: left_out_of_factor(lower, entries))
+    print(f"{BATCH} of {BUDGET + BATCH} rows left out: anew {again:.3f} s, by updating the factor {update:.3f} s")
+    return update / again
+
+
+def newest(latent: ExactPosterior, budget: int) -> torch.Tensor:
+    count = len(latent.features[0])
+    return torch.arange(count - budget, count)
+
+
+def far_apart(latent: ExactPosterior, budget: int) -> torch.Tensor:
+    return torch.tensor(np.sort(farthest_point_sampling(latent.features[0].numpy(), budget)))  # standardised (q, v, u)
+
+
+def rules() -> dict[str, Callable[[ExactPosterior, int], torch.Tensor]]:
+    generator = np.random.default_rng(0)
+
+    def random(latent: ExactPosterior, budget: int) -> torch.Tensor:
+        return torch.tensor(np.sort(generator.choice(len(latent.features[0]), budget, replace=False)))
+
+    return {
+        "newest": newest,
+        "random": random,
+        "farthest": far_apart,
+        "information": partial(rows_to_keep, worth=information),
+        "divergence": rows_to_keep,
+    }
+
+
+def error(posterior: StructuredPosterior, test: Dataset) -> float:
+    mean = posterior.predict(test.q, test.v, test.u, covariance=False).mean
+    return float((mean - torch.tensor(test.truth["a"])).abs().mean())
+
+
+def streams() -> dict[str, float]:
+    found: dict[str, list[float]] = {}
+    print(f"seed {'rule':>12}  noise-free MAE [rad/s^2]   s per update of {BATCH} rows")
+    for seed in SEEDS:
+        stream = simulate_kuka_surface(KukaSurfaceConfig(seconds=100.0, seed=seed)).rows(slice(0, 12 * STREAM, 12))
+        test = simulate_kuka_surface(KukaSurfaceConfig(seconds=60.0, seed=1000 + seed)).rows(slice(0, None, 20))
+        options = OptimizerOptions(iterations=60)
+        first = StructuredGP(stream.system).fit(stream.rows(slice(0, FIRST)), restarts=1, options=options)
+        hindsight = TrainingData.of(farthest_rows(stream, BUDGET), torch.device("cpu"))
+        at_once = first.model.condition(
+            TrainingData(hindsight.q, hindsight.v, hindsight.u, hindsight.a, reference=first.training),
+            first.parameters,
+            NO_SEARCH,
+            {},
+        )
+        scores = {"first_rows": (error(first, test), 0.0), "hindsight": (error(at_once, test), 0.0)}
+        for name, rule in rules().items():
+            posterior = first
+            start = time.perf_counter()
+            for row in range(FIRST, STREAM, BATCH):
+                posterior = updated(posterior, stream.rows(slice(row, row + BATCH)), BUDGET, rule)
+            seconds = (time.perf_counter() - start) / ((STREAM - FIRST) / BATCH)
+            scores[name] = error(posterior, test), seconds
+        for name, (score, seconds) in scores.items():
+            print(f"{seed:4d} {name:>12}  {score:.4f}                    {seconds:.3f}", flush=True)
+            found.setdefault(name, []).append(score)
+    return {f"stream_mae_{name}_b{BUDGET}": statistics.median(values) for name, values in found.items()}
+
+
+def run() -> dict[str, float]:
+    """Measure and print; returns the keys of results.json that this question answers."""
+    data = farthest_rows(simulate_kuka_surface(KukaSurfaceConfig(seconds=40.0, seed=1)), 1010)
+    results = {
+        "update_10_rows_speedup_n1000": update_speed(data),
+        "leave_20_rows_out_update_over_anew": deletion_speed(data),
+    }
+    return results | streams()
