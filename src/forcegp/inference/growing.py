@@ -32,7 +32,6 @@ from forcegp.inference.kernels import LatentKernels, kernel_cross
 from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, deflated_covariance
 from forcegp.inference.posterior import ExactPosterior
 
-
 COPIED_ROWS = 256
 """Rows of a factor that are copied at once, without what lies beyond their diagonal."""
 
