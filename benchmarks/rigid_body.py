@@ -87,8 +87,8 @@ class States:
         self.tensors = tuple(torch.tensor(x) for x in (self.q, self.v, self.tau))
 
 
-def compiled(folder: Path) -> ctypes.PyDLL:
-    """The C++ loops, built in ``folder``."""
+def compiled(folder: Path, text: str = SOURCE) -> ctypes.PyDLL:
+    """The C++ loops of a source text, built in ``folder``."""
     prefix = Path(pin.__file__).parents[4]
     eigen = next((p for p in map(Path, _eigen_folders(prefix)) if (p / "Eigen" / "Core").exists()), None)
     if eigen is None:  # headers only; Pinocchio's wheel was built with them but does not bring them along
@@ -96,8 +96,12 @@ def compiled(folder: Path) -> ctypes.PyDLL:
         subprocess.run(pip, check=True, capture_output=True)
         eigen = folder / "cmeel.prefix" / "include" / "eigen3"
     source, library = folder / "loops.cpp", folder / "loops.so"
-    source.write_text(SOURCE)
-    defines = ["PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION", "BOOST_MPL_LIMIT_LIST_SIZE=30"]
+    source.write_text(text)
+    defines = [
+        "PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION",
+        "BOOST_MPL_LIMIT_LIST_SIZE=30",
+        "BOOST_FUSION_INVOKE_MAX_ARITY=10",
+    ]
     includes = [prefix / "include", eigen, sysconfig.get_paths()["include"]]
     command = ["g++", "-std=c++17", "-O3", "-DNDEBUG", "-shared", "-fPIC", "-w"]
     command += [f"-D{define}" for define in (*defines, "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS")]

@@ -14,6 +14,10 @@ from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
+from forcegp.robots.compiled_programs import CompiledProgram, compile_c
+from forcegp.robots.dynamics_programs import INERTIA_ENTRIES, Request, trace
+from forcegp.robots.machine_code import input_arrays, write_c
+from forcegp.robots.unrolled import UnrolledRobot
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
 TEXT = """<robot name="small">
@@ -137,6 +141,22 @@ def test_every_number_of_states(robot, compiled, count):
         for of in (compiled, robot)
     )
     torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("lanes", [2, 8])
+def test_other_widths_of_vector_registers(robot, tmp_path, lanes):
+    """What is written for other processors runs here, too, only slower."""
+    request = Request("forward_dynamics", free_inertias=True, states=True, inertias=True)
+    source = write_c(trace(UnrolledRobot(robot), request), request.inputs, lanes)
+    compile_c(source, (), tmp_path / "program.so")
+    q, v, tau, weights = random(4, 13, 3)
+    inertias = robot.tree.inertias[..., 0][:, *zip(*INERTIA_ENTRIES, strict=True)].reshape(1, -1)
+    inputs = {"q": q, "v": v, "tau": tau, "inertias": inertias, "sin q": q.sin(), "cos q": q.cos(), "result 0": weights}
+    outputs = {name: torch.full_like(inputs[name], torch.nan) for name in request.wanted}
+    assert CompiledProgram(tmp_path / "program.so", input_arrays(request.inputs))(13, inputs, outputs)
+    leaves = [x.requires_grad_() for x in (q, v, tau)]
+    expected = torch.autograd.grad((robot.forward_dynamics(q, v, tau) * weights).sum(), leaves)
+    torch.testing.assert_close([outputs[name] for name in ("q", "v", "tau")], list(expected))
 
 
 def test_batches_broadcast_as_those_of_the_robot(robot, compiled):

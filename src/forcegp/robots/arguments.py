@@ -41,6 +41,9 @@ def check_mapping(inertials: object) -> None:
 
 def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
     """Common batch shape; :class:`~forcegp.errors.InvalidInput` where there is none."""
+    different = {shape for shape in shapes.values() if shape}
+    if len(different) <= 1:  # the usual case; torch's function imports for a quarter of a second at first
+        return next(iter(different), torch.Size())
     try:
         return torch.broadcast_shapes(*shapes.values())
     except RuntimeError:

@@ -32,7 +32,7 @@ from forcegp.robots.dynamics_programs import Request, trace
 from forcegp.robots.machine_code import input_arrays, write_c
 from forcegp.robots.unrolled import UnrolledRobot
 
-SOURCES = ("scalar_algebra", "unrolled", "expressions", "dynamics_programs", "machine_code", "compiled_programs")
+SOURCES = ("scalar_algebra", "unrolled", "unrolled_kinematics", "expressions", "dynamics_programs", "machine_code")
 STATES_PER_THREAD = 2048  # fewer are done before another thread has started
 
 # Lanes and compiler options by the vector unit that torch found.
@@ -108,7 +108,7 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
     path = folder / f"{name}-{request.function}-{key[:32]}.so"
     _make(folder)
     if not path.exists():
-        _compile(write_c(trace(unrolled, request), request.inputs, lanes), options, path)
+        compile_c(write_c(trace(unrolled, request), request.inputs, lanes), options, path)
     _require_own(path)
     return CompiledProgram(path, input_arrays(request.inputs))
 
@@ -161,7 +161,8 @@ def _compiler() -> list[str]:
     )
 
 
-def _compile(source: str, options: tuple[str, ...], path: Path) -> None:
+def compile_c(source: str, options: tuple[str, ...], path: Path) -> None:
+    """Compile a source text to the library ``path``, whole or not at all."""
     compiler = _compiler()
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".compiling-") as work:
@@ -176,7 +177,7 @@ def _compile(source: str, options: tuple[str, ...], path: Path) -> None:
                     "environment variable CC, or use the robot itself, whose results are the same."
                 )
             library.chmod(0o700)
-            os.replace(library, path)  # whole or not at all, whoever else compiles the same
+            os.replace(library, path)  # whoever else compiles the same meanwhile
     except OSError as error:
         raise CompilerError(
             f"the folder {path.parent} for compiled dynamics cannot be written to ({error.strerror}); choose another: "

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 from forcegp.robots.expressions import Expression, Graph, gradients
 from forcegp.robots.scalar_algebra import Matrix, Scalar, Vector, factorize, minus, negate, solve_factorized
-from forcegp.robots.unrolled import UnrolledKinematics, UnrolledRobot
+from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.unrolled_kinematics import UnrolledKinematics
 
 # Arguments of each function, and the shapes of its results in joints.
 ARGUMENTS = {
