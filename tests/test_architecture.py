@@ -17,21 +17,29 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 # The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
 ROOMS = {
     "errors": set(),
+    "parallel": {"errors"},
     "robots": {"errors"},
     "mechanics": {"errors", "robots"},
     "data": {"errors", "robots", "mechanics"},
     "priors": {"errors", "robots", "mechanics"},
     "inference": {"errors"},
     "integration": {"errors", "robots", "mechanics"},
-    "models": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration"},
+    "models": {"errors", "parallel", "robots", "mechanics", "data", "priors", "inference", "integration"},
     "simulation": {"errors", "robots", "mechanics", "data"},
-    "evaluation": {"errors", "robots", "mechanics", "data", "priors", "inference", "integration", "models"},
+    "evaluation": {"errors", "parallel", "robots", "mechanics", "data", "priors", "inference", "integration", "models"},
 }
 ROOMS["experiments"] = set(ROOMS)
 ROOMS["cli"] = set(ROOMS)
 
 # Optional or slow to import: imported inside the function that uses them. The rooms named here may import them at once.
-IMPORTED_WHERE_USED = {"pybullet": set(), "matplotlib": set(), "joblib": set(), "tyro": {"cli"}, "rich": {"cli"}}
+IMPORTED_WHERE_USED = {
+    "pybullet": set(),
+    "matplotlib": set(),
+    "joblib": set(),
+    "ray": set(),
+    "tyro": {"cli"},
+    "rich": {"cli"},
+}
 
 LONGEST_MODULE = 350  # lines
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}

@@ -101,6 +101,10 @@ class NumericalError(ForceGPError):
     """A factorisation or optimisation failed, with the cause and the remedy."""
 
 
+class NotEnoughMemory(ForceGPError, MemoryError):
+    """A computation would need more memory than is free; raised before anything is allocated."""
+
+
 class FitError(NumericalError):
     """No restart of the optimisation gave a usable model."""
 
@@ -113,12 +117,20 @@ class CompilerError(ForceGPError):
     """Dynamics that cannot be compiled or loaded: no C compiler, one that failed, or a folder that cannot be used."""
 
 
+class BackendError(ForceGPError):
+    """Workers that cannot be had, have other versions, or died again and again."""
+
+
 class MissingExtra(ForceGPError, ImportError):
     """An optional dependency is not installed; the message holds the pip command."""
 
 
 class NumericalWarning(UserWarning):
     """Something was repaired (jitter added, say) and the result is still usable."""
+
+
+class WorkerWarning(UserWarning):
+    """A process at work died and its task began anew; the outcome is the same."""
 
 
 class DataWarning(UserWarning):

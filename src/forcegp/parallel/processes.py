@@ -1,0 +1,120 @@
+"""`Joblib`: processes on this machine, kept between calls."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Hashable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from typing_extensions import override
+
+from forcegp.errors import BackendError, WorkerWarning
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, check_jobs
+from forcegp.parallel.worker import ONE_THREAD, begin_process, recorded, replayed
+
+IDLE_SECONDS = 300
+"""So long processes without work are kept for the next call."""
+
+
+@dataclass(frozen=True)
+class Joblib(Backend):
+    """`jobs` processes on this machine (those of joblib, which can also carry functions of a script).
+
+    The first call starts them; they are kept for the calls that follow, and end with this process.
+    """
+
+    name: ClassVar[str] = "joblib"
+    jobs: int
+
+    def __post_init__(self) -> None:
+        check_jobs(self.jobs)
+
+    @override
+    def pool(self) -> Pool:
+        return _Processes(self.jobs)
+
+
+@dataclass(eq=False)
+class _Task:
+    key: Hashable
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    deaths: int = 0
+
+
+class _Processes(Pool):
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
+        self._at_work: dict[Future[Any], _Task] = {}
+
+    @property
+    @override
+    def free(self) -> int | float:
+        # No more than there are processes: a process that dies takes all tasks with it that were handed over.
+        return self._jobs - len(self._at_work)
+
+    @override
+    def __len__(self) -> int:
+        return len(self._at_work)
+
+    @override
+    def submit(self, key: Hashable, function: Callable[..., Any], *arguments: Any) -> None:
+        self._begin(_Task(key, function, arguments))
+
+    @override
+    def finished(self) -> list[tuple[Any, Future[Any]]]:
+        while True:
+            ended, _ = wait(self._at_work, return_when=FIRST_COMPLETED)
+            tasks = [(future, self._at_work.pop(future)) for future in ended]
+            died = [task for future, task in tasks if isinstance(future.exception(), BrokenProcessPool)]
+            if died:
+                self._begin_again(died)
+            whole = [(task.key, _with_warnings(future)) for future, task in tasks if task not in died]
+            if whole:
+                return whole
+
+    @override
+    def stop(self) -> None:
+        if self._at_work:
+            self._executor().shutdown(wait=True, kill_workers=True)
+            self._at_work.clear()
+
+    def _executor(self) -> Any:
+        """The processes of the last call, or new ones where a process died or their number has changed."""
+        from joblib.externals.loky import get_reusable_executor
+
+        return get_reusable_executor(
+            self._jobs, timeout=IDLE_SECONDS, initializer=begin_process, initargs=(os.getpid(),), env=ONE_THREAD
+        )
+
+    def _begin(self, task: _Task) -> None:
+        try:
+            future = self._executor().submit(recorded, task.function, task.arguments)
+        except BrokenProcessPool:  # it died since the last look; asked again, joblib makes a new one
+            future = self._executor().submit(recorded, task.function, task.arguments)
+        self._at_work[future] = task
+
+    def _begin_again(self, tasks: list[_Task]) -> None:
+        names = ", ".join(str(task.key) for task in tasks)
+        for task in tasks:
+            task.deaths += 1
+        if max(task.deaths for task in tasks) > MOST_DEATHS:
+            raise BackendError(
+                f"a process died {MOST_DEATHS + 1} times while task {names} was at work, probably for want of memory; "
+                "try fewer jobs if memory is short"
+            )
+        warnings.warn(
+            f"a process died while task {names} was at work (killed, or out of memory); it begins anew",
+            WorkerWarning,
+            stacklevel=3,
+        )
+        for task in tasks:
+            self._begin(task)
+
+
+def _with_warnings(future: Future[Any]) -> Future[Any]:
+    return future if future.exception() is not None else replayed(*future.result())

@@ -1,0 +1,82 @@
+"""Tasks that tell where and how they ran, or end their own process, for tests of the backends."""
+
+import os
+import signal
+import time
+import warnings
+from pathlib import Path
+
+
+def seeded_sum(seed):
+    import numpy as np
+
+    return float(np.random.default_rng(seed).standard_normal(1000).sum())
+
+
+def slow_first(index):
+    """The first argument ends last."""
+    time.sleep(0.5 if index == 0 else 0.0)
+    return index
+
+
+def process(_):
+    time.sleep(0.1)
+    return os.getpid()
+
+
+def mark(file):
+    Path(file).touch()
+    return file
+
+
+def mark_or_fail(file):
+    if file is None:
+        raise TypedError("no luck", 7)
+    return mark(file)
+
+
+class TypedError(ValueError):
+    def __init__(self, text, code):
+        super().__init__(text, code)
+        self.code = code
+
+
+def die_once(marker):
+    """SIGKILL the worker at the first attempt; a file remembers it."""
+    try:
+        Path(marker).touch(exist_ok=False)
+    except FileExistsError:
+        return "survived"
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die(folder):
+    """SIGKILL the worker at every attempt; files count them."""
+    (Path(folder) / str(os.getpid())).touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def warn(index):
+    warnings.warn("look here", UserWarning, stacklevel=1)
+    return index
+
+
+def threads(_):
+    """The threads of every linear algebra library in a worker."""
+    import torch
+    from threadpoolctl import threadpool_info
+
+    return [torch.get_num_threads(), *(library["num_threads"] for library in threadpool_info())]
+
+
+def node(_):
+    import ray
+
+    time.sleep(0.3)
+    return ray.get_runtime_context().get_node_id()
+
+
+def begin_and_wait(begun):
+    """Tell the process, then wait long."""
+    Path(begun).write_text(str(os.getpid()))
+    time.sleep(300.0)
