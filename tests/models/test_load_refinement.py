@@ -14,6 +14,7 @@ from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.inference import OptimizerOptions
 from forcegp.models import StructuredGP, load_posterior, save_posterior
 from forcegp.models.load_refinement import SETTLED, fit_with_refined_loads
+from forcegp.parallel import Serial
 from forcegp.priors import ContactFriction, JointFriction, Payload, SumPrior
 
 COULOMB, SLOWLY = 0.35, 0.1  # coefficient, and the speed (m/s) below which it falls to zero
@@ -60,7 +61,8 @@ def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
 
 def first_fit(model: StructuredGP, data: Dataset):
     """The fit under the nominal normal force, which `fit` does not stop at."""
-    return model._fit(data, data, 1, None, None, 0.0, seed=0, jobs=1, hyperprior=True, options=OPTIONS, progress=None)
+    how = {"seed": 0, "backend": Serial(), "hyperprior": True, "options": OPTIONS, "progress": None}
+    return model._fit(data, data, 1, None, None, 0.0, **how)
 
 
 def errors(posterior, test: Dataset) -> dict[str, float]:

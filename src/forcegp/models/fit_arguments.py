@@ -52,10 +52,10 @@ def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
     return replace(noise or Noise(), acceleration=tuple(float(std) for std in level))
 
 
-def check_search_numbers(restarts: int, jobs: int, seed: int) -> None:
+def check_search_numbers(restarts: int, seed: int) -> None:
     """Raises InvalidInput for numbers that are out of range."""
-    if restarts < 1 or jobs < 1:
-        raise InvalidInput(f"restarts={restarts} and jobs={jobs} must be at least 1")
+    if restarts < 1:
+        raise InvalidInput(f"restarts={restarts} must be at least 1")
     if seed < 0:
         raise InvalidInput(f"seed={seed} must be 0 or larger")
 

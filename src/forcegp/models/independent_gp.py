@@ -26,6 +26,7 @@ from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.protocol import Model
 from forcegp.models.search import FitProgress, blas_threads, default_restarts, perturbed, run_restarts
+from forcegp.parallel import Backend, backend_for
 from forcegp.priors import JointForces
 
 Outcomes = list[OptimizationResult | FitError]
@@ -72,7 +73,8 @@ class IndependentGP(Model):
         points: int | None = None,
         restarts: int | None = None,
         seed: int = 0,
-        jobs: int = 1,
+        jobs: int | None = None,
+        backend: Backend | str | None = None,
         hyperprior: bool = True,
         options: OptimizerOptions | None = None,
         start: Mapping[str, Tensor] | None = None,
@@ -89,10 +91,11 @@ class IndependentGP(Model):
         InvalidInput: the dataset does not fit the robot, or an argument is out of range.
         FitError: no restart could be evaluated for some joint; the message names it and the cause.
         """
+        workers = backend_for(backend, jobs)
         rows = training_rows(self.system.robot.joint_names, dataset, points)
         noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
-        check_search_numbers(restarts, jobs, seed)
+        check_search_numbers(restarts, seed)
         training = TrainingData.of(rows, self.system.robot.device)
         likelihood = IndependentLikelihood(self.inputs, training)
         kernels = likelihood.kernels()
@@ -106,7 +109,7 @@ class IndependentGP(Model):
         )
         search = _JointSearches(objectives, moments, first_start(moments, start or {}, fixed), seed, options)
         with blas_threads(len(rows)):
-            outcomes = run_restarts(search, restarts, jobs, progress)
+            outcomes = run_restarts(search, restarts, workers, progress)
         result = self._chosen(outcomes)
         settings = {
             **described_rows(rows, dataset),
@@ -151,6 +154,7 @@ class IndependentGP(Model):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        solution: Tensor | None = None,
     ) -> IndependentPosterior:
         likelihood = IndependentLikelihood(self.inputs, training)
         posterior = IndependentPosterior(self, likelihood, dict(parameters), result, dict(settings))

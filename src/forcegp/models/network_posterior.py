@@ -63,6 +63,7 @@ class NetworkModel(Model):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        solution: Tensor | None = None,
     ) -> NetworkPosterior:
         return NetworkPosterior(self, training, dict(parameters), result, dict(settings))
 
@@ -75,7 +76,7 @@ class NetworkModel(Model):
     def prepared(self, dataset: Dataset, points: int | None, seed: int) -> tuple[Dataset, TrainingData]:
         """The rows to train on, as a Dataset and as tensors."""
         rows = training_rows(self.system.robot.joint_names, dataset, points)
-        check_search_numbers(1, 1, seed)
+        check_search_numbers(1, seed)
         return rows, TrainingData.of(rows, self.system.robot.device)
 
 

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult
 from forcegp.models.noise import ACCELERATION, FORCE
 from forcegp.models.physical_parameters import PHYSICAL
+from forcegp.parallel import Backend, Serial
 
 RESTART_SPREAD = 0.7
 """Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
@@ -69,14 +71,19 @@ def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
 
 
 def run_restarts(
-    search: Callable[[int, FitProgress | None], Outcome], restarts: int, jobs: int, progress: FitProgress | None
+    search: Callable[[int, FitProgress | None], Outcome], restarts: int, backend: Backend, progress: FitProgress | None
 ) -> Sequence[Outcome]:
-    """`search(0, progress)`, `search(1, progress)`, ... in `jobs` processes, on which the outcomes do not depend."""
-    if jobs == 1 or restarts == 1:
-        return [search(index, progress) for index in range(restarts)]
-    from joblib import Parallel, delayed
+    """`search(0, progress)`, `search(1, progress)`, ... on a backend, on which the outcomes do not depend.
 
-    return Parallel(n_jobs=min(jobs, restarts))(delayed(search)(index, None) for index in range(restarts))  # type: ignore[return-value]
+    Only this process can tell the progress. A single search is not sent anywhere.
+    """
+    if restarts == 1 or isinstance(backend, Serial):
+        return [search(index, progress) for index in range(restarts)]
+    return list(backend.map(partial(_silently, search), range(restarts)))
+
+
+def _silently(search: Callable[[int, FitProgress | None], Outcome], index: int) -> Outcome:
+    return search(index, None)
 
 
 def with_steps_before(

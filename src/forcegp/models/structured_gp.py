@@ -45,6 +45,7 @@ from forcegp.models.search import (
 )
 from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.models.surface_distance import check_distance
+from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
 
 
@@ -88,7 +89,8 @@ class StructuredGP(Model):
         points: int | None = None,
         restarts: int | None = None,
         seed: int = 0,
-        jobs: int = 1,
+        jobs: int | None = None,
+        backend: Backend | str | None = None,
         hyperprior: bool = True,
         options: OptimizerOptions | None = None,
         start: Mapping[str, Tensor] | None = None,
@@ -107,7 +109,9 @@ class StructuredGP(Model):
             where local optima cost most and searches cost little, and 1 beyond. They draw kernel parameters only: all
             begin at the same physical values.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
-        jobs: processes for the restarts (joblib); results do not depend on it.
+        jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
+        backend: where restarts run: `Serial()`, `Joblib(jobs)`, `Ray(address)` or a name, "serial", "joblib", "ray"
+            (docs/clusters.md). None is this process for one job and processes of this machine for several.
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
             maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood. With
             `learn` the variances of the processes have a weak one as well (`models.objective.with_variance_priors`).
@@ -120,7 +124,7 @@ class StructuredGP(Model):
         prior_strength: weight w of the prior on learned inertias, w/2 times the squared distance of pseudo-inertias
             (`models.objective.squared_distance`) from the given ones: a body with all masses (1 + x) times as large
             costs 2 w x^2. 0 is no prior.
-        progress: called as progress(restart, iteration, nll) with jobs = 1.
+        progress: called as progress(restart, iteration, nll) where the restarts run in this process.
 
         Where the prior has a friction that is proportional to the normal force, and no `expected` friction is given,
         the fit is repeated with the normal force under the friction that was found, until it settles (not with
@@ -132,7 +136,8 @@ class StructuredGP(Model):
         ContactError: a contact cannot hold at some row, or no row touches its surface.
         FitError: no restart could be evaluated; the message names the cause.
         """
-        how = {"seed": seed, "hyperprior": hyperprior, "options": options, "jobs": jobs, "progress": progress}
+        how: dict[str, Any] = {"seed": seed, "hyperprior": hyperprior, "options": options, "progress": progress}
+        how["backend"] = backend_for(backend, jobs)
         rows = training_rows(self.system.robot.joint_names, dataset, points)
         first = self._fit(rows, dataset, restarts, start, learn, prior_strength, **how)
         if learn is not None:
@@ -155,7 +160,7 @@ class StructuredGP(Model):
         prior_strength: float,
         *,
         seed: int,
-        jobs: int,
+        backend: Backend,
         hyperprior: bool,
         options: OptimizerOptions | None,
         progress: FitProgress | None,
@@ -163,7 +168,7 @@ class StructuredGP(Model):
         """`fit` to these rows of the dataset with the prior as it is."""
         noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
-        check_search_numbers(restarts, jobs, seed)
+        check_search_numbers(restarts, seed)
         if not 0.0 <= prior_strength < float("inf"):
             raise InvalidInput(f"prior_strength is {prior_strength}; it must be finite and at least 0")
         training = TrainingData.of(rows, self.system.robot.device)
@@ -191,7 +196,7 @@ class StructuredGP(Model):
         kept = options if begin is None else replace(options, keep_iterates=True)
         search = _Search(objective, moments, first, seed, kept)
         with blas_threads(training.q.numel()):
-            results = run_restarts(search, restarts, jobs, progress)
+            results = run_restarts(search, restarts, backend, progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
