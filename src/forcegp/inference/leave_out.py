@@ -83,8 +83,9 @@ def leave_blocks_out(
         precision = None
         if rank:
             precision = CholeskyFactor(system.factor.lower.clone(), system.factor.jitter).into_inverse()
-        parts = [_left_out_block(system, precision, torch.tensor(block)) for block in chosen]
-        rows = torch.tensor([row for block in chosen for row in block])
+        device = system.alpha.device
+        parts = [_left_out_block(system, precision, torch.tensor(block, device=device)) for block in chosen]
+        rows = torch.tensor([row for block in chosen for row in block], device=device)
         order = torch.argsort(rows)
         rows = rows[order]
         residual = torch.cat([part.residual for part in parts])[order]
@@ -124,7 +125,7 @@ def _left_out_block(system: DeflatedSystem, precision: Tensor | None, rows: Int[
     if precision is None:
         return _LeftOut(-orthogonal.sum(), -orthogonal, remainder, identity.expand(count, -1, -1))
     ascending, place = torch.sort(rows)  # only the lower triangle of the precision is there
-    index = (ascending[:, None] * rank + torch.arange(rank)).reshape(-1).to(U.device)
+    index = (ascending[:, None] * rank + torch.arange(rank, device=U.device)).reshape(-1)
     lower = precision[index[:, None], index].tril()
     factor, info = torch.linalg.cholesky_ex(lower + lower.tril(-1).mT)
     if bool(info):
@@ -136,7 +137,7 @@ def _left_out_block(system: DeflatedSystem, precision: Tensor | None, rows: Int[
     error = torch.cholesky_solve(alpha, factor).reshape(count, rank)
     log_density = factor.diagonal().log().sum() - 0.5 * (alpha[:, 0] @ error.reshape(-1)) - orthogonal.sum()
     spread = torch.cholesky_inverse(factor).reshape(count, rank, count, rank)
-    each = torch.arange(count)
+    each = torch.arange(count, device=U.device)
     given = torch.argsort(place)  # back to the order in which the block names its rows
     error, spread = error[given], spread[each, :, each][given]
     own = torch.linalg.cholesky(spread)

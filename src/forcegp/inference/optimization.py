@@ -80,16 +80,16 @@ class _Search:
         self.cause: str | None = None
 
     def flatten(self, parameters: Mapping[str, Tensor]) -> np.ndarray:
-        arrays = [parameters[name].detach().cpu().reshape(-1).numpy() for name in self.template]
-        return np.concatenate(arrays) if arrays else np.zeros(0)
+        values = [parameters[name].detach().reshape(-1) for name in self.template]
+        return torch.cat(values).cpu().numpy() if values else np.zeros(0)  # one copy from a GPU, not one each
 
     def unflatten(self, point: np.ndarray) -> dict[str, Tensor]:
-        parameters, offset = {}, 0
-        for name, value in self.template.items():
-            chunk = torch.as_tensor(point[offset : offset + value.numel()].copy(), dtype=value.dtype)
-            parameters[name] = chunk.reshape(value.shape).to(value.device)
-            offset += value.numel()
-        return parameters
+        if not self.template:
+            return {}
+        device = next(iter(self.template.values())).device
+        chunks = torch.tensor(point, device=device).split([value.numel() for value in self.template.values()])
+        shaped = zip(self.template.items(), chunks, strict=True)
+        return {name: chunk.reshape(value.shape).to(value.dtype, copy=True) for (name, value), chunk in shaped}
 
     def evaluate(self, point: np.ndarray) -> tuple[float, np.ndarray] | None:
         """Objective and gradient; None, with the cause kept, where they cannot be evaluated or are not finite."""

@@ -124,6 +124,13 @@ class MechanicalSystem:
                 "the least-squares sense; remove one of them or check their surfaces."
             )
 
+    def to(self, device: torch.device | str) -> MechanicalSystem:
+        """The same system with its robot and the numbers of its known forces on `device`, for instance "cuda".
+
+        Raises InvalidInput for a device that is not there.
+        """
+        return replace(self, robot=self.robot.to(device))  # known forces are bound to the robot's device again
+
     def with_robot(self, robot: Robot) -> MechanicalSystem:
         """The same contacts and forces on another robot with the same joints."""
         return replace(self, robot=robot)

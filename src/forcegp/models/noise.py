@@ -43,7 +43,7 @@ class Noise:
         if self.force is not None:
             object.__setattr__(self, "force", _positive("force", self.force))
 
-    def parameters(self, nv: int) -> dict[str, Float[Tensor, "nv"]]:
+    def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint.
 
         Raises InvalidInput for a wrong number of values, and where only a dataset can tell the level.
@@ -55,7 +55,7 @@ class Noise:
         named = {ACCELERATION: self.acceleration} | ({} if self.force is None else {FORCE: self.force})
         out = {}
         for name, value in named.items():
-            values = torch.as_tensor(value, dtype=torch.float64)
+            values = torch.as_tensor(value, dtype=torch.float64, device=device)
             if values.dim() and len(values) != nv:
                 raise InvalidInput(f"Noise has {len(values)} values for {nv} joints; give one number or one per joint.")
             out[name] = values.expand(nv).log()
@@ -84,10 +84,11 @@ class Noise:
         Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint
         arm with 60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
         """
-        total = torch.zeros((), dtype=torch.float64)
-        for name, start in self.parameters(nv).items():
+        device = parameters[ACCELERATION].device if ACCELERATION in parameters else None
+        total = torch.zeros((), dtype=torch.float64, device=device)
+        for name, start in self.parameters(nv, device).items():
             if name in parameters:
-                total = total - 0.5 * (parameters[name] - start.to(parameters[name].device)).square().sum()
+                total = total - 0.5 * (parameters[name] - start).square().sum()
         return total
 
     def to_dict(self) -> dict[str, Any]:

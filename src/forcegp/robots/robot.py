@@ -127,10 +127,10 @@ class Robot:
         return self._rebuilt(self.urdf_text, armature)
 
     def to(self, device: torch.device | str) -> Robot:
-        """The same robot with its constants on ``device``."""
-        device = torch.device(device)
-        frames = {name: (body, offset.to(device)) for name, (body, offset) in self._frames.items()}
-        return replace(self, tree=self.tree.to(device), _frames=frames)
+        """The same robot with its constants on ``device``, for instance "cuda"."""
+        tree = self.tree.to(device)
+        frames = {name: (body, offset.to(tree.rest.device)) for name, (body, offset) in self._frames.items()}
+        return replace(self, tree=tree, _frames=frames)
 
     def compile(self, folder: str | Path | None = None) -> CompiledRobot:
         """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.robots.arguments import Inertials, broadcast_batch
+from forcegp.robots.devices import usable_device
 from forcegp.robots.inertia import pseudo_inertia, pseudo_inertia_factor
 from forcegp.robots.layout import WORLD, Layout
 from forcegp.robots.spatial import skew
@@ -57,8 +58,9 @@ class Tree:
     armature: Tensor  # (n,)
     has_armature: bool
 
-    def to(self, device: torch.device) -> Tree:
-        """The same constants on another device."""
+    def to(self, device: torch.device | str) -> Tree:
+        """The same constants on another device. Raises InvalidInput for one that is not there."""
+        device = usable_device(device)
         moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **moved, levels=tuple(level.to(device) for level in self.levels))
 
