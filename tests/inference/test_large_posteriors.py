@@ -187,6 +187,6 @@ def test_a_missed_tolerance_is_an_error():
 def test_a_good_start_saves_iterations():
     given = made()
     first = iterative(given, tolerance=1e-8)
-    again = iterative(given, tolerance=1e-8, start=first.solved.solution.reshape(COUNT, -1))
+    again = iterative(given, tolerance=1e-8, start=first.solved.solution)
     assert again.solved.iterations == 0
     assert first.solved.iterations > 5

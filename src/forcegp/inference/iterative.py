@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from forcegp.errors import InvalidInput
 from forcegp.inference.conjugate_gradients import Iteration, Solved, conjugate_gradients
 from forcegp.inference.deflation import Deflation, deflate, whiten
 from forcegp.inference.kernel_panels import KernelPanels
@@ -107,7 +108,7 @@ class IterativePosterior(LatentPosterior):
         iterations: int,
         memory: int,
         solve_covariance: bool = False,
-        start: Float[Tensor, "N r"] | None = None,
+        start: Float[Tensor, "n 1"] | None = None,
         report: Iteration | None = None,
     ) -> IterativePosterior:
         """Condition on residual = y - m; the first arguments are those of `negative_log_likelihood`.
@@ -121,14 +122,14 @@ class IterativePosterior(LatentPosterior):
             features = tuple(z.detach() for z in features)
             panels = KernelPanels(kernels, features, memory)
             preconditioner = LowRankPlusDiagonal.of(kernels, features, deflation.C, deflation.t, points)
-            first = None if start is None else start.reshape(-1, 1)
+            _check_start(start, deflation)
             solved = conjugate_gradients(
                 lambda x: _covariance_product(deflation.C, panels, x),
                 preconditioner.solve,
                 deflation.t.reshape(-1, 1),
                 tolerance=tolerance,
                 iterations=iterations,
-                start=first,
+                start=start,
                 report=report,
             )
             panels.release()
@@ -183,6 +184,14 @@ class IterativePosterior(LatentPosterior):
             tolerance=self.tolerance,
             iterations=self.iterations,
         ).solution
+
+
+def _check_start(start: Tensor | None, deflation: Deflation) -> None:
+    if start is not None and start.numel() != deflation.t.numel():
+        raise InvalidInput(
+            f"the solution to begin from has {start.numel()} numbers, these rows need {deflation.t.numel()}; give that "
+            "of the same rows, or none."
+        )
 
 
 def _covariance_product(C: Float[Tensor, "N r C"], panels: KernelPanels, x: Float[Tensor, "n S"]) -> Tensor:

@@ -63,15 +63,15 @@ class LatentKernels(torch.nn.Module):
     def crosses(
         self,
         parameters: Mapping[str, Tensor],
-        left: Sequence[Float[Tensor, "n _"]],
-        right: Sequence[Float[Tensor, "m _"]],
-    ) -> list[Float[Tensor, "n m"]]:
+        left: Sequence[Float[Tensor, "_ _"]],
+        right: Sequence[Float[Tensor, "_ _"]],
+    ) -> list[Float[Tensor, "_ _"]]:
         """k_c(left_i, right_j) of every latent at `parameters`, differentiable in them."""
         return self._at(parameters, _Crosses(self), left, right)
 
     def diagonals(
-        self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "n _"]]
-    ) -> list[Float[Tensor, " n"]]:
+        self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "_ _"]]
+    ) -> list[Float[Tensor, " _"]]:
         """k_c(z_i, z_i) of every latent at `parameters`, differentiable in them."""
         return self._at(parameters, _Diagonals(self), features)
 

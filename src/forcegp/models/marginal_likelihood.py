@@ -13,7 +13,16 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.inference import ExactPosterior, LatentKernels, LatentPosterior, negative_log_likelihood
+from forcegp.inference import (
+    Engine,
+    Exact,
+    LatentKernels,
+    LatentPosterior,
+    Terms,
+    collapsed_bound,
+    negative_log_likelihood,
+)
+from forcegp.inference.conjugate_gradients import Iteration
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.priors import ForcePrior, Scaling
@@ -155,19 +164,19 @@ class MarginalLikelihood:
     def _nominal_mixing(self) -> Tensor:
         return self._nominal_dynamics.H @ self.prior.mixing(self._nominal_dynamics)
 
-    def terms(self, parameters: Mapping[str, Tensor]) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+    def terms(self, parameters: Mapping[str, Tensor]) -> Terms:
         """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`."""
         dynamics = self.dynamics(parameters)
         offset = dynamics.acceleration_map(known=self.mean == "analytical").offset
         noise = Noise.covariance(parameters, dynamics.H, self.training.noise_factors)
         if dynamics is self._nominal_dynamics:
-            return self._nominal_features, self._nominal_mixing, self.training.a - offset, noise
+            return Terms(self._nominal_features, self._nominal_mixing, self.training.a - offset, noise)
         # shifted and scaled at these parameters, as a posterior does that has them in its system
         given = self.prior.features(dynamics)
         rows = self if self._reference is None else self._reference
         by = given if rows is self else self.prior.features(rows.dynamics(parameters))
         features = Standardization.of(by, self.prior.scalings(self.system.robot))(given)
-        return features, dynamics.H @ self.prior.mixing(dynamics), self.training.a - offset, noise
+        return Terms(features, dynamics.H @ self.prior.mixing(dynamics), self.training.a - offset, noise)
 
     def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
         """Kernels with moment-based start values, at the physical parameters among `parameters`.
@@ -207,11 +216,26 @@ class MarginalLikelihood:
         features, W, residual, noise = self.terms(parameters)
         return negative_log_likelihood(W, residual, noise, kernels.matrices(parameters, features))
 
-    def condition(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> LatentPosterior:
-        """The posterior of the latent functions at fixed parameters."""
+    def bound(
+        self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
+    ) -> Float[Tensor, ""]:
+        """`collapsed_bound` of the same with these inducing points (prepared features) of every latent."""
+        features, W, residual, noise = self.terms(parameters)
+        return collapsed_bound(W, residual, noise, kernels, parameters, features, points)
+
+    def condition(
+        self,
+        kernels: LatentKernels,
+        parameters: Mapping[str, Tensor],
+        engine: Engine | None = None,
+        *,
+        start: Tensor | None = None,
+        report: Iteration | None = None,
+    ) -> LatentPosterior:
+        """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`."""
         with torch.no_grad():
-            features, W, residual, noise = self.terms(parameters)
-            return ExactPosterior.condition(kernels.at(parameters), features, W, residual, noise)
+            terms = self.terms(parameters)
+            return (engine or Exact()).condition(kernels.at(parameters), terms, start=start, report=report)
 
 
 def inertials_of(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:

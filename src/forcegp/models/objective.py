@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -27,7 +27,8 @@ class FitObjective:
     """The objective as a function of the free parameters alone; a class so that processes can receive it.
 
     With `hyperprior` kernels (see also `with_variance_priors`) and learned noise have their priors; `prior_strength` is
-    the weight of the learned inertias' distance from where they start.
+    the weight of the learned inertias' distance from where they start. With inducing `points` the bound through them
+    stands for the likelihood.
     """
 
     likelihood: MarginalLikelihood
@@ -37,6 +38,7 @@ class FitObjective:
     hyperprior: bool
     physical: PhysicalParameters | None = None
     prior_strength: float = 0.0
+    points: Sequence[Tensor] | None = None
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """In nats; differentiable once in every parameter."""
@@ -48,7 +50,10 @@ class FitObjective:
                 start = inertials_of(self.physical.tensors(self.physical.zero))
                 distances = [squared_distance(value, start[link]) for link, value in inertials_of(named).items()]
                 penalty = 0.5 * self.prior_strength * sum(distances, penalty)
-        value = self.likelihood(self.kernels, named) + penalty
+        if self.points is None:
+            value = self.likelihood(self.kernels, named) + penalty
+        else:
+            value = self.likelihood.bound(self.kernels, named, self.points) + penalty
         if not self.hyperprior:
             return value
         nv = self.likelihood.system.robot.nv

@@ -21,6 +21,7 @@ from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
 from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.prediction import Prediction, join_predictions
+from forcegp.models.predictor import CovarianceKind, Predictor
 from forcegp.models.rollout import Rollout, roll_out
 from forcegp.models.search import FitProgress
 
@@ -122,6 +123,35 @@ class Posterior(ABC):
         ]
         return join_predictions(blocks, batch)
 
+    def predictor(
+        self,
+        *,
+        covariance: CovarianceKind = "compressed",
+        tolerance: float = 0.01,
+        largest_rank: int = 512,
+        compile: bool = True,
+    ) -> Predictor:
+        """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
+
+        Parameters
+        ----------
+        covariance: "compressed" uses so few combinations of the data that standard deviations are up to `tolerance`
+            (relative) larger than the exact ones at states around the training data, and never smaller; "exact" is the
+            covariance of `predict`; "none" leaves it out and prepares faster.
+        tolerance, largest_rank: the rank is the smallest that keeps the tolerance, and at most `largest_rank`; a
+            NumericalWarning says where that does not suffice.
+        compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device.
+
+        Raises
+        ------
+        InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
+        CompilerError: there is no C++ compiler, or it fails.
+        """
+        raise InvalidInput(
+            f"a {self.description} has no predictor for control rates; call predict, or use a structured Gaussian "
+            "process."
+        )
+
     def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Float[Tensor, "rows nv"]], torch.Size]:
         """States as rows of float64 tensors on the model's device, and their batch dimensions.
 
@@ -188,6 +218,11 @@ class Posterior(ABC):
             "another recording instead, or use a Gaussian process."
         )
 
+    @property
+    def solution(self) -> Tensor | None:
+        """What conditioning on these rows again can begin from, stored with the model; None where it is cheap."""
+        return None
+
     def update(self, rows: Dataset, budget: int | None = None) -> Posterior:
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
@@ -252,8 +287,12 @@ class Model(ABC):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        solution: Tensor | None = None,
     ) -> Posterior:
-        """The posterior at given parameters, without a search: what a stored model is loaded with."""
+        """The posterior at given parameters, without a search: what a stored model is loaded with.
+
+        `solution` is what its engine had found (`Posterior.solution`), which saves the engine most of its work.
+        """
 
     @abstractmethod
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:

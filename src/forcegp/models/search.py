@@ -19,7 +19,7 @@ from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult
 from forcegp.models.noise import ACCELERATION, FORCE
 from forcegp.models.physical_parameters import PHYSICAL
-from forcegp.parallel import Backend, Serial
+from forcegp.parallel import Backend, Joblib, Serial
 
 RESTART_SPREAD = 0.7
 """Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
@@ -75,9 +75,9 @@ def run_restarts(
 ) -> Sequence[Outcome]:
     """`search(0, progress)`, `search(1, progress)`, ... on a backend, on which the outcomes do not depend.
 
-    Only this process can tell the progress. A single search is not sent anywhere.
+    Only this process can tell the progress. A single search needs no other process of this machine.
     """
-    if restarts == 1 or isinstance(backend, Serial):
+    if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
         return [search(index, progress) for index in range(restarts)]
     return list(backend.map(partial(_silently, search), range(restarts)))
 

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 
 from forcegp import __version__
 from forcegp.data import units_for
-from forcegp.errors import FileFormatError, ForceGPError
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.marginal_likelihood import TrainingData
@@ -38,6 +38,7 @@ UPDATED = 3
 """
 STATES = ("q", "v", "u", "a")
 NOISE = "noise_std"
+SOLUTION = "latent.solution"
 TRAINING, REFERENCE = "training.", "reference."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
 
@@ -87,6 +88,10 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     if training.reference is not None:
         tensors |= _row_tensors(REFERENCE, training.reference)
     tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
+
+    solution = posterior.solution
+    if solution is not None:
+        tensors[SOLUTION] = solution.detach().cpu().contiguous()
 
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
@@ -155,7 +160,13 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
     _check_tensors(path / "tensors.safetensors", model, training, parameters)
-    posterior = model.condition(training, parameters, optimization, settings)
+    solution = tensors.get(SOLUTION)
+    if solution is not None:
+        _check_numbers(path / "tensors.safetensors", SOLUTION, solution)
+    try:
+        posterior = model.condition(training, parameters, optimization, settings, solution)
+    except (InvalidInput, RuntimeError) as error:
+        raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
     if target is None:
         return posterior
     try:

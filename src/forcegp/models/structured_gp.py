@@ -9,13 +9,15 @@ from typing import Any, ClassVar, get_args
 
 from torch import Tensor
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import DataWarning, FitError, InvalidInput
 from forcegp.inference import (
+    Engine,
     LatentKernels,
     OptimizationResult,
     OptimizerOptions,
     best_of,
+    engine_of,
     minimize_objective,
 )
 from forcegp.mechanics import MechanicalSystem
@@ -28,6 +30,7 @@ from forcegp.models.fit_arguments import (
 )
 from forcegp.models.identification import Identification
 from forcegp.models.load_refinement import fit_with_refined_loads
+from forcegp.models.many_rows import learning_rows, on_all_rows, require_memory_to_learn
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import Noise
 from forcegp.models.objective import LOG_VARIANCE_SPREAD, FitObjective, with_variance_priors
@@ -36,6 +39,7 @@ from forcegp.models.physical_start import PhysicalStart
 from forcegp.models.prior_checks import check_prior
 from forcegp.models.protocol import Model
 from forcegp.models.search import (
+    MOST_POINTS_FOR_RESTARTS,
     FitProgress,
     blas_threads,
     default_restarts,
@@ -47,6 +51,11 @@ from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.models.surface_distance import check_distance
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
+
+CONTINUE_FROM = 250
+"""Rows of the fit at whose end a search on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
+LARGE = OptimizerOptions(tolerance=1e-5)
+"""The search on so many rows, where an iteration takes seconds and the objective is thousands of nats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +105,11 @@ class StructuredGP(Model):
         start: Mapping[str, Tensor] | None = None,
         learn: Learned | Sequence[Learned] | None = None,
         prior_strength: float = 0.0,
+        engine: Engine | str = "auto",
+        learning_points: int | None = None,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
-        """Find all kernel and learned noise parameters by marginal likelihood, then condition on the same points.
+        """Find all kernel and learned noise parameters by marginal likelihood, then condition on the points.
 
         Parameters
         ----------
@@ -106,8 +117,8 @@ class StructuredGP(Model):
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
         restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
             factors, every other one from a smoother start; the best final value wins. None means 4 up to 400 points,
-            where local optima cost most and searches cost little, and 1 beyond. They draw kernel parameters only: all
-            begin at the same physical values.
+            where local optima cost most and searches cost little, and 1 beyond, which then begins where a fit to 250
+            of the rows ended. They draw kernel parameters only: all begin at the same physical values.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
         backend: where restarts run: `Serial()`, `Joblib(jobs)`, `Ray(address)` or a name, "serial", "joblib", "ray"
@@ -115,7 +126,8 @@ class StructuredGP(Model):
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
             maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood. With
             `learn` the variances of the processes have a weak one as well (`models.objective.with_variance_priors`).
-        options: the search itself.
+        options: the search itself; None stops beyond 400 points when an iteration lowers the objective by less than
+            1e-5 of it, and by less than 1e-8 up to there.
         start: unconstrained parameters at which the first search begins instead of moments, for example
             `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
         learn: physical parameters to estimate along with all others, from the values that the system has:
@@ -124,6 +136,11 @@ class StructuredGP(Model):
         prior_strength: weight w of the prior on learned inertias, w/2 times the squared distance of pseudo-inertias
             (`models.objective.squared_distance`) from the given ones: a body with all masses (1 + x) times as large
             costs 2 w x^2. 0 is no prior.
+        engine: how the posterior is computed from all points: "exact", "iterative", "inducing", or one of
+            `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
+            memory, and says why in `settings["engine_reason"]`.
+        learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
+            up to 1500, and 1000 beyond. The posterior is that of all points.
         progress: called as progress(restart, iteration, nll) where the restarts run in this process.
 
         Where the prior has a friction that is proportional to the normal force, and no `expected` friction is given,
@@ -135,13 +152,36 @@ class StructuredGP(Model):
         InvalidInput: the dataset does not fit the system, or an argument is out of range.
         ContactError: a contact cannot hold at some row, or no row touches its surface.
         FitError: no restart could be evaluated; the message names the cause.
+        NotEnoughMemory: the engine, or the likelihood of the learning points, would need more than is free.
+        NumericalError: the engine failed, for example to reach its tolerance.
         """
+        chosen = engine_of(engine)
         how: dict[str, Any] = {"seed": seed, "hyperprior": hyperprior, "options": options, "progress": progress}
         how["backend"] = backend_for(backend, jobs)
-        rows = training_rows(self.system.robot.joint_names, dataset, points)
+        all_rows = training_rows(self.system.robot.joint_names, dataset, points)
+        rows = learning_rows(all_rows, learning_points, ordered=points is not None)
+        if start is None and learn is None:
+            start = self._continuation(rows, dataset, restarts, how)
         first = self._fit(rows, dataset, restarts, start, learn, prior_strength, **how)
-        if learn is not None:
-            return first
+        if learn is None:
+            first = self._with_refined_loads(first, rows, dataset, how)
+        return on_all_rows(first, all_rows, chosen, described_rows(all_rows, dataset), hyperprior)
+
+    def _continuation(
+        self, rows: Dataset, dataset: Dataset, restarts: int | None, how: Mapping[str, Any]
+    ) -> dict[str, Tensor] | None:
+        """Where a single search on many rows begins: at the end of one on few of them; None for few rows."""
+        if len(rows) <= MOST_POINTS_FOR_RESTARTS or restarts not in (None, 1):
+            return None
+        few = farthest_rows(rows, CONTINUE_FROM)
+        begin = {**how, "options": how["options"] or OptimizerOptions(iterations=100, tolerance=1e-6)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # the fit to all rows will say it
+            return dict(self._fit(few, dataset, 1, None, None, 0.0, **begin).parameters)
+
+    def _with_refined_loads(
+        self, first: StructuredPosterior, rows: Dataset, dataset: Dataset, how: Mapping[str, Any]
+    ) -> StructuredPosterior:
 
         def again(prior: ForcePrior, last: StructuredPosterior) -> StructuredPosterior:
             with warnings.catch_warnings():
@@ -176,6 +216,7 @@ class StructuredGP(Model):
         self.system.check_states(training.q, training.v, training.u)
         check_distance(self.system, training)
         check_prior(likelihood)
+        require_memory_to_learn(likelihood)
         noise_parameters = noise.parameters(self.system.robot.nv)
         learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
         begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters, prior_strength)
@@ -183,7 +224,7 @@ class StructuredGP(Model):
         if begin is not None and hyperprior:
             kernels = with_variance_priors(kernels)
         moments = (kernels.initial_parameters() if begin is None else begin.path[-1]) | learned_noise
-        options = options or OptimizerOptions()
+        options = options or (LARGE if len(rows) > MOST_POINTS_FOR_RESTARTS else OptimizerOptions())
         if PHYSICAL in (start or {}):
             raise InvalidInput(
                 f"start has {PHYSICAL!r}, numbers in units that the data of their own fit gave them; leave it out, and "
@@ -239,10 +280,11 @@ class StructuredGP(Model):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        solution: Tensor | None = None,
     ) -> StructuredPosterior:
         """The posterior at given parameters, without optimisation; names as in `MarginalLikelihood`."""
         likelihood = self._likelihood(training)
-        return self._posterior(likelihood, likelihood.kernels(), parameters, result, settings)
+        return self._posterior(likelihood, likelihood.kernels(), parameters, result, settings, solution)
 
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the kernel and noise parameters that a posterior on these points needs."""
@@ -257,9 +299,11 @@ class StructuredGP(Model):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        solution: Tensor | None = None,
     ) -> StructuredPosterior:
         posterior = StructuredPosterior(self, likelihood, kernels, dict(parameters), result, dict(settings))
-        _ = posterior.latent  # factorise now: a failure belongs to the fit, not to the first prediction
+        # now: a failure belongs to the fit, not to the first prediction
+        vars(posterior)["latent"] = likelihood.condition(kernels, parameters, posterior.engine, start=solution)
         return posterior
 
     def _likelihood(self, training: TrainingData) -> MarginalLikelihood:

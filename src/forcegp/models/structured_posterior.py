@@ -15,7 +15,18 @@ from typing_extensions import override
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, unknown_name_message
-from forcegp.inference import LatentKernels, LatentPosterior, LeaveOut, OptimizationResult, exact, leave_blocks_out
+from forcegp.inference import (
+    Engine,
+    InducingPosterior,
+    IterativePosterior,
+    LatentKernels,
+    LatentPosterior,
+    LeaveOut,
+    OptimizationResult,
+    engine_from_dict,
+    exact,
+    leave_blocks_out,
+)
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, StructuredAccelerations
 from forcegp.models.components import Components, Curve, Latents, components_of, term_slices
@@ -24,6 +35,7 @@ from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData,
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.predictor import CovarianceKind, Predictor, make_predictor
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.search import blas_threads
 from forcegp.models.updating import updated
@@ -56,7 +68,17 @@ class StructuredPosterior(Posterior):
     @cached_property
     def latent(self) -> LatentPosterior:
         """The posterior of the latent functions."""
-        return self.likelihood.condition(self.kernels, self.parameters)
+        return self.likelihood.condition(self.kernels, self.parameters, self.engine)
+
+    @property
+    def engine(self) -> Engine:
+        """What computes `latent`."""
+        return engine_from_dict(self.settings.get("engine"))
+
+    @property
+    @override
+    def solution(self) -> Tensor | None:
+        return self.engine.solution(self.latent)
 
     @property
     @override
@@ -124,6 +146,17 @@ class StructuredPosterior(Posterior):
             return Latents(nothing.flatten(-2), nothing if covariance else None)
         mean = self.latent.mean(features).reshape(*batch, latents)
         return Latents(mean, self.latent.covariance(features).reshape(*batch, latents, latents) if covariance else None)
+
+    @override
+    def predictor(
+        self,
+        *,
+        covariance: CovarianceKind = "compressed",
+        tolerance: float = 0.01,
+        largest_rank: int = 512,
+        compile: bool = True,
+    ) -> Predictor:
+        return make_predictor(self, covariance, tolerance, largest_rank, compile)
 
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
         """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
@@ -254,9 +287,18 @@ class StructuredPosterior(Posterior):
 
     @cached_property
     def negative_log_likelihood(self) -> float:
-        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
+        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior.
+
+        With inducing points its upper bound; with conjugate gradients, which do not compute it, that of the rows which
+        the hyper-parameters were found on (`training.reference`).
+        """
         with torch.no_grad():
-            return float(self.likelihood(self.kernels, self.parameters))
+            if isinstance(self.latent, InducingPosterior):
+                return float(self.likelihood.bound(self.kernels, self.parameters, self.latent.features))
+            likelihood = self.likelihood
+            if isinstance(self.latent, IterativePosterior) and self.training.reference is not None:
+                likelihood = replace(likelihood, training=self.training.reference)
+            return float(likelihood(self.kernels, self.parameters))
 
     @property
     @override

@@ -1,0 +1,265 @@
+"""Engines: how the posterior of the latents is computed from many rows, what memory that needs, and which one to take.
+
+| engine | posterior | time | memory |
+|---|---|---|---|
+| `Exact` | exact, from the factorised covariance | (rN)^3 | (rN)^2 |
+| `Iterative` | exact mean by conjugate gradients, covariance of a low-rank model | iterations C N^2 | N P |
+| `Inducing` | variational, through inducing points, with a bound on what that costs | N P^2 | P^2 |
+
+with N rows, r the rank of the mixing vectors, C latents and P points of all latents together.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.inducing import InducingPosterior
+from forcegp.inference.iterative import IterativePosterior
+from forcegp.inference.kernels import LatentKernels
+from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
+from forcegp.inference.posterior import ExactPosterior, LatentPosterior
+from forcegp.inference.terms import Terms
+
+MOST_EXACT_ROWS = 1500
+"""Rows up to which the exact engine is taken without a question, and all hyper-parameters are found on all of them."""
+
+MOST_EXACT_ENTRIES = 16_000
+"""Size rN of the covariance up to which factorising it takes about as long as conjugate gradients on it."""
+
+FEW_FEATURES = 3
+"""Features of a latent up to which inducing points can be expected to leave nothing out."""
+
+ENOUGH = 1.0
+"""Nats that inducing points may leave out where the engine is chosen by itself: far below what data can tell."""
+
+
+@dataclass(frozen=True)
+class ProblemSize:
+    """`rows` with `outputs` each, `latents` functions of at most `features` features, mixing vectors of rank `rank`."""
+
+    rows: int
+    outputs: int
+    rank: int
+    latents: int
+    features: int
+
+    @classmethod
+    def of(cls, terms: Terms) -> ProblemSize:
+        """From the data; the rank is that of some of the rows."""
+        W, features = terms.W, terms.features
+        rows, outputs, latents = W.shape
+        some = W[:: max(1, rows // 100)]
+        rank = int(torch.linalg.matrix_rank(some, rtol=1e-12).max()) if some.numel() else 0
+        return cls(rows, outputs, rank, latents, max((z.shape[-1] for z in features), default=0))
+
+
+class Engine(ABC):
+    """One way to compute a posterior; a frozen value whose fields are its settings."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def required_bytes(self, size: ProblemSize) -> int:
+        """Memory that conditioning on so many rows takes at least."""
+
+    @abstractmethod
+    def condition(
+        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
+    ) -> LatentPosterior:
+        """The posterior given the data.
+
+        `start` is an earlier `solution` of the same engine, `report(iteration, residual)` follows an iterative one.
+        Raises NotEnoughMemory before anything large is allocated, NumericalError where the engine fails.
+        """
+
+    def require_memory(self, size: ProblemSize, device: torch.device) -> None:
+        """Raise NotEnoughMemory where conditioning needs more memory than is free."""
+        remedy = {
+            "exact": "use engine='iterative' or engine='inducing', or fewer points",
+            "iterative": "give Iterative fewer points, use engine='inducing', or fewer rows",
+        }.get(self.name, "give Inducing fewer points, or fewer rows")
+        require_memory(self.required_bytes(size), f"engine {self.name!r} on N={size.rows} rows", remedy, device)
+
+    def solution(self, posterior: LatentPosterior) -> Tensor | None:
+        """What makes conditioning again cheap, to be stored with a model; None where nothing does."""
+        return None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Name and settings as plain JSON values."""
+        return {"name": self.name, **asdict(self)}  # type: ignore[call-overload]  # every engine is a dataclass
+
+
+@dataclass(frozen=True)
+class Exact(Engine):
+    """The factorised covariance of all rows (the default up to 1500 rows): the only engine that can leave rows out."""
+
+    name: ClassVar[str] = "exact"
+
+    @override
+    def required_bytes(self, size: ProblemSize) -> int:
+        return 8 * ((size.rows * size.rank) ** 2 + size.latents * size.rows**2)
+
+    def bytes_to_learn(self, size: ProblemSize) -> int:
+        """Memory that the likelihood with its gradients takes: kernel matrices, their slopes and gradients as well."""
+        return self.required_bytes(size) + 16 * size.latents * size.rows**2
+
+    @override
+    def condition(
+        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
+    ) -> LatentPosterior:
+        self.require_memory(ProblemSize.of(terms), terms.W.device)
+        return ExactPosterior.condition(kernels, *terms)
+
+
+@dataclass(frozen=True)
+class Iterative(Engine):
+    """Preconditioned conjugate gradients on all rows.
+
+    `points` of each latent for the preconditioner (None: as many as are worth their time), `tolerance` of the relative
+    residual, most `iterations`, `memory` in GiB for kernel matrices that are kept between iterations (None: half of
+    what is free). `solve_covariance`: see `IterativePosterior`.
+    """
+
+    name: ClassVar[str] = "iterative"
+    points: int | None = None
+    tolerance: float = 1e-4
+    iterations: int = 1000
+    memory: float | None = None
+    solve_covariance: bool = False
+
+    def __post_init__(self) -> None:
+        _require(self.points is None or self.points >= 1, "Iterative points", self.points, "at least 1")
+        _require(0.0 < self.tolerance < 1.0, "Iterative tolerance", self.tolerance, "between 0 and 1")
+        _require(self.iterations >= 1, "Iterative iterations", self.iterations, "at least 1")
+        _require(self.memory is None or self.memory >= 0.0, "Iterative memory", self.memory, "at least 0 (GiB)")
+
+    def points_for(self, rows: int) -> int:
+        """A tenth of the rows, at least 200 and at most 1000: measured, see docs/large-data.md."""
+        return min(rows, self.points if self.points is not None else min(1000, max(200, rows // 10)))
+
+    @override
+    def required_bytes(self, size: ProblemSize) -> int:
+        points = self.points_for(size.rows)
+        weights = size.latents * points
+        return 8 * (weights * size.rows + 3 * weights**2 + 12 * size.rows * size.latents * size.outputs)
+
+    @override
+    def condition(
+        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
+    ) -> LatentPosterior:
+        size, device = ProblemSize.of(terms), terms.W.device
+        self.require_memory(size, device)
+        spare = max(0, free_memory(device) - self.required_bytes(size))
+        return IterativePosterior.condition(
+            kernels,
+            *terms,
+            points=self.points_for(size.rows),
+            tolerance=self.tolerance,
+            iterations=self.iterations,
+            memory=spare // 2 if self.memory is None else int(self.memory * 2**30),
+            solve_covariance=self.solve_covariance,
+            start=start,
+            report=report,
+        )
+
+    @override
+    def solution(self, posterior: LatentPosterior) -> Tensor | None:
+        return posterior.solved.solution if isinstance(posterior, IterativePosterior) else None
+
+
+@dataclass(frozen=True)
+class Inducing(Engine):
+    """Variational inducing points: at most `points` for each latent, fewer where they leave out `tolerance` nats.
+
+    With `refine` iterations the hyper-parameters are improved on all rows by the collapsed bound, where the points
+    leave out no more than `tolerance`: elsewhere the bound prefers what few points can describe.
+    """
+
+    name: ClassVar[str] = "inducing"
+    points: int = 500
+    tolerance: float = ENOUGH
+    refine: int = 20
+
+    def __post_init__(self) -> None:
+        _require(self.points >= 1, "Inducing points", self.points, "at least 1")
+        _require(self.tolerance >= 0.0, "Inducing tolerance", self.tolerance, "at least 0 (nats)")
+        _require(self.refine >= 0, "Inducing refine", self.refine, "at least 0 iterations")
+
+    @override
+    def required_bytes(self, size: ProblemSize) -> int:
+        weights = size.latents * self.points
+        return 8 * (3 * weights**2 + 20_000 * self.points + 12 * size.rows * size.latents * size.outputs)
+
+    @override
+    def condition(
+        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
+    ) -> LatentPosterior:
+        self.require_memory(ProblemSize.of(terms), terms.W.device)
+        return InducingPosterior.condition(kernels, *terms, points=self.points, tolerance=self.tolerance)
+
+
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing)}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An engine and why it was chosen, in one sentence."""
+
+    engine: Engine
+    reason: str
+
+
+def engine_of(given: Engine | str) -> Engine | None:
+    """The engine of that name, or itself; None for "auto". Raises InvalidInput for anything else."""
+    if isinstance(given, Engine):
+        return given
+    if given == "auto":
+        return None
+    if given not in ENGINES:
+        raise InvalidInput(unknown_name_message("engine", str(given), "forcegp", ("auto", *ENGINES)))
+    return ENGINES[given]()
+
+
+def engine_from_dict(stored: Mapping[str, Any] | None) -> Engine:
+    """The engine that `to_dict` stored; exact for None. Raises InvalidInput for anything else."""
+    if stored is None:
+        return Exact()
+    kind = ENGINES.get(str(stored.get("name")))
+    known = {field.name for field in fields(kind)} if kind is not None else set()  # type: ignore[arg-type]  # a dataclass
+    settings = {name: value for name, value in stored.items() if name != "name"}
+    if kind is None or not set(settings) <= known:
+        raise InvalidInput(f"stored engine {dict(stored)!r} is unknown; there are {', '.join(ENGINES)}")
+    return kind(**settings)
+
+
+def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = True) -> Choice:
+    """By number of rows, features and free memory; without `inducing`, another than inducing points.
+
+    Raises NotEnoughMemory where no engine fits.
+    """
+    exact, rows = Exact(), f"{size.rows} rows"
+    needed, free = exact.required_bytes(size), free_memory(device)
+    fits = needed <= USABLE * free
+    if size.rows <= MOST_EXACT_ROWS and fits:
+        return Choice(exact, f"exact: {rows} need {gib(needed)}")
+    if inducing and size.features <= FEW_FEATURES:
+        return Choice(Inducing(), f"inducing: {rows}, and the processes have {size.features} features at most")
+    if fits and size.rows * size.rank <= MOST_EXACT_ENTRIES:
+        return Choice(exact, f"exact: {rows} need {gib(needed)}, {gib(free)} are free")
+    iterative = Iterative()
+    iterative.require_memory(size, device)
+    return Choice(iterative, f"iterative: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")
+
+
+def _require(fine: bool, what: str, given: object, allowed: str) -> None:
+    if not fine:
+        raise InvalidInput(f"{what} is {given!r}; it must be {allowed}")

@@ -1,0 +1,47 @@
+"""How much memory there is, and the error that says what a computation would need."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import psutil
+import torch
+
+from forcegp.errors import NotEnoughMemory
+
+CGROUP = Path("/sys/fs/cgroup")
+"""Where Linux tells what a container may use (control groups, version 2)."""
+
+USABLE = 0.9
+"""Fraction of the free memory that a computation may plan with; the rest is for what else happens meanwhile."""
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes that are free on the device, within the limits of a container."""
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        return int(free)
+    return min(psutil.virtual_memory().available, _free_in_container())
+
+
+def require_memory(needed: int, what: str, remedy: str, device: torch.device) -> None:
+    """Raise NotEnoughMemory where `what` needs more bytes than are free: before anything is allocated."""
+    free = free_memory(device)
+    if needed > USABLE * free:
+        raise NotEnoughMemory(f"{what} needs {gib(needed)}, {gib(free)} are free: {remedy}")
+
+
+def gib(size: int) -> str:
+    """A number of bytes for people."""
+    return f"{size / 2**30:.1f} GiB" if size >= 2**30 / 10 else f"{size / 2**20:.0f} MiB"
+
+
+def _free_in_container() -> int:
+    """What the limit of the control group leaves; file caches, which are given back on demand, count as free."""
+    try:
+        limit = (CGROUP / "memory.max").read_text().strip()
+        used = int((CGROUP / "memory.current").read_text())
+        cached = dict(line.split() for line in (CGROUP / "memory.stat").read_text().splitlines())["inactive_file"]
+    except (OSError, ValueError, KeyError):
+        return 2**63
+    return 2**63 if limit == "max" else max(0, int(limit) - used + int(cached))

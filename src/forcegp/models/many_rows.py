@@ -1,0 +1,165 @@
+"""Learning from many rows: hyper-parameters from some of them, the posterior from all of them by an engine.
+
+`StructuredGP.fit` takes `learning_rows` (all, or those farthest apart) to the search; `on_all_rows` then lets the engine
+condition on all rows at the same hyper-parameters, with the features prepared as for the rows that they were found on.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.inference import (
+    Choice,
+    Engine,
+    Exact,
+    Inducing,
+    InducingPosterior,
+    LatentPosterior,
+    OptimizerOptions,
+    ProblemSize,
+    choose_engine,
+    minimize_objective,
+)
+from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.engines import MOST_EXACT_ROWS
+from forcegp.inference.memory import require_memory
+from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
+from forcegp.models.noise import ACCELERATION
+from forcegp.models.objective import FitObjective
+from forcegp.models.search import blas_threads
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_posterior import StructuredPosterior
+
+LEARNING_ROWS = 1000
+"""Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
+
+MOST_ITERATIVE_ROWS = 20_000
+"""Rows beyond which conjugate gradients take hours rather than minutes; approximate inducing points are kept then."""
+
+
+def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
+    """The rows that hyper-parameters are found on: all, or those that lie farthest apart.
+
+    `ordered`: the rows come in that order already. None means all rows up to 1500, and 1000 beyond.
+    Raises InvalidInput for a number out of range.
+    """
+    count = len(rows)
+    if learning_points is None:
+        learning_points = count if count <= MOST_EXACT_ROWS else LEARNING_ROWS
+    if learning_points < 2:
+        raise InvalidInput(f"learning_points is {learning_points}; hyper-parameters need at least 2 rows")
+    if learning_points >= count:
+        return rows
+    return rows.rows(slice(learning_points)) if ordered else farthest_rows(rows, learning_points)
+
+
+def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
+    """Raise NotEnoughMemory where the exact likelihood of these rows does not fit into memory."""
+    with torch.no_grad():
+        size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
+    remedy = "find hyper-parameters on fewer rows: learning_points=1000 (--learning-points 1000), or give fewer points"
+    what = f"the likelihood of N={size.rows} rows with its gradients"
+    require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
+
+
+def on_all_rows(
+    fitted: StructuredPosterior,
+    rows: Dataset,
+    engine: Engine | None,
+    described: Mapping[str, Any],
+    hyperprior: bool,
+    report: Iteration | None = None,
+) -> StructuredPosterior:
+    """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
+
+    `described` replaces what the settings say of the rows. Raises NotEnoughMemory, NumericalError.
+    """
+    reference = fitted.training
+    training = reference if len(rows) == len(reference.q) else _training(rows, reference)
+    likelihood = replace(fitted.likelihood, training=training)
+    fitted.model.system.check_states(training.q, training.v, training.u)
+    with torch.no_grad():
+        size = ProblemSize.of(likelihood.terms(fitted.parameters))
+    choice = (
+        choose_engine(size, training.q.device) if engine is None else Choice(engine, f"{engine.name}: as asked for")
+    )
+    settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
+    if isinstance(choice.engine, Exact) and training is reference:
+        return fitted.with_settings(**settings, engine=choice.engine.to_dict(), engine_reason=choice.reason)
+    with blas_threads(training.q.numel()):
+        latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine, report=report)
+        if engine is None and _leaves_too_much_out(latent, choice.engine):
+            choice, latent = _another(choice, latent, size, fitted, likelihood, report)
+        settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
+        posterior = replace(fitted, likelihood=likelihood, settings=settings)
+        vars(posterior)["latent"] = latent  # where the cached property looks first
+        return _refined(posterior, hyperprior, report)
+
+
+def _training(rows: Dataset, reference: TrainingData) -> TrainingData:
+    return replace(TrainingData.of(rows, reference.q.device), reference=reference)
+
+
+def _leaves_too_much_out(latent: LatentPosterior, engine: Engine) -> bool:
+    return isinstance(latent, InducingPosterior) and isinstance(engine, Inducing) and latent.left_out > engine.tolerance
+
+
+def _another(
+    choice: Choice,
+    latent: LatentPosterior,
+    size: ProblemSize,
+    fitted: StructuredPosterior,
+    likelihood: MarginalLikelihood,
+    report: Iteration | None,
+) -> tuple[Choice, LatentPosterior]:
+    """An engine without inducing points, where these leave too much out and there are not too many rows for it."""
+    assert isinstance(latent, InducingPosterior)
+    short = f"inducing points leave out {latent.left_out:.3g} nats"
+    if size.rows > MOST_ITERATIVE_ROWS:
+        warnings.warn(
+            f"{short} of {size.rows} rows, so that the posterior is an approximation; give Inducing more points, or "
+            "fewer rows to another engine",
+            NumericalWarning,
+            stacklevel=4,
+        )
+        return Choice(choice.engine, f"{choice.reason}; they leave out {latent.left_out:.3g} nats"), latent
+    other = choose_engine(size, likelihood.training.q.device, inducing=False)
+    other = Choice(other.engine, f"{other.reason}; {short}")
+    return other, likelihood.condition(fitted.kernels, fitted.parameters, other.engine, report=report)
+
+
+def _refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration | None) -> StructuredPosterior:
+    """Hyper-parameters improved on all rows, where inducing points describe them and nothing physical was learned."""
+    engine, latent = posterior.engine, posterior.latent
+    if not isinstance(engine, Inducing) or not isinstance(latent, InducingPosterior) or not engine.refine:
+        return posterior
+    if latent.left_out > engine.tolerance or posterior.identification is not None:
+        return posterior
+    noise = posterior.model.noise
+    assert noise is not None, "a fitted model has its noise"
+    held = {} if noise.learn else noise.parameters(posterior.model.system.robot.nv)
+    start = {name: value for name, value in posterior.parameters.items() if name not in held}
+    held = {name: posterior.parameters[name] for name in held}
+    objective = FitObjective(posterior.likelihood, posterior.kernels, noise, held, hyperprior, points=latent.features)
+    options = OptimizerOptions(iterations=engine.refine, tolerance=1e-6)
+    result = minimize_objective(objective, start, options, report)
+    parameters = {**posterior.parameters, **result.parameters}
+    better = posterior.likelihood.condition(posterior.kernels, parameters, engine)
+    note = f"{len(result.history) - 1} iterations on all rows: {result.history[0]:.1f} -> {result.value:.1f}"
+    settings = {**posterior.settings, "refined": note}
+    out = replace(
+        posterior,
+        parameters=parameters,
+        settings=settings,
+        result=replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds),
+    )
+    vars(out)["latent"] = better
+    return out

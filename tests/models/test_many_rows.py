@@ -1,0 +1,159 @@
+"""Engines behind `StructuredGP.fit`: choice, hyper-parameters from some of the rows, the posterior from all."""
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import arm_data
+
+from forcegp import JointFriction, StructuredGP, load_posterior, save_posterior
+from forcegp.errors import InvalidInput, NotEnoughMemory, NumericalError
+from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions
+from forcegp.inference import memory as memory_module
+
+QUICK = OptimizerOptions(iterations=5)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(60, seed=1)
+
+
+@pytest.fixture(scope="module")
+def states():
+    test = arm_data(8, seed=2)
+    return test.q, test.v, test.u
+
+
+def fit(data, engine="auto", prior=None, **how):
+    model = StructuredGP(data.system) if prior is None else StructuredGP(data.system, prior)
+    return model.fit(data, engine=engine, restarts=1, **{"options": QUICK, **how})
+
+
+@pytest.mark.parametrize(
+    "engine",
+    [Iterative(tolerance=1e-11, points=20, solve_covariance=True), Inducing(points=60, tolerance=0.0, refine=0)],
+    ids=["iterative", "inducing"],
+)
+def test_every_engine_predicts_what_the_exact_one_does(data, states, engine):
+    expected, given = fit(data, "exact").predict(*states), fit(data, engine).predict(*states)
+    torch.testing.assert_close(given.mean, expected.mean, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(given.covariance, expected.covariance, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(given.unknown_force.mean, expected.unknown_force.mean, rtol=1e-6, atol=1e-6)
+
+
+def test_parameters_come_from_some_rows_and_the_posterior_from_all(data, states):
+    some = fit(data, learning_points=30, points=60)
+    first = fit(data, points=30)
+    for name, value in first.parameters.items():
+        torch.testing.assert_close(some.parameters[name], value)
+    assert len(some.training.q) == 60
+    assert len(some.training.reference.q) == 30
+    assert some.settings["points"] == 60
+    assert some.settings["learning_points"] == 30
+    by_hand = first.update(data.rows([i for i in range(60) if i not in rows_of(first, data)]))
+    torch.testing.assert_close(some.predict(*states).mean, by_hand.predict(*states).mean, rtol=1e-7, atol=1e-8)
+
+
+def rows_of(posterior, data) -> set[int]:
+    q = posterior.training.q.numpy()
+    return {int(np.flatnonzero((data.q == row).all(1))[0]) for row in q}
+
+
+def test_the_engine_is_chosen_and_said(data):
+    assert fit(data).settings["engine_reason"].startswith("exact: 60 rows need")
+    assert fit(data, "iterative").engine == Iterative()
+
+
+def test_few_features_take_inducing_points(data, monkeypatch):
+    monkeypatch.setattr("forcegp.inference.engines.MOST_EXACT_ROWS", 50)
+    posterior = fit(data, prior=JointFriction(), learning_points=60)
+    assert posterior.engine == Inducing()
+    assert posterior.latent.left_out <= 1.0
+    assert "refined" in posterior.settings
+    exact = fit(
+        data, "exact", prior=JointFriction(), start=posterior.parameters, options=OptimizerOptions(iterations=0)
+    )
+    test = arm_data(8, seed=2)
+    expected, given = (p.predict(test.q, test.v, test.u).mean for p in (exact, posterior))
+    torch.testing.assert_close(given, expected, rtol=0.0, atol=2e-2)
+    assert posterior.negative_log_likelihood == pytest.approx(exact.negative_log_likelihood, abs=1.0)
+
+
+def test_refining_on_all_rows_lowers_the_objective(data):
+    prior = JointFriction()
+    rough = fit(data, Inducing(refine=0), prior=prior, learning_points=15, points=60)
+    refined = fit(data, Inducing(), prior=prior, learning_points=15, points=60)
+    assert refined.negative_log_likelihood < rough.negative_log_likelihood
+
+
+@pytest.mark.parametrize("engine", [Iterative(tolerance=1e-8, points=20), Inducing(points=30)], ids=["cg", "inducing"])
+def test_stored_and_loaded_it_predicts_the_same(data, states, engine, tmp_path):
+    posterior = fit(data, engine, learning_points=30)
+    save_posterior(posterior, tmp_path / "model")
+    loaded = load_posterior(tmp_path / "model")
+    assert loaded.engine == engine
+    torch.testing.assert_close(loaded.predict(*states).mean, posterior.predict(*states).mean, rtol=1e-6, atol=1e-6)
+    if isinstance(engine, Iterative):
+        assert loaded.latent.solved.iterations == 0
+
+
+def test_too_little_memory_is_said_before_anything_is_allocated(data, monkeypatch):
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
+    with pytest.raises(NotEnoughMemory, match=r"N=60 rows.* needs .* MiB, 0 MiB are free: .*learning_points"):
+        fit(data)
+
+
+def test_an_engine_that_does_not_fit_names_the_others(data, monkeypatch):
+    posterior = fit(data, points=30)
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
+    with pytest.raises(NotEnoughMemory, match="use engine='iterative'"):
+        Exact().condition(posterior.kernels, posterior.likelihood.terms(posterior.parameters))
+
+
+def test_a_missed_tolerance_is_an_error(data):
+    with pytest.raises(NumericalError, match="conjugate gradients reached"):
+        fit(data, Iterative(tolerance=1e-12, iterations=2, points=2))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("fast", "no engine 'fast'"), ("Exact", "no engine 'Exact'")],
+)
+def test_unknown_engines(data, given, message):
+    with pytest.raises(InvalidInput, match=message):
+        fit(data, given)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Iterative(points=0),
+        lambda: Iterative(tolerance=2.0),
+        lambda: Inducing(points=0),
+        lambda: Inducing(refine=-1),
+    ],
+)
+def test_settings_are_checked(make):
+    with pytest.raises(InvalidInput, match="must be"):
+        make()
+
+
+def test_learning_points_are_checked(data):
+    with pytest.raises(InvalidInput, match="learning_points is 1"):
+        fit(data, learning_points=1)
+
+
+def test_leaving_rows_out_needs_the_exact_engine(data):
+    with pytest.raises(InvalidInput, match="engine='exact'"):
+        fit(data, "iterative").leave_out()
+
+
+def test_functions_are_drawn_and_curves_read_from_every_engine(data, states):
+    q, v, u = (torch.tensor(x) for x in states)
+    for engine in (Inducing(), Iterative()):
+        posterior = fit(data, engine, prior=JointFriction())
+        sampled = posterior.accelerations(None).sampled(3, 0)(*(x[None].expand(3, -1, -1) for x in (q, v, u)))
+        assert sampled.shape == (3, 8, 3)
+        assert bool(torch.isfinite(sampled).all())
+        curve = posterior.curve(posterior.latent_names[0], points=5)
+        assert bool((curve.std > 0).all())
