@@ -99,7 +99,7 @@ class IndependentGP(Model):
         training = TrainingData.of(rows, self.system.robot.device)
         likelihood = IndependentLikelihood(self.inputs, training)
         kernels = likelihood.kernels()
-        noise_parameters = noise.parameters(self.system.robot.nv)
+        noise_parameters = noise.parameters(self.system.robot.nv, self.system.robot.device)
         fixed = {} if noise.learn else noise_parameters
         moments = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
         options = options or OptimizerOptions()
@@ -185,7 +185,8 @@ class _JointObjective:
             return value
         value = value - self.kernels.log_prior(parameters)
         if ACCELERATION in parameters:
-            given = self.noise.parameters(self.likelihood.training.a.shape[-1])[ACCELERATION][self.joint]
+            a = self.likelihood.training.a
+            given = self.noise.parameters(a.shape[-1], a.device)[ACCELERATION][self.joint]
             value = value - Noise(float(given.exp())).log_prior(parameters, 1)
         return value
 

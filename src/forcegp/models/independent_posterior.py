@@ -77,7 +77,8 @@ class IndependentLikelihood:
             raise InvalidInput("all accelerations are zero, so there is nothing to learn; check that a was measured.")
         dimension = self._training_features.shape[-1]
         floored = variances.clamp_min(RESIDUAL_FLOOR * largest)
-        return LatentKernels(kernels_of("squared-exponential", (dimension,) * len(variances), floored))
+        kernels = kernels_of("squared-exponential", (dimension,) * len(variances), floored)
+        return LatentKernels(kernels).to(floored.device)
 
     def __call__(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood of one joint, at parameters named as by `joint_part`."""

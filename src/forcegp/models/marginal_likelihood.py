@@ -198,7 +198,7 @@ class MarginalLikelihood:
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         dimensions = tuple(z.shape[-1] for z in features)
-        return LatentKernels(self.prior.kernels(self.system.robot, dimensions, variances))
+        return LatentKernels(self.prior.kernels(self.system.robot, dimensions, variances)).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood, exact and differentiable in every parameter.

@@ -61,7 +61,8 @@ def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, T
             shifted[name] = value
             continue
         shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)
-        shifted[name] = value + shift + RESTART_SPREAD * torch.as_tensor(generator.standard_normal(tuple(value.shape)))
+        factors = torch.as_tensor(generator.standard_normal(tuple(value.shape)), device=value.device)
+        shifted[name] = value + shift + RESTART_SPREAD * factors
     return shifted
 
 

@@ -217,7 +217,7 @@ class StructuredGP(Model):
         check_distance(self.system, training)
         check_prior(likelihood)
         require_memory_to_learn(likelihood)
-        noise_parameters = noise.parameters(self.system.robot.nv)
+        noise_parameters = noise.parameters(self.system.robot.nv, self.system.robot.device)
         learned_noise, fixed = (noise_parameters, {}) if noise.learn else ({}, noise_parameters)
         begin = None if learn is None else PhysicalStart.of(learn, likelihood, noise_parameters, prior_strength)
         kernels = likelihood.kernels() if begin is None else begin.kernels
