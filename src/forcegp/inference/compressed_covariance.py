@@ -5,8 +5,8 @@ whitened data with f(z) and L L^T = T theirs. With orthonormal columns B (n, R),
 
     k(z, z) - (B^T V)^T (B^T V)
 
-is the covariance given only the R numbers (L^-T B)^T t of the data t: that of a Gaussian process which has seen less. So
-it is never below the exact one (the difference V^T (I - B B^T) V is positive semidefinite) and needs R instead of n
+is the covariance given only the R numbers (L^-T B)^T t of the data t: that of a Gaussian process which has seen less.
+So it is never below the exact one (the difference V^T (I - B B^T) V is positive semidefinite) and needs R instead of n
 numbers per latent and centre. B holds the leading left singular vectors of V at sample states, each weighted by what
 it does to the standard deviations there.
 """
@@ -29,7 +29,7 @@ ROUNDING = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """States at which covariances are compared: features of all latents and y = W f (n, k, C), the quantity of interest."""
+    """States at which covariances are compared: features of all latents, and W (n, k, C) of what matters, y = W f."""
 
     features: Sequence[Float[Tensor, "n _"]]
     W: Float[Tensor, "n k C"]
@@ -37,29 +37,36 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class CompressedCovariance:
-    """Cov(f(z)) = k(z, z) - P P^T with P_c = k_c(z, Z) factors_c (n, R).
+    """Cov(f(z)) = k(z, z) - P P^T with P_c = k_c(z, Z) F_c, F_c (N, R); `factors` has those of groups of latents.
 
     `inflation` holds the standard deviations of y over the exact ones, minus 1, at states that did not choose B.
     """
 
-    factors: Float[Tensor, "C N R"]
+    factors: tuple[Float[Tensor, "G N R"], ...]
     inflation: Float[Tensor, " _"]
 
     @property
     def rank(self) -> int:
         """R: how many combinations of the data are used."""
-        return self.factors.shape[-1]
+        return self.factors[0].shape[-1]
 
-    def explained_root(self, cross: Float[Tensor, "n C N"]) -> Float[Tensor, "n C R"]:
-        """P for what the kernels say."""
-        return torch.bmm(cross.transpose(0, 1), self.factors).transpose(0, 1)
+    def roots(self, cross: Sequence[Float[Tensor, "n G N"]]) -> list[Float[Tensor, "n G R"]]:
+        """P from the kernel functions of every group."""
+        return [torch.bmm(k.transpose(0, 1), F).transpose(0, 1) for k, F in zip(cross, self.factors, strict=True)]
 
 
 def compress(
-    latent: ExactPosterior, sample: Sample, check: Sample, *, tolerance: float, largest: int
+    latent: ExactPosterior,
+    groups: Sequence[Sequence[int]],
+    sample: Sample,
+    check: Sample,
+    *,
+    tolerance: float,
+    largest: int,
 ) -> CompressedCovariance:
-    """The smallest rank at which no standard deviation at the states of `check` is more than 1 + `tolerance` times too
-    large; `largest` where that needs more.
+    """The smallest rank at which standard deviations at the states of `check` are at most 1 + `tolerance` too large.
+
+    It is `largest` where more would be needed. B is chosen at the states of `sample`.
     """
     with torch.no_grad():
         D, _ = _directions(latent, sample)
@@ -68,15 +75,14 @@ def compress(
         B, _ = torch.linalg.qr(columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300))
         at, total = _directions(latent, check)
         seen = (B.mT @ at).square_().cumsum_(0)
-        # in units of the exact variance; the exact one is 1 where nothing is missing
-        excess = (total - seen).clamp_min_(0.0).amax(1)
-        enough = torch.nonzero((1.0 + excess).sqrt() - 1.0 <= tolerance)
+        excess = (total - seen).clamp_min_(0.0)  # in units of the exact variance
+        enough = torch.nonzero((1.0 + excess.amax(1)).sqrt() - 1.0 <= tolerance)
         rank = int(enough[0]) + 1 if len(enough) else len(seen)
-        inflation = (1.0 + (total - seen[rank - 1]).clamp_min_(0.0)).sqrt() - 1.0
-        S = latent.system.factor.solve_lower_transposed(B[:, :rank].contiguous())
+        S = latent.system.factor.solve_upper(B[:, :rank].contiguous())
         C = latent.system.deflation.C
         factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], rank))
-    return CompressedCovariance(factors.contiguous(), inflation)
+        chosen = tuple(factors[list(group)].contiguous() for group in groups)
+    return CompressedCovariance(chosen, (1.0 + excess[rank - 1]).sqrt() - 1.0)
 
 
 def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "n _"], Float[Tensor, " _"]]:

@@ -4,8 +4,7 @@ Scaled squared exponentials of latents that share their centres are one matrix p
 
     log k_c(z, z_j) = log s_c - 1/2 |z / l_c|^2 + (z / l_c^2) . z_j - 1/2 |z_j / l_c|^2
 
-is linear in z_j and in what depends on j alone, so the centres are read once for all latents. Every other kernel is
-evaluated by itself.
+is one matrix product with the centres for all of them. Every other kernel is evaluated by itself.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.inference.compiled_kernels import CompiledSums
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
 from forcegp.inference.kernels import kernel_cross, kernel_diagonal
 from forcegp.inference.posterior import LatentPosterior
@@ -25,39 +25,44 @@ from forcegp.inference.posterior import LatentPosterior
 
 @dataclass(frozen=True, eq=False)
 class SharedCenters:
-    """Squared exponentials of latents with the same centres (N, d)."""
+    """Squared exponentials of latents with the same centres (N, d), which are given about their mean `shift`."""
 
     latents: tuple[int, ...]
     shift: Float[Tensor, " d"]
+    centers: Float[Tensor, "N d"]
     precisions: Float[Tensor, "G d"]  # 1 / l^2
     variances: Float[Tensor, " G"]
-    table: Float[Tensor, "width N"]
+    own: Float[Tensor, "G N"]  # log s - 1/2 |z_j / l|^2
 
     @classmethod
     def of(
         cls, latents: tuple[int, ...], centers: Float[Tensor, "N d"], scales: Sequence[tuple[Tensor, Tensor]]
     ) -> SharedCenters:
         """`scales` are the length scales and the variance of every latent."""
-        width = centers.shape[-1]
-        precisions = torch.stack([length.detach().expand(width) ** -2 for length, _ in scales])
+        precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])
         variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])
         shift = centers.mean(0)
-        z = centers - shift  # or what cancels would be large
-        own = variances.log()[:, None] - 0.5 * precisions @ z.square().mT
-        return cls(latents, shift, precisions, variances, torch.cat([z.mT, own, torch.ones_like(own[:1])]))
+        centers = centers - shift  # or what cancels would be large
+        return cls(
+            latents,
+            shift,
+            centers,
+            precisions,
+            variances,
+            variances.log()[:, None] - 0.5 * precisions @ centers.square().mT,
+        )
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n _"]:
-        """Left factors of the matrix product, (n, G (d + G + 1)) flattened."""
-        z = features[self.latents[0]] - self.shift
-        scaled = z[:, None] * self.precisions
-        chosen = torch.eye(len(self.latents), dtype=z.dtype, device=z.device).expand(len(z), -1, -1)
-        own = -0.5 * (scaled * z[:, None]).sum(-1, keepdim=True)
-        return torch.cat([scaled, chosen, own], dim=-1).flatten(1)
+        """z / l^2 and -1/2 |z / l|^2 of all latents, (n, G (d + 1)) flattened."""
+        z = (features[self.latents[0]] - self.shift)[:, None]
+        scaled = z * self.precisions
+        return torch.cat([scaled, -0.5 * (scaled * z).sum(-1, keepdim=True)], dim=-1).flatten(1)
 
     def cross(self, inputs: Float[Tensor, "n _"]) -> Float[Tensor, "n G N"]:
         """k_c(z_i, z_j)."""
-        rows = inputs.reshape(-1, len(self.table)) @ self.table
-        return rows.exp_().view(len(inputs), len(self.latents), -1)
+        rows = inputs.view(len(inputs), len(self.latents), -1)
+        products = (rows[..., :-1].flatten(0, 1) @ self.centers.mT).view(*rows.shape[:2], -1)
+        return (products + self.own + rows[..., -1:]).exp_()
 
     def diagonal(self, inputs: Float[Tensor, "n _"]) -> Float[Tensor, "n G"]:
         """k_c(z_i, z_i)."""
@@ -89,41 +94,68 @@ KernelGroup = SharedCenters | AnyKernel
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedMean:
-    """The posterior mean of all latents from `inputs`, one tensor per group; `weights` are (G, N, 1)."""
+class PreparedKernels:
+    """The kernels of all latents by what they share, and the weights of the posterior mean."""
 
     groups: tuple[KernelGroup, ...]
-    weights: tuple[Float[Tensor, "G N 1"], ...]
+    weights: tuple[Float[Tensor, "G N"], ...]
     order: Tensor | None
+    compiled: tuple[CompiledSums | None, ...]
 
     @classmethod
-    def of(cls, latent: LatentPosterior) -> PreparedMean:
-        """Prepared once for a posterior."""
+    def of(cls, latent: LatentPosterior, compile: bool) -> PreparedKernels:
+        """Prepared once for a posterior. With `compile`, raises CompilerError without a C++ compiler."""
         groups = kernel_groups(latent)
-        weights = tuple(torch.stack([latent.weights[c].detach() for c in g.latents])[..., None] for g in groups)
+        weights = tuple(torch.stack([latent.weights[c].detach() for c in group.latents]) for group in groups)
         order = [c for group in groups for c in group.latents]
-        back = torch.tensor(order, dtype=torch.long).argsort()
-        return cls(groups, weights, None if order == sorted(order) else back.to(latent.features[0].device))
+        back = None if order == sorted(order) else torch.tensor(order).argsort().to(weights[0].device)
+        compiled = tuple(
+            CompiledSums(group, w) if compile and isinstance(group, SharedCenters) else None
+            for group, w in zip(groups, weights, strict=True)
+        )
+        return cls(groups, weights, back, compiled)
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "n _"]]:
         """What the kernels need of the features of all latents, group by group."""
         return [group.inputs(features) for group in self.groups]
 
-    def cross(self, inputs: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "n G N"]]:
-        """Kernel functions about the centres."""
-        return [group.cross(x) for group, x in zip(self.groups, inputs, strict=True)]
+    def mean(
+        self, inputs: Sequence[Float[Tensor, "n _"]], keep: bool = False
+    ) -> tuple[Float[Tensor, "n C"], list[Float[Tensor, "n G N"]]]:
+        """E f_c, and with `keep` the kernel functions of every group about its centres."""
+        found = [self._group_mean(number, x, keep) for number, x in enumerate(inputs)]
+        return self.ordered([f for f, _ in found]), [cross for _, cross in found if cross is not None]
 
-    def mean(self, cross: Sequence[Float[Tensor, "n G N"]]) -> Float[Tensor, "n C"]:
-        """E f_c from what `cross` returned."""
-        parts = [torch.bmm(k.transpose(0, 1), w)[..., 0].mT for k, w in zip(cross, self.weights, strict=True)]
-        return self._ordered(parts)
+    def _group_mean(self, number: int, inputs: Tensor, keep: bool) -> tuple[Tensor, Tensor | None]:
+        compiled = self.compiled[number]
+        if compiled is not None and not (torch.is_grad_enabled() and inputs.requires_grad):
+            return compiled(inputs, keep)
+        cross = self.groups[number].cross(inputs)
+        return (cross * self.weights[number]).sum(-1), cross
+
+    def mean_and_slopes(
+        self, inputs: Sequence[Float[Tensor, "n _"]], slopes: Sequence[Float[Tensor, "n _ x"]]
+    ) -> tuple[Float[Tensor, "n C"], Float[Tensor, "n C x"]]:
+        """E f_c and its derivatives in whatever the inputs have the derivatives `slopes` in."""
+        with torch.enable_grad():
+            leaves = [x.detach().requires_grad_() for x in inputs]
+            f, _ = self.mean(leaves)
+            total = f.sum() + sum(leaf.sum() for leaf in leaves) * 0.0  # constant kernels use no inputs
+            gradients = torch.autograd.grad(total, leaves)
+        # latents have no inputs in common, so the gradient of their sum has all of theirs side by side
+        parts = [
+            (gradient[..., None] * slope).reshape(len(f), len(group.latents), -1, slope.shape[-1]).sum(2)
+            for group, gradient, slope in zip(self.groups, gradients, slopes, strict=True)
+        ]
+        return f.detach(), self.ordered(parts)
 
     def diagonal(self, inputs: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
         """Prior variances."""
-        return self._ordered([group.diagonal(x) for group, x in zip(self.groups, inputs, strict=True)])
+        return self.ordered([group.diagonal(x) for group, x in zip(self.groups, inputs, strict=True)])
 
-    def _ordered(self, parts: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
-        joined = parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=-1)
+    def ordered(self, parts: Sequence[Float[Tensor, "n _ ..."]]) -> Float[Tensor, "n C ..."]:
+        """Values of all latents in the order of the posterior, from those of every group."""
+        joined = parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=1)
         return joined if self.order is None else joined[:, self.order]
 
 

@@ -1,0 +1,111 @@
+"""What a predictor needs of a state before Gaussian processes come in, by torch or from a tape."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.models.marginal_likelihood import inertials_of
+from forcegp.models.tape_machine import TapeMachine
+from forcegp.models.tape_tracing import trace
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_posterior import StructuredPosterior
+
+TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
+"""States (n, nv) -> the entries of `Terms` as one list."""
+
+
+class Terms(NamedTuple):
+    """At n states: a = offset + W f, (n, nv) and (n, nv, C); what the kernels need; the prepared features.
+
+    Their derivatives in [q, v, u] have one dimension (3 nv) more.
+    """
+
+    offset: Tensor
+    W: Tensor
+    inputs: list[Tensor]
+    features: list[Tensor]
+
+    @classmethod
+    def of(cls, parts: Sequence[Tensor], groups: int) -> Terms:
+        """From one list."""
+        return cls(parts[0], parts[1], list(parts[2 : 2 + groups]), list(parts[2 + groups :]))
+
+
+def terms_function(posterior: StructuredPosterior, prepared: PreparedKernels) -> TermsFunction:
+    """The terms as a function of the state, differentiable, by the same code as `posterior.predict`."""
+    system, prior, known = posterior.system, posterior.model.prior, posterior.model.mean == "analytical"
+    inertials = {name: value.detach() for name, value in inertials_of(posterior.parameters).items()} or None
+    standardize = posterior.likelihood.standardization
+
+    def terms(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+        dynamics = system.dynamics(q, v, u, inertials)
+        affine, features = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
+        return [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(features), *features]
+
+    return terms
+
+
+class EagerTerms:
+    """The terms as torch computes them, operation by operation, on any device."""
+
+    def __init__(self, function: TermsFunction, nv: int, groups: int) -> None:
+        self.function, self.nv, self.groups = function, nv, groups
+
+    def __call__(self, x: Tensor) -> Terms:
+        """At rows [q, v, u]."""
+        return Terms.of(self.function(*x.split(self.nv, dim=-1)), self.groups)
+
+    def with_jacobians(self, x: Tensor) -> tuple[Terms, Terms]:
+        """The terms and their derivatives."""
+
+        def one(row: Tensor) -> list[Tensor]:
+            return [part[0] for part in self.function(*row[None].split(self.nv, dim=-1))]
+
+        slopes = torch.func.vmap(torch.func.jacrev(one))(x)
+        return self(x), Terms.of(slopes, self.groups)
+
+
+class TapedTerms:
+    """The same terms from a tape, on the CPU.
+
+    Raises InvalidInput for a system on another device and for operations that a tape cannot hold, CompilerError
+    without a C++ compiler.
+    """
+
+    def __init__(self, function: TermsFunction, examples: Sequence[Tensor], groups: int) -> None:
+        if examples[0].device.type != "cpu":
+            raise InvalidInput(
+                f"a compiled predictor runs on the CPU, and the model is on {examples[0].device}; give compile=False, "
+                "or a model on the CPU."
+            )
+        self.groups = groups
+        program, shapes = trace(function, examples)
+        self.machine = TapeMachine(program)
+        self.shapes = [shape[1:] for shape in shapes]
+        self.sizes = [shape.numel() for shape in self.shapes]
+
+    def __call__(self, x: Tensor) -> Terms:
+        """At rows [q, v, u]."""
+        return self._split(self.machine(x), ())
+
+    def with_jacobians(self, x: Tensor) -> tuple[Terms, Terms]:
+        """The terms and their derivatives."""
+        values, slopes = self.machine.with_jacobian(x)
+        return self._split(values, ()), self._split(slopes, x.shape[1:])
+
+    def _split(self, joined: Tensor, trailing: Sequence[int]) -> Terms:
+        parts = joined.split(self.sizes, dim=1)
+        return Terms.of(
+            [
+                part if len(shape) == 1 else part.reshape(len(joined), *shape, *trailing)
+                for part, shape in zip(parts, self.shapes, strict=True)
+            ],
+            self.groups,
+        )
