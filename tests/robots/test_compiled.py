@@ -143,11 +143,11 @@ def test_every_number_of_states(robot, compiled, count):
     torch.testing.assert_close(ours, theirs)
 
 
-@pytest.mark.parametrize("lanes", [2, 8])
-def test_other_widths_of_vector_registers(robot, tmp_path, lanes):
-    """What is written for other processors runs here, too, only slower."""
+@pytest.mark.parametrize(("lanes", "statements"), [(2, 500), (8, 500), (4, 40), (4, 10**6)])
+def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
+    """What is written for other processors runs here, too, only slower; parts of any length do the same."""
     request = Request("forward_dynamics", free_inertias=True, states=True, inertias=True)
-    source = write_c(trace(UnrolledRobot(robot), request), request.inputs, lanes)
+    source = write_c(trace(UnrolledRobot(robot), request), request.inputs, lanes, statements)
     compile_c(source, (), tmp_path / "program.so")
     q, v, tau, weights = random(4, 13, 3)
     inertias = robot.tree.inertias[..., 0][:, *zip(*INERTIA_ENTRIES, strict=True)].reshape(1, -1)

@@ -83,14 +83,15 @@ class Program:
     positive: Vector
 
     @property
+    def needed(self) -> list[int]:
+        """Nodes of the graph that this program computes, operands first."""
+        return self.graph.needed([scalar for vector in self.outputs.values() for scalar in vector] + self.positive)
+
+    @property
     def operations(self) -> int:
         """Number of arithmetic operations."""
         nodes = self.graph.nodes
-        return sum(nodes[index].operation in ("+", "-", "*", "/", "negate", "sqrt") for index in self._needed)
-
-    @property
-    def _needed(self) -> list[int]:
-        return self.graph.needed([scalar for vector in self.outputs.values() for scalar in vector] + self.positive)
+        return sum(nodes[index].operation in ("+", "-", "*", "/", "negate", "sqrt") for index in self.needed)
 
 
 def trace(unrolled: UnrolledRobot, request: Request) -> Program:
