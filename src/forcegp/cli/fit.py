@@ -90,6 +90,8 @@ class Fit(FitOptions):
         arg(metavar="N", constructor=int, help_behavior_hint=ITERATIONS_HINT),
     ] = None
     """Most L-BFGS iterations of each start, or training steps of a network."""
+    device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
+    """Where to compute; see docs/gpu.md. The folder that is written can be used on any machine."""
     json: Json = False
     debug: Debug = False
 
@@ -101,12 +103,14 @@ class Fit(FitOptions):
         command = resolved(self)
         assert command.points is not None, "a resolved command has points"
         from forcegp.data import Dataset
+        from forcegp.robots.devices import usable_device
 
+        usable_device(self.device)
         start = time.monotonic()
         dataset = Dataset.load(self.data)
         system = self._system(dataset)
         dataset, rows_note = self._rows(dataset, system)
-        model = make_model(command, system, dataset)
+        model = make_model(command, system.to(self.device), dataset)
         points = min(command.points, len(dataset))
         posterior = fit(terminal, model, dataset, points=points, **search_arguments(command))
         summary = fit_summary(posterior, time.monotonic() - start)

@@ -62,7 +62,7 @@ class KernelTerm:
 
     def columns(self, z: Float[Tensor, "n d"]) -> Float[Tensor, "n p"]:
         """sqrt(s) phi(z): all products of one entry of every factor's phi."""
-        columns = self.scale.sqrt().expand(len(z), 1)
+        columns = self.scale.to(z.device).sqrt().expand(len(z), 1)
         for feature in self.features:
             columns = (columns[:, :, None] * feature(z)[:, None, :]).flatten(1)
         return columns

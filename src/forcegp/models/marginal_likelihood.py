@@ -61,6 +61,12 @@ class TrainingData:
         states = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
         return cls(*states, noise_std=noise_std)
 
+    def to(self, device: torch.device) -> TrainingData:
+        """The same rows on another device."""
+        states = (getattr(self, name).to(device) for name in ("q", "v", "u", "a"))
+        noise_std = None if self.noise_std is None else self.noise_std.to(device)
+        return TrainingData(*states, noise_std, None if self.reference is None else self.reference.to(device))
+
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:
         """The noise of every row over its root mean square, joint by joint; None where all rows are equally noisy.

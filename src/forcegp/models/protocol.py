@@ -20,6 +20,7 @@ from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
 from forcegp.models.marginal_likelihood import TrainingData
+from forcegp.models.moving import moved
 from forcegp.models.prediction import Prediction, join_predictions
 from forcegp.models.predictor import CovarianceKind, Predictor
 from forcegp.models.rollout import Rollout, roll_out
@@ -252,6 +253,13 @@ class Posterior(ABC):
             f"a {self.description} learned the accelerations of one system, contacts included, so it cannot move to "
             "another; fit it to data from there, or use a structured model, which learns forces."
         )
+
+    def to(self: AnyPosterior, device: torch.device | str) -> AnyPosterior:
+        """The same knowledge on another device, for instance "cuda": conditioned there on the same rows.
+
+        Raises InvalidInput for a device that is not there. An `identification` stays where it was.
+        """
+        return moved(self, device)  # type: ignore[return-value]  # of the same class, for its model made it
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""
