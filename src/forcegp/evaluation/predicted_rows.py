@@ -83,10 +83,11 @@ def predict_rows(
 
 
 def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> PredictedRows:
-    q, v, u = (torch.tensor(values[block]) for values in (dataset.q, dataset.v, dataset.u))
+    device = posterior.system.robot.device
+    q, v, u = (torch.tensor(values[block], device=device) for values in (dataset.q, dataset.v, dataset.u))
     prediction = posterior.predict(q, v, u)
     dynamics = posterior.dynamics(q, v, u)
-    own = dynamics if dataset.system is None else dataset.system.dynamics(q, v, u)
+    own = dynamics if dataset.system is None else dataset.system.to(device).dynamics(q, v, u)
     covariance = _array(_not_none(prediction.covariance))
     measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
     mean, mass = _array(prediction.mean), _array(dynamics.M)

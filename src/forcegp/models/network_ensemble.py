@@ -144,7 +144,7 @@ class _Training:
         self.weights = {name: value.to(self.x).requires_grad_() for name, value in weights.items()}
         train, held_out = held_out_rows(rows, model.members, model.held_out, seed)
         self.batches = Batches(train, model.batch, generator)
-        self.held_out = torch.stack(held_out)
+        self.held_out = torch.stack(held_out).to(self.x.device)
         self.best = {name: value.detach().clone() for name, value in self.weights.items()}
         self.best_loss = torch.full((model.members,), torch.inf, dtype=torch.float64)
         self.best_step = torch.zeros(model.members, dtype=torch.int64)
@@ -162,7 +162,7 @@ class _Training:
         while self.step < steps:
             self.step += 1
             optimizer.zero_grad()
-            self._loss(self.batches.draw(), self.model.beta).sum().backward()
+            self._loss(self.batches.draw().to(self.x.device), self.model.beta).sum().backward()
             optimizer.step()
             schedule.step()
             if self.step % every == 0 or self.step == steps:
@@ -194,4 +194,5 @@ class _Training:
 
     def _keep(self, weights: Mapping[str, Tensor], members: Tensor) -> None:
         for name, value in weights.items():
-            self.best[name][members] = value.detach()[members]
+            here = members.to(value.device)
+            self.best[name][here] = value.detach()[here]

@@ -107,7 +107,7 @@ class NeuralNetwork(NetworkModel):
         every = max(1, self.steps // REPORTS)
         history, losses = [], torch.zeros((), dtype=torch.float64)
         for step in range(1, self.steps + 1):
-            (chosen,) = batches.draw()
+            chosen = batches.draw()[0].to(x.device)
             loss = (layer(weights, x[chosen][None])[0] - a[chosen]).square().mean()
             optimizer.zero_grad()
             loss.backward()
