@@ -73,7 +73,9 @@ def test_published_values_stand_beside_ours(reproduced):
     [
         (("fig9",), "no figure 'fig9'"),
         (("fig2b", "--preset", "huge"), "no preset 'huge'"),
-        (("fig2b", "--jobs", -1), "--jobs is -1"),
+        (("fig2b", "--jobs", -1), "jobs is -1; give the number of tasks at once, at least 1"),
+        (("fig2b", "--backend", "dask"), "no backend 'dask'; choose serial, joblib, ray"),
+        (("fig2b", "--address", "10.0.0.1:6379"), "add --backend ray"),
         (("fig2b", "--points", 500, "--out", "new"), "its data have 400 rows, so give 2 to 400"),
         (("fig2b", "--points", 1, "--out", "new"), "asked for 1 training points"),
         (("fig2b", "--seeds", -3, "--out", "new"), "--seeds"),

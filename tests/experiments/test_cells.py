@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.errors import FileFormatError, FitError
+from forcegp.errors import BackendError, FileFormatError, FitError, WorkerWarning
 from forcegp.experiments.cells import Cell, digests, run_cells
 from forcegp.experiments.results import Results
+from forcegp.parallel import Joblib, Serial
 
 TOY = "tests.experiments.toy_tasks"
 
@@ -33,7 +34,7 @@ def results(tmp_path):
 def test_all_cells_are_computed_once_and_in_order(results):
     cells = [next_to(square(3)), square(3), square(4)]
     told = []
-    assert run_cells(results, cells, jobs=2, progress=lambda *given: told.append(given)) == 3
+    assert run_cells(results, cells, backend=Joblib(2), progress=lambda *given: told.append(given)) == 3
     assert results.result("next/3")["value"] == 10
     assert results.result("square/4")["value"] == 16
     assert (results.cell_folder("square/4") / "note.txt").read_text() == "beside the result"
@@ -41,7 +42,7 @@ def test_all_cells_are_computed_once_and_in_order(results):
     assert [done for done, *_ in told] == sorted(done for done, *_ in told)
     assert told[-1][0] == told[-1][1]
     before = results.load("square/3")
-    assert run_cells(results, [*cells, square(5)], jobs=1) == 1
+    assert run_cells(results, [*cells, square(5)]) == 1
     assert results.load("square/3") == before
 
 
@@ -49,7 +50,7 @@ def test_a_failure_stops_only_what_needs_it(results):
     bad = Cell("bad", f"{TOY}:fail", {})
     cells = [bad, next_to(bad), next_to(next_to(bad)), square(2)]
     with pytest.raises(FitError, match=r"bad failed.*no luck.*1 of \d cells are kept"):
-        run_cells(results, cells, jobs=1)
+        run_cells(results, cells)
     assert results.result("square/2")["value"] == 4
     assert not results.cell_folder("bad").exists()
 
@@ -57,15 +58,30 @@ def test_a_failure_stops_only_what_needs_it(results):
 @pytest.mark.parametrize(("task", "cause"), [("break_down", "ZeroDivisionError"), ("not_a_number", "ValueError")])
 def test_a_defect_in_one_cell_does_not_cost_the_others(results, task, cause):
     with pytest.raises(FitError, match=rf"bad failed \({cause}: .*1 of 2 cells are kept"):
-        run_cells(results, [Cell("bad", f"{TOY}:{task}", {}), square(2)], jobs=2)
+        run_cells(results, [Cell("bad", f"{TOY}:{task}", {}), square(2)], backend=Joblib(2))
     assert results.result("square/2")["value"] == 4
     assert not results.cell_folder("bad").exists()
 
 
-def test_a_process_that_dies_is_reported_and_what_was_done_is_kept(results):
-    with pytest.raises(FitError, match="a process died while"):
+@pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
+def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(results):
+    with pytest.raises(BackendError, match=r"died 4 times while task dead .*1 of 2 cells are kept"):
         run_cells(results, [square(2), Cell("dead", f"{TOY}:die", {}, ("square/2",))])
     assert results.result("square/2")["value"] == 4
+
+
+def test_a_process_that_is_killed_is_replaced(results, tmp_path):
+    cell = Cell("killed", f"{TOY}:die_once", {"marker": str(tmp_path / "marker")})
+    with pytest.warns(WorkerWarning, match="a process died while task killed was at work"):
+        assert run_cells(results, [cell, square(2)]) == 2
+    assert results.result("killed") == {"survived": True}
+    assert not list((tmp_path / "out").glob("**/*.tmp"))
+
+
+def test_this_process_can_do_it_all(results):
+    assert run_cells(results, [next_to(square(3)), square(3)], Serial()) == 2
+    assert results.result("next/3")["value"] == 10
+    assert results.result("square/3")["process"] == os.getpid()
 
 
 def test_other_settings_of_what_a_cell_is_made_from_are_seen(results):

@@ -8,11 +8,18 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
+from tests.experiments.test_cells import TOY, next_to, square
+from tests.models.arm import arm_data
 from tests.parallel import tasks
 from tests.parallel.conformance import WorkersConformance
 
-from forcegp.errors import BackendError
-from forcegp.parallel import Ray
+from forcegp.errors import BackendError, FitError
+from forcegp.experiments.cells import Cell, run_cells
+from forcegp.experiments.results import Results
+from forcegp.inference import OptimizerOptions
+from forcegp.models import IndependentGP, StructuredGP
+from forcegp.parallel import Joblib, Ray, Serial
 from forcegp.parallel import cluster as cluster_module
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -44,6 +51,51 @@ class TestRay(WorkersConformance):
             list(Ray(dead_address).map(tasks.slow_first, [0]))
 
 
+@pytest.mark.parametrize("model", [StructuredGP, IndependentGP])
+def test_a_fit_is_the_same_on_every_backend(cluster, model):
+    """To the last bit: every worker computes on one thread, as the tests do."""
+    train = arm_data(30, seed=0)
+    how = {"points": 15, "restarts": 3, "seed": 7, "options": OptimizerOptions(iterations=4)}
+    one, two, three = (
+        model(train.system).fit(train, backend=backend, **how) for backend in (Serial(), Joblib(2), Ray(cluster))
+    )
+    assert len(set(one.settings["restart_objective"])) == 3
+    for other in (two, three):
+        assert other.settings["restart_objective"] == one.settings["restart_objective"]
+        assert all(torch.equal(other.parameters[name], value) for name, value in one.parameters.items())
+
+
+def test_cells_are_computed_without_seeing_the_folder_of_results(cluster, tmp_path):
+    """Those that others are made from travel there, and all files travel back."""
+    results = Results.open(tmp_path / "out", "smoke")
+    last = Cell("last", f"{TOY}:square", {"before": "next/3"}, ("next/3",))
+    assert run_cells(results, [square(3), square(4)], Ray(cluster)) == 2
+    assert run_cells(results, [last, next_to(square(3)), square(3)], Ray(cluster)) == 2
+    assert results.result("last")["value"] == 11
+    assert (results.cell_folder("square/4") / "note.txt").read_text() == "beside the result"
+    assert results.result("square/3")["process"] != os.getpid()
+    with pytest.raises(FitError, match=r"bad failed \(no luck\); 1 of 2 cells are kept"):
+        run_cells(results, [Cell("bad", f"{TOY}:fail", {}), square(5)], Ray(cluster))
+
+
+def test_a_sweep_whose_driver_is_killed_goes_on(cluster, tmp_path):
+    begun = tmp_path / "begun"
+    script = (
+        "from pathlib import Path\n"
+        "from tests.experiments.test_cells import *\n"
+        "from forcegp.parallel import Ray\n"
+        f"slow = Cell('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=300))\n"
+        f"run_cells(Results.open(Path({str(tmp_path / 'out')!r}), 'smoke'), [square(2), slow], Ray({cluster!r}))\n"
+    )
+    results = tmp_path / "out" / "cells"
+    kill_when(script, begun, lambda: (results / "square" / "2").exists())
+    results = Results.open(tmp_path / "out", "smoke")
+    first = results.load("square/2")
+    assert not results.cell_folder("slow").exists()
+    assert run_cells(results, [square(2), square(3)], Ray(cluster)) == 1
+    assert results.load("square/2") == first
+
+
 def test_no_task_outlives_its_caller(cluster, tmp_path):
     begun = tmp_path / "begun"
     script = (
@@ -51,9 +103,14 @@ def test_no_task_outlives_its_caller(cluster, tmp_path):
         "from tests.parallel.tasks import begin_and_wait\n"
         f"list(Ray({cluster!r}).map(begin_and_wait, [{str(begun)!r}]))\n"
     )
+    kill_when(script, begun, lambda: True)
+
+
+def kill_when(script, begun, ready):
+    """Run it, SIGKILL it when its task has begun and all is ready, and wait until its task is dead, too."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     run = subprocess.Popen([sys.executable, "-c", script], env=environment, cwd=REPOSITORY)
-    wait_until(lambda: begun.exists() and begun.read_text() != "")
+    wait_until(lambda: begun.exists() and begun.read_text() != "" and ready())
     run.send_signal(signal.SIGKILL)
     run.wait()
     wait_until(lambda: not alive(int(begun.read_text())))

@@ -134,7 +134,7 @@ class Compare(LearningOptions):
                 noise=resolved_noise(self.noise, dataset, self.force_noise),
                 restarts=restarts,
                 seed=self.seed,
-                jobs=self.jobs,
+                backend=self._backend(),
                 hyperprior=self.hyperprior,
                 options=options,
                 block_seconds=self.block_seconds,

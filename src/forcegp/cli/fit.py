@@ -60,6 +60,7 @@ class Fit(FitOptions):
       forcegp fit train.h5 --points 100 --out run
       forcegp fit train.h5 --prior tool-friction --prior joint-friction --points 100 --out run
       forcegp fit train.h5 --model independent-gp --points 100 --out baseline
+      forcegp fit train.h5 --points 100 --restarts 8 --backend ray --address 10.0.0.1:6379 --out run
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
     """
 
@@ -101,6 +102,7 @@ class Fit(FitOptions):
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
         command = resolved(self)
+        self._backend()  # refused now, not after the data are read
         assert command.points is not None, "a resolved command has points"
         from forcegp.data import Dataset
         from forcegp.robots.devices import usable_device
@@ -137,7 +139,7 @@ def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fittin
             note = f"{start}iteration {iteration}, objective {_short(value)}"
             report(restart * steps + min(iteration, steps), restarts * steps, note)
 
-        return model.fit(dataset, **how, progress=progress if how.get("jobs", 1) == 1 else None)
+        return model.fit(dataset, **how, progress=progress)
 
 
 def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:

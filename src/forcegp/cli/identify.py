@@ -85,7 +85,7 @@ class Identify(FitOptions):
             points=min(self.points, len(dataset)),
             restarts=self.restarts if self.model == "structured" else 1,  # without processes all starts are the same
             seed=self.seed,
-            jobs=self.jobs,
+            backend=self._backend(),
             hyperprior=self.hyperprior,
             options=OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
             learn=learn,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from forcegp.cli.command import Command
+from forcegp.cli.backend_choice import BackendOptions
 from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.errors import InvalidInput
@@ -23,7 +23,7 @@ KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningOptions(Command):
+class LearningOptions(BackendOptions):
     """What every command asks that learns from a dataset."""
 
     data: Annotated[Positional[Path], arg(metavar="DATA")]
@@ -40,8 +40,10 @@ class LearningOptions(Command):
     """Starts of the search; the best is kept."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the starts of the search after the first."""
-    jobs: Annotated[int, arg(metavar="J")] = 1
-    """Processes for the restarts."""
+    jobs: Annotated[
+        int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: 1, or all that --backend has)")
+    ] = None
+    """Restarts at once."""
     adam_steps: Annotated[int, arg(metavar="N")] = 0
     """Adam steps before them."""
     hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True

@@ -26,6 +26,8 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "force_noise": ("structured", "unconstrained", "analytical"),
     "restarts": SEARCHED,
     "jobs": SEARCHED,
+    "backend": SEARCHED,
+    "address": SEARCHED,
     "adam_steps": (*SEARCHED, "analytical"),
     "hyperprior": (*SEARCHED, "analytical"),
 }
@@ -95,7 +97,7 @@ def search_arguments(command: Fit) -> dict[str, Any]:
     return {
         "seed": command.seed,
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
-        "jobs": command.jobs,
+        "backend": command._backend(),
         "hyperprior": command.hyperprior,
         "options": OptimizerOptions(iterations=command.iterations, adam_steps=command.adam_steps),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,13 +10,14 @@ from typing import Annotated, Any, ClassVar
 
 from tyro.conf import Positional, arg
 
-from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.backend_choice import BackendOptions
+from forcegp.cli.command import Debug, Json
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reproduce(Command):
+class Reproduce(BackendOptions):
     """Compute figures of Rath, Geist, Trimpe (2021) beside the published values, and what goes beyond the paper.
 
     FIGURE is fig2b, fig2c, fig3, fig4, extrapolation, ablation or all; with the presets of force priors it is
@@ -28,6 +28,7 @@ class Reproduce(Command):
       forcegp reproduce all --preset smoke
       forcegp reproduce fig2b --preset paper --jobs 2
       forcegp reproduce fig2b --points 50 100 --seeds 7 8 --out my-curves
+      forcegp reproduce all --preset paper --backend ray --address 10.0.0.1:6379
     """
 
     interrupted: ClassVar[str] = "finished cells are kept, and the same command goes on from there"
@@ -45,17 +46,18 @@ class Reproduce(Command):
     """Other numbers of training points."""
     seeds: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: the preset's)")] = ()
     """Other trajectories."""
-    jobs: Annotated[int, arg(metavar="J", help_behavior_hint="(default: as many as cores)")] = 0
+    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: as many as cores)")] = (
+        None
+    )
     """Pieces of work at once, each on one core."""
     json: Json = False
     debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Compute what is missing and write all summaries."""
-        if self.jobs < 0:
-            raise InvalidInput(f"--jobs is {self.jobs}; give at least 1.")
         if any(seed < 0 for seed in self.seeds):
             raise InvalidInput(f"--seeds are {self.seeds}; give numbers of at least 0.")
+        backend = self._backend("joblib")
         from forcegp.experiments.pages import page_of
         from forcegp.experiments.presets import experiments_of
         from forcegp.experiments.reproduction import page_name, reproduce
@@ -67,7 +69,6 @@ class Reproduce(Command):
         if self.seeds:
             experiments = tuple(experiment.with_seeds(self.seeds) for experiment in experiments)
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
-        jobs = self.jobs or os.cpu_count() or 1
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
             summaries = reproduce(
                 experiments,
@@ -75,7 +76,7 @@ class Reproduce(Command):
                 out,
                 command=self._command(),
                 docs=self.docs,
-                jobs=jobs,
+                backend=backend,
                 progress=report,
             )
         terminal.say(

@@ -30,6 +30,7 @@ from forcegp.models import Noise, StructuredGP, StructuredPosterior
 from forcegp.models.fit_arguments import training_rows
 from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.prior_checks import check_prior
+from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior
 
 BLOCKS = 20
@@ -146,7 +147,8 @@ def compare_priors(
     noise: Noise | None = None,
     restarts: int | None = None,
     seed: int = 0,
-    jobs: int = 1,
+    jobs: int | None = None,
+    backend: Backend | str | None = None,
     hyperprior: bool = True,
     options: OptimizerOptions | None = None,
     block_seconds: float | None = None,
@@ -162,13 +164,15 @@ def compare_priors(
     system: what is known; None takes that of the dataset.
     block_seconds: length of the stretches of time that are left out; None cuts the recording into 20.
     test: another Dataset to score the candidates on as well.
-    mean, noise, restarts, seed, jobs, hyperprior, options: as in `StructuredGP` and its `fit`, for every candidate.
+    mean, noise, restarts, seed, jobs, backend, hyperprior, options: as in `StructuredGP` and its `fit`, for each of
+        them.
 
     Raises
     ------
     InvalidInput: an argument is out of range, or the data cannot teach a candidate anything; it is named.
     FitError: no start of the search for a candidate could be evaluated.
     """
+    workers = backend_for(backend, jobs)
     known = dataset.system if system is None else system
     if known is None:
         raise InvalidInput("the dataset does not carry its robot; give system=MechanicalSystem(robot, contacts)")
@@ -190,7 +194,7 @@ def compare_priors(
     models = {name: _named(name, partial(StructuredGP, known, prior, mean, noise)) for name, prior in priors.items()}
     for name, model in models.items():
         _named(name, partial(_check, model, rows))
-    how = {"restarts": restarts, "seed": seed, "jobs": jobs, "hyperprior": hyperprior, "options": options}
+    how = {"restarts": restarts, "seed": seed, "backend": workers, "hyperprior": hyperprior, "options": options}
     posteriors = {}
     for name, model in models.items():
         note = None if progress is None else _note(progress, name)

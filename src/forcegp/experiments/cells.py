@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import threading
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from importlib import import_module
-from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
-from forcegp.errors import FitError, ForceGPError
+from forcegp.errors import BackendError, FitError, ForceGPError
 from forcegp.experiments.machine import machine
+from forcegp.experiments.packed_cells import PackedCell
 from forcegp.experiments.results import CELL_FILE, Results, write_json
+from forcegp.parallel import Backend, Joblib, Pool, Shared
 
 Task = Callable[[Results, Mapping[str, Any], Path], dict[str, Any]]
 """`task(results, spec, folder)`: computes one cell, may write files to `folder`, returns plain JSON values."""
@@ -44,11 +43,14 @@ class Cell:
     cost: float = field(default=1.0, compare=False)
 
 
-def run_cells(results: Results, cells: Sequence[Cell], jobs: int = 1, progress: Progress | None = None) -> int:
-    """Compute all cells that are not there yet, `jobs` at once in separate processes; returns how many.
+def run_cells(
+    results: Results, cells: Sequence[Cell], backend: Backend | None = None, progress: Progress | None = None
+) -> int:
+    """Compute all cells that are not there yet, on a backend (None: in one other process); returns how many.
 
     Every finished cell is kept at once, so a run that is killed at any moment goes on where it was. A cell that fails
-    stops only what depends on it. Raises FitError at the end if any has failed, naming the first.
+    stops only what depends on it. Raises FitError at the end if any has failed, naming the first, and BackendError if
+    workers cannot be had, or if those of one cell died again and again.
     """
     wanted = digests(cells)
     if all(results.has(name, digest) for name, digest in wanted.items()):
@@ -57,7 +59,7 @@ def run_cells(results: Results, cells: Sequence[Cell], jobs: int = 1, progress: 
         results.remove_leftovers()
         missing = {cell.name: cell for cell in cells if not results.has(cell.name, wanted[cell.name])}
         if missing:
-            _Run(results, missing, wanted, progress).with_processes(jobs)
+            _Run(results, missing, wanted, progress).on(backend or Joblib(1), {cell.name: cell for cell in cells})
     return len(missing)
 
 
@@ -93,42 +95,47 @@ class _Run:
         self.failed: dict[str, str] = {}
         self.progress = progress
 
-    def with_processes(self, jobs: int) -> None:
-        # spawn: a forked child would inherit the threads of BLAS in an unknown state
-        context, before = get_context("spawn"), set(active_children())
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(),)) as pool:
-            running: dict[Future[None], Cell] = {}
-            try:
-                while self.waiting or running:
-                    for cell in self._ready(jobs - len(running)):
-                        running[pool.submit(compute, self.results, cell, self.digests[cell.name])] = cell
-                    if not running:
+    def on(self, backend: Backend, every: Mapping[str, Cell]) -> None:
+        """Compute all; `every` cell by name, also the finished ones."""
+        sent: dict[str, Shared] = {}
+
+        def submit(pool: Pool, cell: Cell) -> None:
+            digest = self.digests[cell.name]
+            if backend.shares_files:
+                pool.submit(cell.name, compute, self.results, cell, digest)
+                return
+            before = _before(cell, every)
+            for name in before:
+                sent.setdefault(name, Shared(PackedCell.of(self.results, name)))
+            pool.submit(cell.name, computed_elsewhere, cell, digest, *(sent[name] for name in before))
+
+        try:
+            with backend.pool() as pool:
+                while self.waiting or len(pool):
+                    for cell in self._ready(pool.free):
+                        submit(pool, cell)
+                    if not len(pool):
                         break  # what still waits depends on cells that failed
-                    finished, _ = wait(running, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        self._record(running.pop(future), future)
-            except BaseException:
-                workers = set(active_children()) - before
-                for worker in workers:
-                    worker.terminate()
-                for worker in workers:
-                    worker.join()  # before the lock is given back: none of them may finish a cell after that
-                self.results.remove_leftovers()
-                raise
+                    for name, future in pool.finished():
+                        self._record(every[name], future)
+        except BackendError as error:
+            raise BackendError(f"{error}. {self._kept()}") from None
+        finally:
+            self.results.remove_leftovers()
         if self.failed:
             name, cause = next(iter(self.failed.items()))
             others = f" and {len(self.failed) - 1} more failed" if len(self.failed) > 1 else " failed"
             skipped = f", {len(self.waiting)} that need them were left out" if self.waiting else ""
-            raise FitError(
-                f"{name}{others}{skipped} ({cause}); {len(self.done)} of {self.count} cells are kept, so the same "
-                "command goes on from here"
-            )
+            raise FitError(f"{name}{others}{skipped} ({cause}); {self._kept()}")
 
-    def _ready(self, free: int) -> list[Cell]:
+    def _kept(self) -> str:
+        return f"{len(self.done)} of {self.count} cells are kept, so the same command goes on from here"
+
+    def _ready(self, free: int | float) -> list[Cell]:
         """The next cells whose conditions are fulfilled: those that others wait for longest come first."""
         ready = [cell for cell in self.waiting.values() if all(self._finished(name) for name in cell.after)]
         ready.sort(key=lambda cell: -self._work_behind(cell.name))
-        chosen = ready[: max(free, 0)]
+        chosen = ready[: int(min(max(free, 0), len(ready)))]
         for cell in chosen:
             del self.waiting[cell.name]
         return chosen
@@ -143,16 +150,12 @@ class _Run:
             (self._work_behind(other.name) for other in self.waiting.values() if name in other.after), default=0.0
         )
 
-    def _record(self, cell: Cell, future: Future[None]) -> None:
+    def _record(self, cell: Cell, future: Future[PackedCell | None]) -> None:
         try:
-            future.result()
+            packed = future.result()
+            if packed is not None:
+                packed.write(self.results)
             self.done.append(cell.name)
-        except BrokenProcessPool:
-            raise FitError(
-                f"a process died while {cell.name} or another cell was at work, probably for want of memory; "
-                f"{len(self.done)} of {self.count} cells are kept, so the same command goes on from here, with fewer "
-                "--jobs if memory is short"
-            ) from None
         except ForceGPError as error:
             self.failed[cell.name] = str(error)
         except Exception as error:  # also a defect in one cell must not cost what other cells have done
@@ -184,21 +187,19 @@ def compute(results: Results, cell: Cell, digest: str) -> None:
         write_json(folder / CELL_FILE, stored)
 
 
-def _begin_worker(parent: int) -> None:
-    """One thread per process, and no life without the parent: a killed run must not go on in its children."""
-    import signal
+def computed_elsewhere(cell: Cell, digest: str, *before: PackedCell) -> PackedCell:
+    """Compute one cell where the folder of results cannot be seen, from the cells that it needs."""
+    with tempfile.TemporaryDirectory(prefix="forcegp-") as folder:
+        results = Results(Path(folder))
+        for packed in before:
+            packed.write(results)
+        compute(results, cell, digest)
+        return PackedCell.of(results, cell.name)
 
-    import torch
-    from threadpoolctl import threadpool_limits
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its children itself
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    torch.set_num_threads(1)
-    threadpool_limits(1)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+def _before(cell: Cell, every: Mapping[str, Cell]) -> list[str]:
+    """What the cell is made from, and what that is made from in turn, each once."""
+    found: dict[str, None] = {}
+    for name in cell.after:
+        found |= dict.fromkeys([*_before(every[name], every), name])
+    return list(found)

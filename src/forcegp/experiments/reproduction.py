@@ -19,6 +19,7 @@ from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.pages import page_of
 from forcegp.experiments.report import report
 from forcegp.experiments.results import KIND, Results, write_json, write_text
+from forcegp.parallel import Backend
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +32,7 @@ def reproduce(
     *,
     command: str,
     docs: Path | None = None,
-    jobs: int = 1,
+    backend: Backend | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
@@ -48,7 +49,7 @@ def reproduce(
     for root in (out, docs) if docs is not None else (out,):
         _make_folder(root / page_of(preset).name)
     cells = {cell.name: cell for experiment in experiments for cell in experiment.cells()}
-    run_cells(results, list(cells.values()), jobs, progress)
+    run_cells(results, list(cells.values()), backend, progress)
     documents, pictures, tables = {}, {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)

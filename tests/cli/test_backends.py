@@ -1,0 +1,68 @@
+"""`--backend`: the same model wherever it is computed; what is wrong is one line and exit code 2."""
+
+import json
+import socket
+
+import pytest
+from tests.models.arm import arm_data
+
+from forcegp.cli.main import main
+from forcegp.models import load_posterior
+
+FIT = ("fit", "arm.h5", "--points", 10, "--iterations", 3, "--restarts", 2)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    arm_data(20, seed=0).save(tmp_path / "arm.h5")
+    return tmp_path
+
+
+@pytest.fixture
+def dead_address():
+    """A port of this machine on which nothing listens: bound, so that nobody else takes it, and not listening."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        yield f"127.0.0.1:{taken.getsockname()[1]}"
+
+
+def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
+    for backend, more in (("serial", ()), ("joblib", ("--jobs", 2))):
+        done = forcegp(*FIT, "--backend", backend, *more, "--out", backend, "--json", folder=folder)
+        assert (done.returncode, done.stderr) == (0, ""), done.stderr
+        assert json.loads(done.stdout)["restarts"] == 2
+    one, two = (load_posterior(folder / name) for name in ("serial", "joblib"))
+    assert one.settings["restart_objective"] == pytest.approx(two.settings["restart_objective"], rel=1e-9)
+
+
+@pytest.mark.parametrize("command", [(*FIT, "--out", "run"), ("reproduce", "fig2c", "--out", "run")])
+def test_a_dead_cluster_is_one_line(forcegp, folder, dead_address, command):
+    pytest.importorskip("ray")
+    pytest.importorskip("pybullet")
+    refused = forcegp(*command, "--backend", "ray", "--address", dead_address, folder=folder)
+    assert refused.returncode == 2
+    assert len(refused.stderr.strip().splitlines()) == 1
+    assert refused.stderr.startswith(f"forcegp: no Ray cluster answers at {dead_address}")
+    assert "ray start --head" in refused.stderr
+    assert not (folder / "run" / "config.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--backend", "dask"), "no backend 'dask'; choose serial, joblib, ray"),
+        (("--jobs", 0), "jobs is 0; give"),
+        (("--address", "10.0.0.1:6379"), "add --backend ray"),
+        (("--backend", "joblib", "--address", "10.0.0.1:6379"), "backend joblib uses none; choose ray"),
+        (("--backend", "ray", "--address", "head"), "give HOST:PORT"),
+        (("--backend", "serial", "--jobs", 2), "choose joblib"),
+        (("--model", "neural-network", "--backend", "joblib"), "--backend means nothing to --model neural-network"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_one_line(folder, words, message, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main([*map(str, (*FIT[:2], *words)), "--out", "run"]) == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert len(told.strip().splitlines()) == 1
+    assert not (folder / "run").exists()
