@@ -20,15 +20,29 @@ README = FOLDER / "README.md"
 BEGIN, END = "<!-- table: written by `make bench` -->", "<!-- end of table -->"
 
 # Each question is a module with run() -> {key: number}; each key has a bound and a meaning.
-QUESTIONS = ("likelihood", "rigid_body", "learning", "incremental")
+QUESTIONS = ("likelihood", "rigid_body", "compiled_dynamics", "learning", "incremental")
 MEANINGS = {
     "nll_speedup_n400": (">= 4.5", "NLL + all gradients, N = 400, one contact: dense time / deflated time"),
     "nll_speedup_n1000": (">= 5", "the same at N = 1000"),
     "nll_speedup_n400_three_constraints": (">= 12", "the same at N = 400 with three constraints"),
     "nll_speedup_n400_tool_friction": (">= 40", "the same at N = 400, one contact, prior tool-friction (rank 2)"),
     "nll_memory_ratio_n1000": ("<= 0.333", "peak memory at N = 1000: deflated / dense"),
-    "mass_bias_vs_pinocchio_b1000": ("<= 6", "mass matrix + bias of 1000 states: our CPU time / a C++ Pinocchio loop"),
+    "mass_bias_vs_pinocchio_b1000": ("<= 4", "mass matrix + bias of 1000 states: our CPU time / a C++ Pinocchio loop"),
     "forward_dynamics_single_ms": ("<= 1", "forward dynamics of a single state [ms]"),
+    "compiled_mass_bias_vs_pinocchio_b10000": (
+        "<= 0.5",
+        "mass matrix + bias of 10,000 states, compiled for the robot: our CPU time / a C++ Pinocchio loop",
+    ),
+    "compiled_fd_vs_pinocchio_b10000": ("<= 0.5", "forward dynamics: the same"),
+    "compiled_inertial_gradient_vs_pinocchio_b10000": (
+        "<= 0.3",
+        "forward dynamics and the gradient of a weighted sum of it to all inertial parameters: the same",
+    ),
+    "compiled_error_vs_pinocchio": ("<= 1e-9", "largest error of these three, relative to the largest value"),
+    "compiled_fd_single_ms": ("", "compiled forward dynamics of a single state [ms]"),
+    "compiled_cold_seconds_fd": ("<= 60", "compiling forward dynamics [s, wall-clock]"),
+    "compiled_cold_seconds_inertial_gradient": ("<= 60", "compiling it and its gradient to the inertials [s]"),
+    "compiled_warm_seconds_fd": ("", "robot.compile() to the first result in a new process, from the folder [s]"),
     "mae_analytical_n100": ("<= 0.0865", "S-GP + analytical mean, N = 100: MAE on noisy test data, median [rad/s^2]"),
     "mae_zero_n100": ("<= 0.13", "S-GP without mean, N = 100: the same"),
     "mae_noise_free_analytical_n100": ("", "S-GP + analytical mean: MAE against the noise-free acceleration"),

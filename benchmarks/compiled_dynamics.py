@@ -17,11 +17,13 @@ Our side goes further, to the log-Cholesky parameters, and takes the time of a f
 the first result of forward dynamics, with torch and the robot loaded (wall-clock time both).
 
     python -m benchmarks.compiled_dynamics
+    python -m benchmarks.compiled_dynamics inductor     the same unrolled scalars through torch.compile (minutes)
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 import subprocess
 import sys
 import tempfile
@@ -36,6 +38,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot, physical_from_parameters
 from forcegp.robots.compiled import CompiledRobot
+from forcegp.robots.unrolled import UnrolledRobot
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 
@@ -169,6 +172,23 @@ def cold(robot: Robot, folder: Path) -> dict[str, float]:
     }
 
 
+def inductor() -> None:
+    """Print what torch.compile makes of the unrolled forward dynamics, and how long it takes to."""
+    states = States(BATCH)
+    unrolled = UnrolledRobot(states.robot)
+
+    @torch.compile(dynamic=True, fullgraph=True)
+    def forward(q: torch.Tensor, v: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
+        return torch.stack(unrolled.states(q.unbind(-1), v.unbind(-1)).forward_dynamics(tau.unbind(-1)), dim=-1)
+
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder
+        taken = seconds(lambda: forward(*states.tensors))
+        error = largest_error(forward(*states.tensors), states.robot.forward_dynamics(*states.tensors))
+        (own,) = in_turn(lambda: forward(*states.tensors), repetitions=REPETITIONS)
+    print(f"forward dynamics by torch.compile: compiled in {taken:.0f} s, {1e3 * own:.2f} ms, error {error:.1e}")
+
+
 def run() -> dict[str, float]:
     """Measure and print; nothing where there is no C++ loop to compare with."""
     torch.empty(30 * 2**20, dtype=torch.uint8)  # freed at once: see benchmarks.rigid_body
@@ -227,6 +247,9 @@ def main(arguments: list[str]) -> None:
         robot = Robot.from_urdf(URDF)
         q, v, tau = torch.zeros(3, robot.nv, dtype=torch.float64)
         print(seconds(lambda: robot.compile(arguments[1]).forward_dynamics(q, v, tau)))
+        return
+    if arguments[:1] == ["inductor"]:
+        inductor()
         return
     with threadpool_limits(1):
         for key, value in run().items():
