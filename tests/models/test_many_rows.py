@@ -7,7 +7,7 @@ from tests.models.arm import arm_data
 
 from forcegp import JointFriction, StructuredGP, load_posterior, save_posterior
 from forcegp.errors import InvalidInput, NotEnoughMemory, NumericalError
-from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions
+from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, Stochastic
 from forcegp.inference import memory as memory_module
 
 QUICK = OptimizerOptions(iterations=5)
@@ -86,6 +86,14 @@ def test_refining_on_all_rows_lowers_the_objective(data):
     assert refined.negative_log_likelihood < rough.negative_log_likelihood
 
 
+def test_mini_batches_of_all_rows_lower_the_objective(data):
+    still = fit(data, Stochastic(points=20, steps=0), learning_points=15, points=60)
+    engine = Stochastic(points=20, steps=40, batch=30, rate=0.05)
+    moved = fit(data, engine, learning_points=15, points=60)
+    assert moved.negative_log_likelihood < still.negative_log_likelihood
+    assert "30 rows each" in moved.settings["refined"]
+
+
 @pytest.mark.parametrize("engine", [Iterative(tolerance=1e-8, points=20), Inducing(points=30)], ids=["cg", "inducing"])
 def test_stored_and_loaded_it_predicts_the_same(data, states, engine, tmp_path):
     posterior = fit(data, engine, learning_points=30)
@@ -131,6 +139,8 @@ def test_unknown_engines(data, given, message):
         lambda: Iterative(tolerance=2.0),
         lambda: Inducing(points=0),
         lambda: Inducing(refine=-1),
+        lambda: Stochastic(rate=0.0),
+        lambda: Stochastic(batch=0),
     ],
 )
 def test_settings_are_checked(make):

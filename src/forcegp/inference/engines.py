@@ -5,6 +5,7 @@
 | `Exact` | exact, from the factorised covariance | (rN)^3 | (rN)^2 |
 | `Iterative` | exact mean by conjugate gradients, covariance of a low-rank model | iterations C N^2 | N P |
 | `Inducing` | variational, through inducing points, with a bound on what that costs | N P^2 | P^2 |
+| `Stochastic` | the same, hyper-parameters from mini-batches of all rows | steps P^3 + N P^2 | P^2 |
 
 with N rows, r the rank of the mixing vectors, C latents and P points of all latents together.
 """
@@ -207,7 +208,41 @@ class Inducing(Engine):
         return InducingPosterior.condition(kernels, *terms, points=self.points, tolerance=self.tolerance)
 
 
-ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing)}
+@dataclass(frozen=True)
+class Stochastic(Engine):
+    """Inducing points whose hyper-parameters are improved on mini-batches of all rows: for many features and many rows.
+
+    `points` of each latent, `steps` on `batch` rows each with Adam's `rate`, rows drawn by `seed`. The posterior is the
+    variational one at the parameters that were found, from one pass over all rows.
+    """
+
+    name: ClassVar[str] = "stochastic"
+    points: int = 200
+    steps: int = 200
+    batch: int = 128
+    rate: float = 0.01
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("points", "batch"):
+            _require(getattr(self, name) >= 1, f"Stochastic {name}", getattr(self, name), "at least 1")
+        _require(self.steps >= 0 and self.seed >= 0, "Stochastic steps or seed", (self.steps, self.seed), "at least 0")
+        _require(self.rate > 0.0, "Stochastic rate", self.rate, "positive")
+
+    @override
+    def required_bytes(self, size: ProblemSize) -> int:
+        inside = size.latents * (self.points + self.batch)
+        return Inducing(self.points).required_bytes(size) + 80 * inside**2
+
+    @override
+    def condition(
+        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
+    ) -> LatentPosterior:
+        self.require_memory(ProblemSize.of(terms), terms.W.device)
+        return InducingPosterior.condition(kernels, *terms, points=self.points, tolerance=0.0)
+
+
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing, Stochastic)}
 
 
 @dataclass(frozen=True)

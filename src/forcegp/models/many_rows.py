@@ -1,7 +1,7 @@
 """Learning from many rows: hyper-parameters from some of them, the posterior from all of them by an engine.
 
-`StructuredGP.fit` takes `learning_rows` (all, or those farthest apart) to the search; `on_all_rows` then lets the engine
-condition on all rows at the same hyper-parameters, with the features prepared as for the rows that they were found on.
+`StructuredGP.fit` takes `learning_rows` (all, or those farthest apart) to the search; `on_all_rows` then lets the
+engine condition on all rows at the same hyper-parameters, with features prepared as for the rows that gave them.
 """
 
 from __future__ import annotations
@@ -22,17 +22,15 @@ from forcegp.inference import (
     Inducing,
     InducingPosterior,
     LatentPosterior,
-    OptimizerOptions,
     ProblemSize,
     choose_engine,
-    minimize_objective,
 )
 from forcegp.inference.conjugate_gradients import Iteration
 from forcegp.inference.engines import MOST_EXACT_ROWS
 from forcegp.inference.memory import require_memory
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
 from forcegp.models.noise import ACCELERATION
-from forcegp.models.objective import FitObjective
+from forcegp.models.refinement import refined
 from forcegp.models.search import blas_threads
 
 if TYPE_CHECKING:
@@ -101,7 +99,7 @@ def on_all_rows(
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings)
         vars(posterior)["latent"] = latent  # where the cached property looks first
-        return _refined(posterior, hyperprior, report)
+        return refined(posterior, hyperprior, report)
 
 
 def _training(rows: Dataset, reference: TrainingData) -> TrainingData:
@@ -134,32 +132,3 @@ def _another(
     other = choose_engine(size, likelihood.training.q.device, inducing=False)
     other = Choice(other.engine, f"{other.reason}; {short}")
     return other, likelihood.condition(fitted.kernels, fitted.parameters, other.engine, report=report)
-
-
-def _refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration | None) -> StructuredPosterior:
-    """Hyper-parameters improved on all rows, where inducing points describe them and nothing physical was learned."""
-    engine, latent = posterior.engine, posterior.latent
-    if not isinstance(engine, Inducing) or not isinstance(latent, InducingPosterior) or not engine.refine:
-        return posterior
-    if latent.left_out > engine.tolerance or posterior.identification is not None:
-        return posterior
-    noise = posterior.model.noise
-    assert noise is not None, "a fitted model has its noise"
-    held = {} if noise.learn else noise.parameters(posterior.model.system.robot.nv)
-    start = {name: value for name, value in posterior.parameters.items() if name not in held}
-    held = {name: posterior.parameters[name] for name in held}
-    objective = FitObjective(posterior.likelihood, posterior.kernels, noise, held, hyperprior, points=latent.features)
-    options = OptimizerOptions(iterations=engine.refine, tolerance=1e-6)
-    result = minimize_objective(objective, start, options, report)
-    parameters = {**posterior.parameters, **result.parameters}
-    better = posterior.likelihood.condition(posterior.kernels, parameters, engine)
-    note = f"{len(result.history) - 1} iterations on all rows: {result.history[0]:.1f} -> {result.value:.1f}"
-    settings = {**posterior.settings, "refined": note}
-    out = replace(
-        posterior,
-        parameters=parameters,
-        settings=settings,
-        result=replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds),
-    )
-    vars(out)["latent"] = better
-    return out

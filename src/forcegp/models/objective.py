@@ -54,10 +54,13 @@ class FitObjective:
             value = self.likelihood(self.kernels, named) + penalty
         else:
             value = self.likelihood.bound(self.kernels, named, self.points) + penalty
+        return value - self.log_prior(parameters)
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """Log density of the hyper-parameters' priors; 0 without `hyperprior`."""
         if not self.hyperprior:
-            return value
-        nv = self.likelihood.system.robot.nv
-        return value - self.kernels.log_prior(parameters) - self.noise.log_prior(parameters, nv)
+            return torch.zeros((), dtype=torch.float64)
+        return self.kernels.log_prior(parameters) + self.noise.log_prior(parameters, self.likelihood.system.robot.nv)
 
 
 def with_variance_priors(kernels: LatentKernels) -> LatentKernels:

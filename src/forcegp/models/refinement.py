@@ -1,0 +1,69 @@
+"""Hyper-parameters improved on all rows, from those that some rows gave: by the collapsed bound or mini-batches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from forcegp.inference import (
+    Inducing,
+    InducingPosterior,
+    OptimizationResult,
+    OptimizerOptions,
+    Stochastic,
+    minimize_objective,
+)
+from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.stochastic import stochastic_search
+from forcegp.models.objective import FitObjective
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_posterior import StructuredPosterior
+
+TOLERANCE = 1e-6
+"""Fraction of the bound by which an iteration must lower it for the search to go on."""
+
+
+def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration | None = None) -> StructuredPosterior:
+    """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
+
+    Where physical parameters were learned they and all others stay, for their standard errors belong together.
+    """
+    engine, latent = posterior.engine, posterior.latent
+    if not isinstance(latent, InducingPosterior) or posterior.identification is not None:
+        return posterior
+    noise = posterior.model.noise
+    assert noise is not None, "a fitted model has its noise"
+    names = () if noise.learn else noise.parameters(posterior.model.system.robot.nv)
+    held = {name: posterior.parameters[name] for name in names}
+    start = {name: value for name, value in posterior.parameters.items() if name not in held}
+    likelihood, kernels = posterior.likelihood, posterior.kernels
+    objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
+    if isinstance(engine, Inducing) and engine.refine and latent.left_out <= engine.tolerance:
+        options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
+        return _with(posterior, minimize_objective(objective, start, options, report))
+    if isinstance(engine, Stochastic) and engine.steps:
+        result = stochastic_search(
+            kernels,
+            latent,
+            lambda parameters: likelihood.terms({**held, **parameters}),
+            start,
+            lambda parameters: -objective.log_prior(parameters),
+            steps=engine.steps,
+            batch=engine.batch,
+            rate=engine.rate,
+            seed=engine.seed,
+            report=report,
+        )
+        return _with(posterior, result)
+    return posterior
+
+
+def _with(posterior: StructuredPosterior, result: OptimizationResult) -> StructuredPosterior:
+    parameters = {**posterior.parameters, **result.parameters}
+    change = f"{result.history[0]:.1f} -> {result.value:.1f}"
+    note = f"on all rows, {result.evaluations} evaluations: {change} ({result.status})"
+    spent = replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds)
+    out = replace(posterior, parameters=parameters, settings={**posterior.settings, "refined": note}, result=spent)
+    vars(out)["latent"] = posterior.likelihood.condition(posterior.kernels, parameters, posterior.engine)
+    return out
