@@ -103,6 +103,7 @@ class CompiledSums:
     """E f_c = sum_j w_cj k_c(z, z_j) of latents that share their centres, on the CPU."""
 
     def __init__(self, group: SharedCenters, weights: Float[Tensor, "G N"]) -> None:
+        self._made_of = group, weights
         valid = weights.shape[1]
         filled = -valid % LANES
         table, own = group.centers.mT, group.own
@@ -120,6 +121,9 @@ class CompiledSums:
         self._sums = cpp_library(SOURCE).sums
         self._sums.restype = None
         self._sums.argtypes = [ctypes.c_long] * 5 + [ctypes.c_void_p] * 6
+
+    def __reduce__(self) -> tuple[type[CompiledSums], tuple[SharedCenters, Tensor]]:
+        return CompiledSums, self._made_of  # addresses mean nothing in another process
 
     def __call__(
         self, inputs: Float[Tensor, "n _"], keep: bool

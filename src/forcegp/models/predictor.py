@@ -12,8 +12,9 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,7 @@ from forcegp.models.sample_states import sample_states
 if TYPE_CHECKING:
     from forcegp.models.structured_posterior import StructuredPosterior
 
-CovarianceKind = Literal["compressed", "exact", "none"]
+COVARIANCES = ("compressed", "exact", "none")
 BLOCK_NUMBERS = 2**18
 """Kernel values that are worked on at once: 2 MiB, so that they stay in the processor's cache."""
 
@@ -66,7 +67,7 @@ class Predictor:
     latent: LatentPosterior
     prepared: PreparedKernels
     tape: TapedTerms | EagerTerms
-    kind: CovarianceKind
+    kind: str
     compressed: CompressedCovariance | None
     prepare_seconds: float
 
@@ -134,7 +135,7 @@ class Predictor:
     def _rows(self, q: Any, v: Any, u: Any) -> tuple[Tensor, bool]:
         """One row [q, v, u] per state, and whether it was a single state."""
         states = [
-            x if isinstance(x, Tensor) and x.dtype == torch.float64 else torch.as_tensor(x, dtype=torch.float64)
+            x.to(torch.float64) if isinstance(x, Tensor) else torch.tensor(np.array(x, np.float64), device=self.device)
             for x in (q, v, u)
         ]
         shape = states[0].shape
@@ -165,13 +166,11 @@ def _finished(blocks: list[Tensor], single: bool) -> Tensor:
 
 
 def make_predictor(
-    posterior: StructuredPosterior, covariance: CovarianceKind, tolerance: float, largest_rank: int, compile: bool
+    posterior: StructuredPosterior, covariance: str, tolerance: float, largest_rank: int, compile: bool
 ) -> Predictor:
     """What `StructuredPosterior.predictor` documents."""
-    if covariance not in get_args(CovarianceKind):
-        raise InvalidInput(
-            f"covariance is {covariance!r}; give one of {', '.join(map(repr, get_args(CovarianceKind)))}."
-        )
+    if covariance not in COVARIANCES:
+        raise InvalidInput(f"covariance is {covariance!r}; give one of {', '.join(map(repr, COVARIANCES))}.")
     if not (0.0 < tolerance < math.inf and isinstance(largest_rank, int) and largest_rank >= 1):
         raise InvalidInput(
             f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "

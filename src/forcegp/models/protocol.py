@@ -22,7 +22,7 @@ from forcegp.models.accelerations import AccelerationModel, PredictedAcceleratio
 from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.moving import moved
 from forcegp.models.prediction import Prediction, join_predictions
-from forcegp.models.predictor import CovarianceKind, Predictor
+from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import Rollout, roll_out
 from forcegp.models.search import FitProgress
 
@@ -127,7 +127,7 @@ class Posterior(ABC):
     def predictor(
         self,
         *,
-        covariance: CovarianceKind = "compressed",
+        covariance: str = "compressed",
         tolerance: float = 0.01,
         largest_rank: int = 512,
         compile: bool = True,

@@ -35,7 +35,7 @@ from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData,
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
-from forcegp.models.predictor import CovarianceKind, Predictor, make_predictor
+from forcegp.models.predictor import Predictor, make_predictor
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.search import blas_threads
 from forcegp.models.updating import updated
@@ -151,7 +151,7 @@ class StructuredPosterior(Posterior):
     def predictor(
         self,
         *,
-        covariance: CovarianceKind = "compressed",
+        covariance: str = "compressed",
         tolerance: float = 0.01,
         largest_rank: int = 512,
         compile: bool = True,

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -78,6 +79,8 @@ class Program:
 class Tape:
     """Operations recorded so far; the operands of a node have smaller numbers."""
 
+    __no_type_check__: ClassVar[bool] = True  # called for every scalar, where checks would take most of the time
+
     def __init__(self, inputs: int) -> None:
         self._nodes: list[tuple] = []
         self._found: dict[tuple, int] = {}
@@ -85,7 +88,7 @@ class Tape:
         self._record(("constant", 1.0))
         self.inputs = [self._record(("input", position)) for position in range(inputs)]
 
-    def constant(self, value: float) -> int:
+    def constant(self, value: float | int) -> int:
         """The node of a number."""
         return self._record(("constant", float(value) + 0.0))  # -0.0 becomes 0.0
 

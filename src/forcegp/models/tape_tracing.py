@@ -80,7 +80,7 @@ class _Numbers:
         self.nodes = nodes
 
 
-def _numbers(tape: Tape, value: _Numbers | Tensor | float) -> _Numbers:
+def _numbers(tape: Tape, value: _Numbers | Tensor | float | int) -> _Numbers:
     if isinstance(value, _Numbers):
         return value
     tensor = torch.as_tensor(value, dtype=torch.float64)
@@ -137,11 +137,11 @@ def _looked_up(tape: Tape, values: Any, indices: list[Any]) -> _Numbers:
     return _elementwise(tape, one, indices[0])
 
 
-def _filled(tape: Tape, x: _Numbers, value: float) -> _Numbers:
+def _filled(tape: Tape, x: _Numbers, value: Any) -> _Numbers:
     return _Numbers(torch.full_like(x.nodes, tape.constant(value)))
 
 
-def _padded(tape: Tape, x: _Numbers, pad: list[int], value: float = 0.0) -> _Numbers:
+def _padded(tape: Tape, x: _Numbers, pad: list[int], value: Any = 0.0) -> _Numbers:
     return _Numbers(torch.constant_pad_nd(x.nodes, pad, tape.constant(value)))
 
 
@@ -152,7 +152,7 @@ def _elementwise(tape: Tape, function: Callable[..., int], *values: Any) -> _Num
 
 
 def _binary(operation: str, swapped: bool = False) -> Callable[..., _Numbers]:
-    def handler(tape: Tape, x: Any, y: Any, alpha: float = 1.0, rounding_mode: None = None) -> _Numbers:
+    def handler(tape: Tape, x: Any, y: Any, alpha: Any = 1.0, rounding_mode: None = None) -> _Numbers:
         if alpha != 1.0:
             y = _elementwise(tape, lambda a, b: tape.apply("multiply", a, b), y, float(alpha))
         x, y = (y, x) if swapped else (x, y)
@@ -211,7 +211,7 @@ def _mean(tape: Tape, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _N
     return _binary("multiply")(tape, total, total.nodes.numel() / x.nodes.numel())
 
 
-def _norm(tape: Tape, x: Any, order: float = 2.0, dim: Any = None, keepdim: bool = False) -> _Numbers:
+def _norm(tape: Tape, x: Any, order: Any = 2.0, dim: Any = None, keepdim: bool = False) -> _Numbers:
     if order != 2.0:
         raise InvalidInput(f"a compiled predictor holds norms of order 2 only, not {order}; give compile=False.")
 
@@ -233,7 +233,7 @@ def _product(tape: Tape, x: Any, y: Any) -> _Numbers:
     return _Numbers(torch.tensor(results, dtype=torch.long).view(shape))
 
 
-def _added_product(tape: Tape, bias: Any, x: Any, y: Any, beta: float = 1.0, alpha: float = 1.0) -> _Numbers:
+def _added_product(tape: Tape, bias: Any, x: Any, y: Any, beta: Any = 1.0, alpha: Any = 1.0) -> _Numbers:
     """addmm and baddbmm."""
     product = _binary("multiply")(tape, _product(tape, x, y), float(alpha))
     return _binary("add")(tape, product, _binary("multiply")(tape, bias, float(beta)))
