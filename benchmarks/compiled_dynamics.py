@@ -18,6 +18,7 @@ the first result of forward dynamics, with torch and the robot loaded (wall-cloc
 
     python -m benchmarks.compiled_dynamics
     python -m benchmarks.compiled_dynamics inductor     the same unrolled scalars through torch.compile (minutes)
+    python -m benchmarks.compiled_dynamics chain 30     compiling forward dynamics of 30 skew joints in series
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot, physical_from_parameters
 from forcegp.robots.compiled import CompiledRobot
+from forcegp.robots.dynamics_programs import Request, trace
 from forcegp.robots.unrolled import UnrolledRobot
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
@@ -189,6 +191,25 @@ def inductor() -> None:
     print(f"forward dynamics by torch.compile: compiled in {taken:.0f} s, {1e3 * own:.2f} ms, error {error:.1e}")
 
 
+def chain(joints: int) -> None:
+    """Print how long forward dynamics of a chain without any structural zeros takes to compile."""
+    inertial = """<inertial><origin xyz="0.1 0.02 0.03"/><mass value="1"/>
+        <inertia ixx="0.01" ixy="0.001" ixz="0.0005" iyy="0.012" iyz="0.0004" izz="0.009"/></inertial>"""
+    parts = [
+        f"""<joint name="j{k}" type="continuous"><origin xyz="0.1 0.05 0.2" rpy="0.3 -0.2 {0.1 * k}"/>
+        <parent link="l{k - 1}"/><child link="l{k}"/><axis xyz="1 {k % 3} -1"/></joint>
+        <link name="l{k}">{inertial}</link>"""
+        for k in range(1, joints + 1)
+    ]
+    robot = Robot.from_urdf_text(f"""<robot name="chain"><link name="l0"/>{"".join(parts)}</robot>""")
+    operations = trace(UnrolledRobot(robot), Request("forward_dynamics", free_inertias=False)).operations
+    with tempfile.TemporaryDirectory() as folder:
+        start = sum(os.times()[:4])  # with those of the compiler
+        robot.compile(folder).prepare("forward_dynamics")
+        taken = sum(os.times()[:4]) - start
+    print(f"forward dynamics of {joints} joints: {operations} operations, compiled in {taken:.1f} CPU s")
+
+
 def run() -> dict[str, float]:
     """Measure and print; nothing where there is no C++ loop to compare with."""
     torch.empty(30 * 2**20, dtype=torch.uint8)  # freed at once: see benchmarks.rigid_body
@@ -250,6 +271,9 @@ def main(arguments: list[str]) -> None:
         return
     if arguments[:1] == ["inductor"]:
         inductor()
+        return
+    if arguments[:1] == ["chain"]:
+        chain(int(arguments[1]))
         return
     with threadpool_limits(1):
         for key, value in run().items():

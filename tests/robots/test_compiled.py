@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import stat
 import subprocess
 import sys
@@ -220,6 +221,16 @@ def test_default_folder(robot, monkeypatch, tmp_path):
     assert robot.compile().folder == tmp_path / "forcegp" / "dynamics"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert robot.compile().folder == Path.home() / ".cache" / "forcegp" / "dynamics"
+
+
+def test_the_page_on_compiled_dynamics_runs(repository, tmp_path):
+    page = (repository / "docs" / "compiled-dynamics.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, "-c", example]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.splitlines() == re.findall(r"# (tensor.*|torch\.Size.*)\n", example)
+    assert any((tmp_path / "forcegp" / "dynamics").iterdir())
 
 
 # ---------------------------------------------------------------------- what cannot be

@@ -109,6 +109,16 @@ def test_structure_stays_structure():
     torch.testing.assert_close(L.mT @ D.diag_embed() @ L, robot.mass_matrix(q))
 
 
+def test_coarser_rounding_drops_what_angles_of_twelve_digits_leave():
+    """The iiwa's file turns by 1.57079632679, so that 5e-12 stands where zeros are meant."""
+    robot = Robot.from_urdf_text(MODELS["iiwa"]())
+    q = torch.randn(COUNT, robot.nv, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    fine, coarse = (UnrolledRobot(robot, rounding=rounding) for rounding in (1e-15, 1e-11))
+    entries = [[x for joint in of.joints for row in joint.rotation for x in row] for of in (fine, coarse)]
+    assert entries[0].count(0.0) < entries[1].count(0.0) == 6 * robot.nv  # the turns are signed permutations
+    close(coarse.states(q.unbind(-1)).mass_matrix(), robot.mass_matrix(q))
+
+
 def test_states_given_as_floats_are_constants():
     robot = Robot.from_urdf_text(CHAIN)
     at = UnrolledRobot(robot).states([0.1, 0.0, 0.3, -0.4], [0.0, 1.0, 0.0, 2.0])

@@ -3,7 +3,7 @@
 A file of the folder is named by a hash of everything that decides what is in it: the robot's constants, the request,
 the sources of the modules that write the code, the processor's vector unit and the platform. Loading such a file runs
 the code in it with the rights of the process. So only files of the folder are loaded, and only if the folder and the
-file belong to the user and no one else may write to them.
+file belong to the user (or to root) and no one else may write to them.
 """
 
 from __future__ import annotations
@@ -141,7 +141,9 @@ def _make(folder: Path) -> None:
 
 def _require_own(path: Path) -> None:
     status = path.stat()
-    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+    if not hasattr(os, "getuid"):
+        return
+    if status.st_uid not in (os.getuid(), 0) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise CompilerError(
             f"{path} can be written to by others than you, and code from it would run with your rights; take that "
             f"away (chmod go-w {shlex.quote(str(path))}) or choose another folder: robot.compile(folder=...)."
