@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         load_posterior,
         save_posterior,
     )
+    from forcegp.parallel import Joblib, Ray, Serial
     from forcegp.priors import (
         ContactFriction,
         JointAccelerations,
@@ -85,6 +86,10 @@ __all__ = [
     "NetworkEnsemble",
     "save_posterior",
     "load_posterior",
+    # where it is computed
+    "Serial",
+    "Joblib",
+    "Ray",
     # how good it is
     "evaluate",
     "Evaluation",
@@ -101,6 +106,7 @@ _ROOMS = {
     | {"JointAccelerations", "NoForces"},
     "models": {"IndependentGP", "NeuralNetwork", "NetworkEnsemble"}
     | {"StructuredGP", "Noise", "Coefficients", "save_posterior", "load_posterior"},
+    "parallel": {"Serial", "Joblib", "Ray"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
     "evaluation": {"Evaluation", "evaluate", "PriorComparison", "compare_priors"},
 }

@@ -1,9 +1,12 @@
 """Addresses at which there is no cluster, and a real cluster of two nodes on this machine."""
 
+import os
 import socket
 
 import pytest
 from tests.parallel.two_nodes import two_nodes
+
+os.environ["RAY_AUTH_MODE"] = "disabled"  # whether or not the home folder of whoever tests holds a token of Ray
 
 
 @pytest.fixture

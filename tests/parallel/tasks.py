@@ -76,6 +76,19 @@ def node(_):
     return ray.get_runtime_context().get_node_id()
 
 
+def wait_for_the_gate(folder):
+    """Leave a file with the name of the node, and wait for the file "gate"."""
+    import ray
+
+    here = ray.get_runtime_context().get_node_id()
+    (Path(folder) / here).touch()
+    for _ in range(1200):
+        if (Path(folder) / "gate").exists():
+            return here
+        time.sleep(0.05)
+    return "the gate stayed shut"
+
+
 def begin_and_wait(begun):
     """Tell the process, then wait long."""
     Path(begun).write_text(str(os.getpid()))

@@ -13,6 +13,7 @@ from tests.experiments.test_cells import TOY, next_to, square
 from tests.models.arm import arm_data
 from tests.parallel import tasks
 from tests.parallel.conformance import WorkersConformance
+from tests.parallel.two_nodes import another_node, end_session
 
 from forcegp.errors import BackendError, FitError
 from forcegp.experiments.cells import Cell, run_cells
@@ -94,6 +95,22 @@ def test_a_sweep_whose_driver_is_killed_goes_on(cluster, tmp_path):
     assert not results.cell_folder("slow").exists()
     assert run_cells(results, [square(2), square(3)], Ray(cluster)) == 1
     assert results.load("square/2") == first
+
+
+def test_what_a_lost_machine_was_computing_is_computed_by_the_others(cluster, tmp_path):
+    backend = Ray(cluster)
+    assert list(backend.map(tasks.slow_first, [0])) == [0]  # connected to a node that stays
+    gates = tmp_path / "gates"
+    gates.mkdir()
+    with another_node(cluster, tmp_path) as node, backend.pool() as pool:
+        for key in range(3):
+            pool.submit(key, tasks.wait_for_the_gate, gates)
+        wait_until(lambda: len(list(gates.iterdir())) == 3)
+        end_session(node)
+        (gates / "gate").touch()
+        ended = [future.result() for _ in range(3) if len(pool) for _, future in pool.finished()]
+    assert len(ended) == 3
+    assert len(set(ended)) == 2
 
 
 def test_no_task_outlives_its_caller(cluster, tmp_path):

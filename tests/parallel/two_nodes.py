@@ -32,8 +32,19 @@ def two_nodes() -> Iterator[str]:
         yield address
     finally:
         for node in nodes:
-            _end_session(node)
+            end_session(node)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def another_node(address: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """One more node, once it has joined; its log is written to that folder."""
+    node = _start(str(folder), "another", f"--address={address}")
+    try:
+        _wait_for(address, str(folder), 3, [node])
+        yield node
+    finally:
+        end_session(node)
 
 
 def _start(folder: str, name: str, *words: str) -> subprocess.Popen[bytes]:
@@ -74,7 +85,7 @@ def _free_port() -> int:
         return free.getsockname()[1]
 
 
-def _end_session(node: subprocess.Popen[bytes]) -> None:
+def end_session(node: subprocess.Popen[bytes]) -> None:
     """End the node and everything that it started: all that is in the session that was made for it."""
     end = time.monotonic() + 20.0
     while members := session(node.pid):

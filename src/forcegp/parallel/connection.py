@@ -2,17 +2,38 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from forcegp.errors import BackendError, InvalidInput, MissingExtra
 
 ANSWER_SECONDS = 10
-"""So long a machine, and then its cluster, is given to answer."""
+"""So long a machine is given to answer."""
+
+JOIN_SECONDS = 20
+"""So long its cluster is given then."""
+
+JOIN = """
+import sys, ray
+try:
+    ray.init(address=sys.argv[1], configure_logging=False, log_to_driver=False)
+except Exception as error:
+    print(type(error).__name__, *str(error).split()[:60])
+    sys.exit(1)
+"""
+"""A trial in a process of its own: where there is no cluster, Ray asks for minutes and then ends the process."""
+
+SAME = (
+    "this machine must be one of its nodes (ray start --address=...), with the same versions of Ray and Python and the "
+    "same RAY_AUTH_MODE"
+)
 
 TIP = "(?s).*Tip: In future versions of Ray"
 """How a warning begins that Ray gives at every start, about accelerators, which are not used here."""
@@ -40,17 +61,26 @@ def connected(address: str | None, jobs: int | None) -> Any:
     if address is not None:
         _require_alive(address)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _without_notices():
             warnings.filterwarnings("ignore", TIP, FutureWarning)
             _join(ray, address, jobs)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
         where = "a cluster of this machine alone" if address is None else f"the Ray cluster at {address}"
         first = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise BackendError(
-            f"{where} cannot be used ({first}); this machine must be one of its nodes (ray start --address=...) and "
-            "have the same versions of Ray and Python"
-        ) from None
+        raise BackendError(f"{where} cannot be used ({first}); {SAME}") from None
     return ray
+
+
+@contextmanager
+def _without_notices() -> Iterator[None]:
+    """Ray tells at every start of a cluster how others are kept out of it; errors are told as ever."""
+    logger = logging.getLogger("ray")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def host_and_port(address: str) -> tuple[str, int]:
@@ -96,7 +126,7 @@ def _is_here(host: str) -> bool:
 
 
 def _require_alive(address: str) -> None:
-    """Raises BackendError unless a Ray cluster answers; Ray itself would ask for a minute, and end the process."""
+    """Raises BackendError unless a Ray cluster answers in time."""
     host, port = host_and_port(address)
     remedy = (
         f"start it with `ray start --head --port={port}` on {host}, or give the address of one that runs (`ray status` "
@@ -106,10 +136,11 @@ def _require_alive(address: str) -> None:
         socket.create_connection((host, port), timeout=ANSWER_SECONDS).close()
     except OSError as error:
         raise BackendError(f"no Ray cluster answers at {address} ({error.strerror or error}); {remedy}") from None
-    asked = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
+    asked = [sys.executable, "-c", JOIN, address]
     try:
-        found = subprocess.run(asked, capture_output=True, timeout=ANSWER_SECONDS, check=False).returncode == 0
+        found = subprocess.run(asked, capture_output=True, text=True, timeout=JOIN_SECONDS, check=False)
     except subprocess.TimeoutExpired:
-        found = False
-    if not found:
-        raise BackendError(f"what answers at {address} is no Ray cluster, or one of another version; {remedy}")
+        raise BackendError(f"what answers at {address} is no Ray cluster, or one too busy; {remedy}") from None
+    if found.returncode != 0:
+        told = found.stdout.strip().splitlines() or ["the connection was lost"]
+        raise BackendError(f"the Ray cluster at {address} cannot be used ({told[-1]}); {SAME}")
