@@ -73,8 +73,17 @@ class Fit(FitOptions):
         int | None,
         arg(metavar="N", constructor=int, help_behavior_hint=POINTS_HINT),
     ] = None
-    """Train on N rows that lie farthest apart (all rows if there are fewer). Time of a Gaussian process grows with the
-    cube of N."""
+    """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N as far as
+    --engine is exact."""
+    engine: Annotated[Literal["auto", "exact", "iterative", "inducing", "stochastic"], arg(metavar="NAME")] = "auto"
+    """How the posterior is computed. exact: from the covariance of all points. iterative: by conjugate gradients.
+    inducing: through fewer points, for friction curves and the like. stochastic: the same, on mini-batches. auto: by
+    the number of points, the features and the free memory, and says why. See docs/large-data.md."""
+    learning_points: Annotated[
+        int | None,
+        arg(metavar="N", constructor=int, help_behavior_hint="(default: all points up to 1500, else 1000)"),
+    ] = None
+    """Find the hyper-parameters on N of the points; the posterior is that of all points."""
     mean: Annotated[
         Literal["analytical", "zero"] | None, arg(metavar="analytical|zero", help_behavior_hint="(default: analytical)")
     ] = None
@@ -114,7 +123,7 @@ class Fit(FitOptions):
         dataset, rows_note = self._rows(dataset, system)
         model = make_model(command, system.to(self.device), dataset)
         points = min(command.points, len(dataset))
-        posterior = fit(terminal, model, dataset, points=points, **search_arguments(command))
+        posterior = fit(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
         with folder_written_whole(self.out) as folder:
             command._write(folder, posterior, KIND)
@@ -126,7 +135,7 @@ class Fit(FitOptions):
 
 def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> Any:
     """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
-    from forcegp.models.search import default_restarts
+    from forcegp.models.search import ALL_ROWS, default_restarts
 
     options: OptimizerOptions | None = how.get("options")  # networks have none, but steps of their own
     steps = model.steps if options is None else options.iterations + options.adam_steps
@@ -135,6 +144,9 @@ def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fittin
     with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
 
         def progress(restart: int, iteration: int, value: float) -> None:
+            if restart == ALL_ROWS:
+                report(restarts * steps, restarts * steps, f"all {how['points']} points: {iteration}, {value:.3g}")
+                return
             start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
             note = f"{start}iteration {iteration}, objective {_short(value)}"
             report(restart * steps + min(iteration, steps), restarts * steps, note)
@@ -153,6 +165,7 @@ def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
         "objective_start": result.history[0],
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
+        **({"engine": settings["engine_reason"]} if "engine_reason" in (settings := posterior.settings) else {}),
         "restarts": posterior.settings.get("restarts", 1),
         "iterations": len(result.history) - 1 if "optimizer" in posterior.settings else result.evaluations,
         "evaluations": result.evaluations,
@@ -174,6 +187,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     table = facts(
         f"{run}: {summary['model']}, learned from {summary['points']} points",
         {
+            **({"engine": summary["engine"]} if "engine" in summary else {}),
             "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",
             "negative log likelihood": f"{summary['nll']:.1f} nats",
             "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",

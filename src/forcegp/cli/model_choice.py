@@ -26,6 +26,8 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "force_noise": ("structured", "unconstrained", "analytical"),
     "restarts": SEARCHED,
     "jobs": SEARCHED,
+    "engine": ("structured", "unconstrained"),
+    "learning_points": ("structured", "unconstrained"),
     "backend": SEARCHED,
     "address": SEARCHED,
     "adam_steps": (*SEARCHED, "analytical"),
@@ -87,19 +89,22 @@ def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Mode
     return StructuredGP(system, prior, command.mean, noise)
 
 
-def search_arguments(command: Fit) -> dict[str, Any]:
-    """What `fit` of the model of a resolved command takes besides the data and the points."""
-    from forcegp.inference import OptimizerOptions
+def search_arguments(command: Fit, points: int) -> dict[str, Any]:
+    """What `fit` of the model of a resolved command takes besides the data and so many points."""
+    from forcegp.models.search import default_options
 
     if command.model in NETWORKS:
         return {"seed": command.seed}
     assert command.iterations is not None, "a resolved command has iterations"
+    engine = {"engine": command.engine, "learning_points": command.learning_points}
+    options = default_options(points)
     return {
         "seed": command.seed,
+        **(engine if command.model in MEANT_FOR["engine"] else {}),
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,
-        "options": OptimizerOptions(iterations=command.iterations, adam_steps=command.adam_steps),
+        "options": replace(options, iterations=command.iterations, adam_steps=command.adam_steps),
     }
 
 

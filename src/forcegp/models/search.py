@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from forcegp.errors import NumericalError, NumericalWarning
-from forcegp.inference import OptimizationResult
+from forcegp.inference import OptimizationResult, OptimizerOptions
 from forcegp.models.noise import ACCELERATION, FORCE
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.parallel import Backend, Joblib, Serial
@@ -36,11 +36,23 @@ SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
 
 FitProgress = Callable[[int, int, float], None]
-"""Called as progress(restart, iteration, objective)."""
+"""Called as progress(restart, iteration, objective), and with restart `ALL_ROWS` while an engine takes in all rows."""
+
+ALL_ROWS = -1
+"""Instead of a restart: the value is then the relative residual of conjugate gradients, or the bound on all rows."""
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
 
 Outcome = TypeVar("Outcome")
+
+
+LARGE = OptimizerOptions(tolerance=1e-5)
+"""The search on more rows than that, where an iteration takes seconds and the objective is thousands of nats."""
+
+
+def default_options(points: int) -> OptimizerOptions:
+    """The search where none is given."""
+    return LARGE if points > MOST_POINTS_FOR_RESTARTS else OptimizerOptions()
 
 
 def default_restarts(points: int) -> int:

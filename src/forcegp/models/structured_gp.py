@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, get_args
 
 from torch import Tensor
@@ -39,9 +40,11 @@ from forcegp.models.physical_start import PhysicalStart
 from forcegp.models.prior_checks import check_prior
 from forcegp.models.protocol import Model
 from forcegp.models.search import (
+    ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
     FitProgress,
     blas_threads,
+    default_options,
     default_restarts,
     perturbed,
     run_restarts,
@@ -54,8 +57,6 @@ from forcegp.priors import ForcePrior, JointForces, prior_to_dict
 
 CONTINUE_FROM = 250
 """Rows of the fit at whose end a search on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
-LARGE = OptimizerOptions(tolerance=1e-5)
-"""The search on so many rows, where an iteration takes seconds and the objective is thousands of nats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,8 @@ class StructuredGP(Model):
             memory, and says why in `settings["engine_reason"]`.
         learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
             up to 1500, and 1000 beyond. The posterior is that of all points.
-        progress: called as progress(restart, iteration, nll) where the restarts run in this process.
+        progress: called as progress(restart, iteration, nll) where the restarts run in this process. The restart is
+            `models.search.ALL_ROWS` while the engine takes in all points.
 
         Where the prior has a friction that is proportional to the normal force, and no `expected` friction is given,
         the fit is repeated with the normal force under the friction that was found, until it settles (not with
@@ -165,7 +167,8 @@ class StructuredGP(Model):
         first = self._fit(rows, dataset, restarts, start, learn, prior_strength, **how)
         if learn is None:
             first = self._with_refined_loads(first, rows, dataset, how)
-        return on_all_rows(first, all_rows, chosen, described_rows(all_rows, dataset), hyperprior)
+        report = None if progress is None else partial(progress, ALL_ROWS)
+        return on_all_rows(first, all_rows, chosen, described_rows(all_rows, dataset), hyperprior, report)
 
     def _continuation(
         self, rows: Dataset, dataset: Dataset, restarts: int | None, how: Mapping[str, Any]
@@ -174,7 +177,9 @@ class StructuredGP(Model):
         if len(rows) <= MOST_POINTS_FOR_RESTARTS or restarts not in (None, 1):
             return None
         few = farthest_rows(rows, CONTINUE_FROM)
-        begin = {**how, "options": how["options"] or OptimizerOptions(iterations=100, tolerance=1e-6)}
+        options = how["options"] or default_options(len(rows))
+        shorter = replace(options, iterations=min(100, options.iterations), tolerance=max(1e-6, options.tolerance))
+        begin = {**how, "options": shorter}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # the fit to all rows will say it
             return dict(self._fit(few, dataset, 1, None, None, 0.0, **begin).parameters)
@@ -224,7 +229,7 @@ class StructuredGP(Model):
         if begin is not None and hyperprior:
             kernels = with_variance_priors(kernels)
         moments = (kernels.initial_parameters() if begin is None else begin.path[-1]) | learned_noise
-        options = options or (LARGE if len(rows) > MOST_POINTS_FOR_RESTARTS else OptimizerOptions())
+        options = options or default_options(len(rows))
         if PHYSICAL in (start or {}):
             raise InvalidInput(
                 f"start has {PHYSICAL!r}, numbers in units that the data of their own fit gave them; leave it out, and "
