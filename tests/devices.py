@@ -78,18 +78,18 @@ class PretendTensor(torch.Tensor):
 class _PretendGenerator(torch.Generator):
     """A generator of the pretended device, which draws the numbers of the CPU's."""
 
-    pretended = False
-
     def __new__(cls, device: Any = "cpu") -> Any:
         made = super().__new__(cls, "cpu")
-        made.pretended = torch.device(device) == PRETEND
+        _GENERATORS[made._cdata] = torch.device(device)
         return made
 
     @property
     def device(self) -> torch.device:
-        return PRETEND if self.pretended else torch.device("cpu")
+        return _GENERATORS[self._cdata]
 
 
+_GENERATORS: dict[int, torch.device] = {}
+"""By their address: an operation sees another Python object of the same generator."""
 _ROUND_TRIPS: list[Counter[str]] = [Counter()]
 
 
@@ -147,8 +147,8 @@ def _dispatch(func: Any, args: Any, kwargs: dict[str, Any], trips: Counter[str])
         trips["number"] += 1
     generator = kwargs.get("generator")
     wanted = pretended[0].device if pretended else torch.device(asked or "cpu")
-    if isinstance(generator, _PretendGenerator) and generator.device.type != wanted.type:
-        raise MixedDevices(f"{func}: a generator of {generator.device} for a tensor on {wanted}")
+    if generator is not None and _GENERATORS.get(generator._cdata, torch.device("cpu")).type != wanted.type:
+        raise MixedDevices(f"{func}: a generator of another device for a tensor on {wanted}")
     inner = tree_map(lambda x: x.inner if isinstance(x, PretendTensor) else x, (args, kwargs))
     if asked is not None:
         inner[1]["device"] = torch.device("cpu")

@@ -80,14 +80,13 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
     jitter = 0.0
     for relative in JITTER_LADDER:
         matrix = build()
-        mean_diagonal = float(matrix.diagonal().mean()) if matrix.shape[0] else 1.0
         if not bool(torch.isfinite(matrix.diagonal()).all()):
             raise NumericalError(
                 "the covariance matrix has entries that are not finite; check the data for huge or constant columns "
                 "and the start values "
                 "of the hyper-parameters"
             )
-        jitter = relative * mean_diagonal
+        jitter = relative * float(matrix.diagonal().mean()) if relative and matrix.shape[0] else relative
         if jitter:
             matrix.diagonal().add_(jitter)
         lower, ok = _cholesky_in_place(matrix)
@@ -116,7 +115,7 @@ def _is_for_lapack(matrix: Tensor) -> bool:
 def _cholesky_in_place(matrix: Float[Tensor, "n n"]) -> tuple[Float[Tensor, "n n"], bool]:
     if not _is_for_lapack(matrix):
         lower, info = torch.linalg.cholesky_ex(matrix)
-        return lower, bool(info == 0) and bool(torch.isfinite(lower.diagonal()).all())
+        return lower, bool((info == 0) & torch.isfinite(lower.diagonal()).all())  # one wait for a GPU, not two
     factor, info = lapack.dpotrf(matrix.numpy().T, lower=0, clean=0, overwrite_a=1)
     lower = torch.from_numpy(factor.T)
     return lower, info == 0 and bool(torch.isfinite(lower.diagonal()).all())

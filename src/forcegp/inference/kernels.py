@@ -87,8 +87,8 @@ class LatentKernels(torch.nn.Module):
         """A copy that holds `parameters`, without gradients; this one is not changed."""
         copy = deepcopy(self)
         for name, value in copy.named_parameters():
-            value.data = parameters[name].detach().clone().reshape(value.shape)
             value.requires_grad_(False)
+            value.copy_(parameters[name].detach().reshape(value.shape))
         return copy
 
     def _at(self, parameters: Mapping[str, Tensor], what: torch.nn.Module, *arguments: object) -> Any:

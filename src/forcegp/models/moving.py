@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 def moved(posterior: Posterior, device: torch.device | str) -> Posterior:
     """`Posterior.to`."""
     model = replace(posterior.model, system=posterior.model.system.to(device))
-    device = model.system.robot.device
+    at: torch.device = model.system.robot.device
     result = replace(
         posterior.result,
-        parameters=_all_on(posterior.result.parameters, device),
-        iterates=tuple(_all_on(point, device) for point in posterior.result.iterates),
+        parameters=_all_on(posterior.result.parameters, at),
+        iterates=tuple(_all_on(point, at) for point in posterior.result.iterates),
     )
-    solution = None if posterior.solution is None else posterior.solution.to(device)
+    solution = None if posterior.solution is None else posterior.solution.to(at)
     there: Any = model.condition(
-        posterior.training.to(device), _all_on(posterior.parameters, device), result, posterior.settings, solution
+        posterior.training.to(at), _all_on(posterior.parameters, at), result, posterior.settings, solution
     )
     identification = getattr(posterior, "identification", None)
     if identification is not None:
