@@ -1,0 +1,235 @@
+"""The predictor says what `predict` says, faster; its compressed covariance is never below the exact one."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
+from forcegp.models import IndependentGP, StructuredGP, StructuredPosterior
+from forcegp.models.marginal_likelihood import TrainingData
+from forcegp.priors import ContactFriction, JointFriction, NoForces, Payload
+from forcegp.robots import inertia
+
+TIP = (0.0, 0.0, 0.2)
+CONTACTS = {
+    "none": [],
+    "sphere": [Contact("hand", TIP, Sphere((0.0, 0.0, -1.0), 1.5))],
+    "implicit": [Contact("hand", TIP, ImplicitSurface(lambda p: p[2] - 0.3 * torch.sin(2 * p[0]) - 0.1 * p[1] ** 2))],
+    "two": [
+        Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.4)),
+        Contact("hand", (0.0, 0.1, 0.2), Sphere((0.0, 0.0, -1.0), 1.5)),
+    ],
+    "redundant": [Contact("hand", TIP, Plane((0.2, 0.0, 1.0), 0.4))] * 2,
+}
+SHORT = OptimizerOptions(iterations=3)
+
+
+def fitted(model: StructuredGP, rows: int = 30) -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        return model.fit(arm_data(rows, 0), restarts=1, options=SHORT)
+
+
+@pytest.fixture(scope="module")
+def posterior() -> StructuredPosterior:
+    return fitted(StructuredGP(arm_system()))
+
+
+@pytest.fixture(scope="module")
+def states() -> tuple[torch.Tensor, ...]:
+    data = arm_data(5, 1)
+    return tuple(torch.tensor(x) for x in (data.q, data.v, data.u))
+
+
+def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-10):
+    assert found.shape == expected.shape
+    assert float((found - expected).abs().max()) <= tolerance * (1e-300 + float(expected.abs().max()))
+
+
+def check(posterior: StructuredPosterior, states: tuple[torch.Tensor, ...]):
+    """Mean, exact covariance and derivatives are those of `predict`, for one state and for several."""
+    predictor = posterior.predictor(covariance="exact")
+    expected = posterior.predict(*states)
+    mean, covariance = predictor(*states)
+    assert_close(mean, expected.mean)
+    assert_close(predictor.mean(*states), expected.mean)
+    assert_close(covariance, expected.covariance, 1e-9)
+    alone = tuple(x[2] for x in states)
+    assert_close(predictor.mean(*alone), expected.mean[2])
+    assert_close(predictor(*alone)[1], expected.covariance[2], 1e-9)
+    derivatives = torch.autograd.functional.jacobian(
+        lambda *x: posterior.predict(*(y[None] for y in x), covariance=False).mean[0], alone
+    )
+    for linear in (predictor.linearize(*alone), [part[2] for part in predictor.linearize(*states)]):
+        assert_close(linear[0], expected.mean[2])
+        for found, derivative in zip(linear[1:], derivatives, strict=True):
+            assert float((found - derivative).abs().max()) <= 1e-9 * (1.0 + float(derivative.abs().max()))
+
+
+@pytest.mark.parametrize("contacts", CONTACTS)
+def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
+    check(posterior.with_contacts(CONTACTS[contacts]), states)
+
+
+@pytest.mark.parametrize(
+    ("prior", "mean"),
+    [
+        (JointFriction() + ContactFriction(load=True, expected=0.2), "analytical"),
+        (ContactFriction(inputs=("velocity", "position")), "analytical"),
+        (NoForces(), "analytical"),
+        (JointFriction(), "zero"),
+    ],
+    ids=["friction under load", "friction map", "no forces", "zero mean"],
+)
+def test_it_is_predict_with_any_prior(states, prior, mean: str):
+    check(fitted(StructuredGP(arm_system(), prior, mean)), states)
+
+
+def test_it_has_the_inertias_that_were_learned(posterior, states):
+    robot = posterior.system.robot
+    heavier = robot.inertial_parameters("hand")["hand"] + torch.tensor([0.3] + [0.0] * 9, dtype=torch.float64)
+    assert inertia.physical_from_parameters(heavier)[0] > 0.6
+    parameters = {**posterior.parameters, "inertials.hand": heavier}
+    check(posterior.model.condition(posterior.training, parameters, posterior.result, posterior.settings), states)
+
+
+def test_constant_kernels_have_no_slopes_of_their_own(states):
+    posterior = fitted(StructuredGP(arm_system(), Payload("hand")))
+    predictor = posterior.predictor(covariance="exact")
+    # the weights of a constant cancel: every sum of them is only as exact as this
+    assert_close(predictor.mean(*states), posterior.predict(*states).mean, 1e-5)
+    x = tuple(part.clone().requires_grad_() for part in states)
+    slopes = torch.autograd.grad(predictor.mean(*x)[:, 1].sum(), x)
+    for found, slope in zip(predictor.linearize(*states)[1:], slopes, strict=True):
+        assert_close(found[:, 1], slope, 1e-6)
+
+
+def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states):
+    compiled = posterior.predictor(tolerance=100.0)
+    eager = posterior.predictor(tolerance=100.0, compile=False)
+    assert compiled.rank == eager.rank > 1
+
+    def gradients(predictor) -> tuple[torch.Tensor, ...]:
+        x = tuple(part.clone().requires_grad_() for part in states)
+        mean, covariance = predictor(*x)
+        return torch.autograd.grad(
+            mean.square().mean() + covariance.diagonal(dim1=1, dim2=2).sqrt().sum() + covariance[:, 0, 1].sum(), x
+        )
+
+    for found, expected in zip(gradients(compiled), gradients(eager), strict=True):
+        assert_close(found, expected, 1e-6)
+    for found, expected in zip(compiled.linearize(*states), eager.linearize(*states), strict=True):
+        assert_close(found, expected)
+
+
+def test_gradients_of_the_covariance_are_differences_of_it(posterior, states):
+    predictor = posterior.predictor(tolerance=0.1)
+    state = [x[0] for x in states]
+    direction = [torch.linspace(-1.0, 1.0, 3, dtype=torch.float64) for _ in state]
+    moved = [x.clone().requires_grad_() for x in state]
+    slopes = torch.autograd.grad(predictor(*moved)[1].diagonal().sqrt().sum(), moved)
+    slope = sum(float(g @ d) for g, d in zip(slopes, direction, strict=True))
+    step = 1e-5
+
+    def spread(scale: float) -> float:
+        return float(
+            predictor(*(x + scale * d for x, d in zip(state, direction, strict=True)))[1].diagonal().sqrt().sum()
+        )
+
+    assert slope == pytest.approx((spread(step) - spread(-step)) / (2 * step), rel=1e-5)
+
+
+def test_the_compressed_covariance_is_never_below_the_exact_one(posterior, states):
+    exact = posterior.predict(*states).covariance
+    for rank in (1, 5, 20):
+        with pytest.warns(NumericalWarning, match=f"rank {rank} makes"):
+            predictor = posterior.predictor(tolerance=1e-9, largest_rank=rank)
+        assert predictor.rank == rank
+        excess = predictor(*states)[1] - exact
+        assert float(torch.linalg.eigvalsh(excess).min()) > -1e-9 * float(exact.abs().max())
+    assert float(excess.diagonal(dim1=1, dim2=2).max()) > 1e-6 * float(exact.abs().max())  # it is a compression
+
+
+def test_the_rank_keeps_the_tolerance_and_no_more(posterior):
+    loose, tight = (posterior.predictor(tolerance=tolerance, compile=False) for tolerance in (100.0, 0.01))
+    assert loose.rank < tight.rank <= 2 * 30
+    assert 0.01 < float(loose.inflation.max()) <= 100.0
+    assert float(tight.inflation.max()) <= 0.01
+    rows = posterior.training
+    compressed = tight(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
+    ratio = (compressed / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt()
+    assert 1.0 - 1e-6 < float(ratio.min()) <= float(ratio.max()) < 1.02
+
+
+def test_many_states_are_one_by_one(posterior):
+    predictor = posterior.predictor(tolerance=0.1)
+    data = arm_data(3000, 3)  # more than one block
+    mean, covariance = predictor(data.q, data.v, data.u)
+    assert mean.shape == (3000, 3)
+    assert covariance.shape == (3000, 3, 3)
+    for row in (0, 1499, 2999):
+        alone = predictor(*(np.array(x[row]) for x in (data.q, data.v, data.u)))
+        assert_close(alone[0], mean[row])
+        assert_close(alone[1], covariance[row], 1e-9)
+    assert predictor.mean(data.q[:0], data.v[:0], data.u[:0]).shape == (0, 3)
+
+
+def test_a_copy_in_another_process_is_the_same(posterior, states):
+    predictor = posterior.predictor(covariance="none")
+    copied = pickle.loads(pickle.dumps(predictor))
+    assert torch.equal(copied.mean(*states), predictor.mean(*states))
+
+
+def test_predictions_without_a_graph_need_none(posterior, states):
+    predictor = posterior.predictor(covariance="none")
+    assert not predictor.mean(*states).requires_grad
+    x = [part.clone().requires_grad_() for part in states]
+    with torch.no_grad():
+        assert not predictor.mean(*x).requires_grad
+    with pytest.raises(InvalidInput, match="first derivatives only"):
+        torch.autograd.grad(predictor.mean(*x).sum(), x, create_graph=True)
+
+
+def test_errors_name_the_remedy(posterior, states):
+    predictor = posterior.predictor(covariance="none")
+    q, v, u = states
+    with pytest.raises(InvalidInput, match=r"u \(5, 2\); give all three \(3,\)"):
+        predictor.mean(q, v, u[:, :2])
+    with pytest.raises(InvalidInput, match=r"v \(3,\)"):
+        predictor.mean(q, v[0], u)
+    with pytest.raises(InvalidInput, match="not finite"):
+        predictor.mean(q, v * float("nan"), u)
+    with pytest.raises(InvalidInput, match="covariance='compressed' or 'exact'"):
+        predictor(q, v, u)
+    with pytest.raises(InvalidInput, match="covariance is 'dense'; give one of 'compressed', 'exact', 'none'"):
+        posterior.predictor(covariance="dense")
+    with pytest.raises(InvalidInput, match=r"tolerance is 0\.0 .*give a positive number"):
+        posterior.predictor(tolerance=0.0)
+    with pytest.raises(NumericalError, match="not finite"):
+        predictor.mean(q, v * 1e200, u)
+
+
+def test_operations_that_no_tape_holds_are_named(posterior, states):
+    surface = ImplicitSurface(lambda p: p[2] + torch.special.bessel_j0(p[0]))
+    bent = posterior.with_contacts([Contact("hand", TIP, surface)])
+    with pytest.raises(InvalidInput, match=r"operation aten.*bessel_j.*compile=False"):
+        bent.predictor(covariance="none")
+    eager = bent.predictor(covariance="none", compile=False)
+    assert_close(eager.mean(*states), bent.predict(*states).mean)
+
+
+def test_other_models_have_none(states):
+    model = IndependentGP(arm_system())
+    training = TrainingData.of(arm_data(8, 0), torch.device("cpu"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        other = model.fit(arm_data(8, 0), restarts=1, options=SHORT)
+    assert len(training.q) == 8
+    with pytest.raises(InvalidInput, match="has no predictor for control rates; call predict"):
+        other.predictor()
