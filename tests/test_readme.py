@@ -139,6 +139,13 @@ def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Pat
     assert done.stdout.splitlines()[-1] == "70 40"
 
 
+def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "gpu.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "cpu"
+
+
 def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
     page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)

@@ -66,6 +66,7 @@ WRONG = [
     ("fit arm.h5 --out arm.h5 --overwrite", "was not written by `forcegp fit`"),
     ("fit arm.h5", "--out"),
     ("fit arm.h5 --pionts 5 --out run", "--pionts, 5. Perhaps you meant: --points N."),
+    ("fit arm.h5 --device cuda:999 --out run", "device 'cuda:999' cannot be used here; there is cpu"),
     ("fit arm.h5 --points five --out run", "--points: invalid literal for int() with base 10: 'five'"),
     ("fit arm.h5 --model magic --out run", "'magic'"),
     ("fit arm.h5 --model independent-gp --mean zero --out run", "--mean means nothing to --model independent-gp"),
