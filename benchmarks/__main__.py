@@ -20,7 +20,7 @@ README = FOLDER / "README.md"
 BEGIN, END = "<!-- table: written by `make bench` -->", "<!-- end of table -->"
 
 # Each question is a module with run() -> {key: number}; each key has a bound and a meaning.
-QUESTIONS = ("likelihood", "rigid_body", "compiled_dynamics", "learning", "incremental")
+QUESTIONS = ("likelihood", "rigid_body", "compiled_dynamics", "learning", "incremental", "prediction")
 MEANINGS = {
     "nll_speedup_n400": (">= 4.5", "NLL + all gradients, N = 400, one contact: dense time / deflated time"),
     "nll_speedup_n1000": (">= 5", "the same at N = 1000"),
@@ -59,6 +59,19 @@ MEANINGS = {
     "stream_mae_information_b200": ("", "the same: rows kept that tell most beyond the others"),
     "stream_mae_divergence_b200": ("", "the same: rows kept that move the posterior most (the default)"),
     "stream_mae_hindsight_b200": ("", "the same: conditioned at once on the 200 of 2000 rows that lie farthest apart"),
+    "predict_mean_ms": ("<= 0.3", "predictor, one state, N = 1000, 7 joints, one plane: mean, median [ms, wall-clock]"),
+    "predict_mean_p99_ms": ("", "the same: 99th percentile"),
+    "predict_cov_ms": ("<= 1", "the same with covariance: median [ms, wall-clock]"),
+    "predict_cov_p99_ms": ("", "the same: 99th percentile"),
+    "predict_linearize_ms": ("", "the mean and its derivatives in q, v and u: median [ms, wall-clock]"),
+    "predict_plain_mean_ms": ("", "what posterior.predict takes for the mean of one state: median [ms]"),
+    "predict_plain_cov_ms": ("", "the same with covariance [ms]"),
+    "predict_states_per_s_b10000": (">= 30000", "predictor, mean of 10,000 states at once [states/s]"),
+    "predict_cov_states_per_s_b10000": ("", "the same with covariance [states/s]"),
+    "predict_cov_inflation_median": ("", "compressed standard deviations over exact ones - 1, another seed: median"),
+    "predict_cov_inflation_p99": ("<= 0.02", "the same: 99th percentile"),
+    "predict_rank": ("", "combinations of the data that the compressed covariance uses, of 6000"),
+    "predict_prepare_s": ("", "making the predictor: tracing, compiling, compressing [s, wall-clock]"),
 }
 
 

@@ -205,6 +205,8 @@ def test_errors_name_the_remedy(posterior, states):
         predictor.mean(q, v[0], u)
     with pytest.raises(InvalidInput, match="not finite"):
         predictor.mean(q, v * float("nan"), u)
+    with pytest.raises(InvalidInput, match="another device than the predictor; move all three to cpu"):
+        predictor.mean(q.to("meta"), v, u)
     with pytest.raises(InvalidInput, match="covariance='compressed' or 'exact'"):
         predictor(q, v, u)
     with pytest.raises(InvalidInput, match="covariance is 'dense'; give one of 'compressed', 'exact', 'none'"):

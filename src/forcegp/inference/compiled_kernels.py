@@ -72,7 +72,8 @@ template <int B> static void block(long d, long centers, const double *in, const
     }
     exponentials<B>(e, k);
     EACH sum[g] += *(const V *)(weights + g * centers + j) * k[g];
-    if (cross) EACH memcpy(cross + g * valid + j, &k[g], (valid - j < LANES ? valid - j : LANES) * sizeof(double));
+    const long left = valid - j < LANES ? valid - j : LANES;       // the rest only fills up
+    if (cross && left > 0) EACH memcpy(cross + g * valid + j, &k[g], left * sizeof(double));
   }
   EACH { mean[g] = 0.0; for (int l = 0; l < LANES; ++l) mean[g] += sum[g][l]; }
 }

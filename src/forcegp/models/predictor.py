@@ -144,6 +144,8 @@ class Predictor:
             raise InvalidInput(
                 f"a predictor was given {shapes}; give all three ({self.nv},) for one state or (n, {self.nv})."
             )
+        if any(x.device.type != self.device.type for x in states):
+            raise InvalidInput(f"q, v or u is on another device than the predictor; move all three to {self.device}.")
         x = torch.cat(states, dim=-1)
         if not math.isfinite(float(x.detach().sum())):
             raise InvalidInput("q, v or u has values that are not finite; a predictor needs finite states.")

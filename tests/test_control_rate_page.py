@@ -1,0 +1,26 @@
+"""The example of docs/control-rate.md runs as it stands."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "control-rate.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    rank, one, linear, many, gradient = done.stdout.splitlines()
+    found, excess = re.fullmatch(r"rank (\d+), standard deviations at most (\S+)% too large", rank).groups()
+    assert 1 < int(found) <= 300
+    assert 0.0 < float(excess) <= 1.0
+    assert one == "torch.Size([7]) torch.Size([7, 7])"
+    assert linear == "torch.Size([7, 7]) torch.Size([7, 7]) torch.Size([7, 7])"
+    assert (many, gradient) == ("torch.Size([1000, 7])", "torch.Size([7])")
+
+
+def test_the_pages_that_it_names_exist(repository: Path):
+    page = (repository / "docs" / "control-rate.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)#]+)\)", page)
+    assert links
+    assert not [link for link in links if not (repository / "docs" / link).exists()]
