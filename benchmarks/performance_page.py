@@ -1,0 +1,62 @@
+"""docs/performance.md from results.json: every key with its bound and whether it is kept. A test keeps both equal."""
+
+from __future__ import annotations
+
+import json
+import operator
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.questions import MEANINGS, TITLES
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGE = DOCS / "performance.md"
+SCALING = DOCS / "performance" / "scaling.json"
+
+INTRODUCTION = """# Performance
+
+Measured, never estimated: this page is written by `make bench` from [benchmarks/results.json](../benchmarks/results.json),
+and never by hand. Every table can be had again by its command. Times are CPU seconds and medians unless it says otherwise;
+ratios compare both sides in the same process on one thread.
+
+What the engines are: [large-data.md](large-data.md); predictors: [control-rate.md](control-rate.md); compiled dynamics:
+[compiled-dynamics.md](compiled-dynamics.md); clusters: [clusters.md](clusters.md); updates: [incremental.md](incremental.md);
+solvers that were tried and not taken: [solvers.md](solvers.md). No GPU has been measured yet: [gpu.md](gpu.md).
+"""  # noqa: E501  # one line of the page each
+
+COMPARISONS = {"<=": operator.le, ">=": operator.ge}
+
+
+def performance_page(results: Mapping[str, Any]) -> str:
+    """The whole page."""
+    parts = [INTRODUCTION]
+    for question, title in TITLES.items():
+        known = {key: meaning for key, meaning in MEANINGS[question].items() if key in results}
+        if not known:
+            continue
+        rows = ["| what | measured | asked | kept |", "|:---|---:|:---|:---|"]
+        for key, (bound, meaning) in known.items():
+            rows.append(f"| {meaning} (`{key}`) | {results[key]:.4g} | {bound} | {kept(results[key], bound)} |")
+        parts += [f"## {title}\n\n`python -m benchmarks {question}`\n", "\n".join(rows) + "\n"]
+        if question == "scaling" and SCALING.exists():
+            parts += ["![CPU time and memory over the number of training rows](performance/scaling.png)\n", scaling()]
+    parts.append(f"{results['machine']}, {results['date']} (the newest of the measurements above).\n")
+    return "\n".join(parts)
+
+
+def kept(value: float, bound: str) -> str:
+    """Whether a bound such as "<= 0.5" is kept; empty without one."""
+    if not bound:
+        return ""
+    sign, number = bound.split()
+    return "yes" if COMPARISONS[sign](value, float(number)) else "**no**"
+
+
+def scaling() -> str:
+    """Time and memory of every case, from what the question `scaling` wrote."""
+    measured = json.loads(SCALING.read_text(encoding="utf-8"))
+    rows = ["| engine | N | CPU s | MiB |", "|:---|---:|---:|---:|"]
+    for engine, found in measured.items():
+        rows += [f"| {engine} | {int(n):,} | {x['cpu_s']:.2f} | {x['memory_mib']:.0f} |" for n, x in found.items()]
+    return "\n".join(rows) + "\n"

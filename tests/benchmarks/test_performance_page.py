@@ -1,0 +1,45 @@
+"""docs/performance.md is what its JSON says, and every number on it has a meaning and a question that measures it."""
+
+import json
+from importlib.util import find_spec
+
+import pytest
+from benchmarks.__main__ import README, RESULTS, table
+from benchmarks.performance_page import PAGE, kept, performance_page
+from benchmarks.questions import MEANINGS, TITLES
+
+ABOUT_ALL = {"machine", "date"}
+
+
+@pytest.fixture(scope="module")
+def results():
+    return json.loads(RESULTS.read_text(encoding="utf-8"))
+
+
+def test_the_page_equals_its_numbers(results):
+    assert PAGE.read_text(encoding="utf-8") == performance_page(results)
+    assert table(results) in README.read_text(encoding="utf-8")
+
+
+def test_every_number_has_a_meaning(results):
+    known = {key for meanings in MEANINGS.values() for key in meanings}
+    assert set(results) - known == ABOUT_ALL
+
+
+def test_every_question_is_a_module():
+    assert list(TITLES) == list(MEANINGS)
+    assert all(find_spec(f"benchmarks.{question}") for question in TITLES)
+
+
+@pytest.mark.parametrize(
+    ("value", "bound", "expected"),
+    [
+        (0.5, "<= 0.5", "yes"),
+        (0.51, "<= 0.5", "**no**"),
+        (2.0, ">= 1.6", "yes"),
+        (1.0, ">= 1.6", "**no**"),
+        (1.0, "", ""),
+    ],
+)
+def test_bounds(value, bound, expected):
+    assert kept(value, bound) == expected
