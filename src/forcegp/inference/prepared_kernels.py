@@ -137,17 +137,26 @@ class PreparedKernels:
         self, inputs: Sequence[Float[Tensor, "n _"]], slopes: Sequence[Float[Tensor, "n _ x"]]
     ) -> tuple[Float[Tensor, "n C"], Float[Tensor, "n C x"]]:
         """E f_c and its derivatives in whatever the inputs have the derivatives `slopes` in."""
+        means, parts = [], []
+        for number, (x, slope) in enumerate(zip(inputs, slopes, strict=True)):
+            f, gradient = self._group_gradient(number, x)
+            means.append(f)
+            parts.append((gradient[..., None, :] @ slope.view(*gradient.shape, slope.shape[-1]))[..., 0, :])
+        return self.ordered(means), self.ordered(parts)
+
+    def _group_gradient(self, number: int, inputs: Tensor) -> tuple[Float[Tensor, "n G"], Float[Tensor, "n G _"]]:
+        """E f_c of a group and its derivatives in the inputs that belong to it."""
+        group, weights = self.groups[number], self.weights[number]
+        if isinstance(group, SharedCenters):
+            f, cross = self._group_mean(number, inputs.detach(), True)
+            assert cross is not None, "it was to be kept"
+            # the exponent is linear in the inputs, with z_j and 1 as slopes
+            return f, torch.cat([(cross * weights) @ group.centers, f[..., None]], dim=-1)
         with torch.enable_grad():
-            leaves = [x.detach().requires_grad_() for x in inputs]
-            f, _ = self.mean(leaves)
-            total = f.sum() + sum(leaf.sum() for leaf in leaves) * 0.0  # constant kernels use no inputs
-            gradients = torch.autograd.grad(total, leaves)
-        # latents have no inputs in common, so the gradient of their sum has all of theirs side by side
-        parts = [
-            (gradient[..., None] * slope).reshape(len(f), len(group.latents), -1, slope.shape[-1]).sum(2)
-            for group, gradient, slope in zip(self.groups, gradients, slopes, strict=True)
-        ]
-        return f.detach(), self.ordered(parts)
+            leaf = inputs.detach().requires_grad_()
+            f, _ = self._group_mean(number, leaf, False)
+            (gradient,) = torch.autograd.grad(f.sum() + 0.0 * leaf.sum(), leaf)  # a constant kernel does not use it
+        return f.detach(), gradient[:, None]
 
     def diagonal(self, inputs: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
         """Prior variances."""

@@ -130,7 +130,7 @@ class Predictor:
             return terms.offset, slopes.offset
         f, df = self.prepared.mean_and_slopes(terms.inputs, slopes.inputs)
         a = terms.offset + (terms.W @ f[..., None])[..., 0]
-        return a, slopes.offset + (slopes.W * f[:, None, :, None]).sum(2) + terms.W @ df
+        return a, slopes.offset + (f[:, None, None] @ slopes.W)[:, :, 0] + terms.W @ df
 
     def _rows(self, q: Any, v: Any, u: Any) -> tuple[Tensor, bool]:
         """One row [q, v, u] per state, and whether it was a single state."""
