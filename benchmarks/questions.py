@@ -11,6 +11,7 @@ TITLES = {
     "prediction": "Predictions at control rates",
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
+    "backends": "Restarts in several processes",
 }
 """The questions in the order in which they are asked, and their headings in docs/performance.md."""
 
@@ -118,5 +119,15 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "slope_iterative": ("", "conjugate gradients: the same"),
         "slope_inducing": ("", "inducing points of the prior tool-friction: the same"),
         "slope_stochastic": ("", "mini-batches (100 steps), then one pass: the same"),
+    },
+    "backends": {
+        "joblib_speedup_8_restarts": (
+            ">= 1.6",
+            "8 restarts, N = 200: wall-clock time in this process / in two warm processes (joblib)",
+        ),
+        "joblib_cold_seconds": ("", "what the first call takes longer, which starts the processes [s, wall-clock]"),
+        "ray_overhead_seconds": ("", "the same on a Ray cluster of this machine: time beyond joblib's [s, wall-clock]"),
+        "ray_cold_seconds": ("", "what its first call takes longer, which starts the cluster [s, wall-clock]"),
+        "backends_identical": (">= 1", "1 if all parameters are the same to the last bit on all three backends"),
     },
 }
