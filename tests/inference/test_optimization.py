@@ -310,3 +310,18 @@ def test_steps_that_shrink_before_a_wall_are_not_convergence():
     result = minimize_objective(walled, {"x": tensor(0.0)})
     assert not result.converged
     assert "beyond the wall" in result.status
+
+
+def test_slow_progress_ends_the_search_and_says_so():
+    def valley(parameters):
+        x, y = parameters["x"]
+        return 100.0 * (y - x**2) ** 2 + (1.0 - x) ** 2
+
+    start = {"x": torch.tensor([-1.2, 1.0], dtype=torch.float64)}
+    patient = minimize_objective(valley, start)
+    content = minimize_objective(valley, start, OptimizerOptions(slow=50.0))
+    assert content.converged
+    assert "10 iterations lower the objective by less than 50 nats" in content.status
+    assert len(content.history) < len(patient.history)
+    assert content.history[-11] - content.history[-1] < 50.0
+    assert content.value == min(content.history)

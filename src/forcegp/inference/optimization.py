@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
 from forcegp.errors import FitError, InvalidInput, NumericalError, NumericalWarning
@@ -20,6 +20,12 @@ ProgressCallback = Callable[[int, float], None]
 LINE_SEARCH_FAILED = 2
 """scipy's L-BFGS-B: neither converged (0) nor stopped by a limit (1)."""
 
+HALTED = 99
+"""The status that scipy gives where its callback ended the search."""
+
+SLOW_ITERATIONS = 10
+"""Iterations over which the progress of a search is judged."""
+
 SOME_FAILURES = 10
 """A line search that strays now and then meets this many points without a value at most; more of them are a wall."""
 
@@ -29,7 +35,7 @@ class OptimizerOptions:
     """How to search.
 
     `iterations`: most L-BFGS iterations; `tolerance`: stop when an iteration lowers the objective by less than this
-    fraction of it;
+    fraction of it; `slow`: stop when `SLOW_ITERATIONS` of them together lower it by less than this (nats), 0 for never;
     `gradient_tolerance`: stop when the largest gradient entry is below this; `adam_steps`, `adam_rate`: optional warm-
     up; `keep_iterates`: keep the parameters after every iteration, too.
     """
@@ -41,11 +47,18 @@ class OptimizerOptions:
     adam_steps: int = 0
     adam_rate: float = 0.1
     keep_iterates: bool = False
+    slow: float = 0.0
 
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.adam_steps < 0:
             raise InvalidInput(f"iterations={self.iterations} and adam_steps={self.adam_steps} must be >= 0")
-        if not (self.tolerance >= 0 and self.gradient_tolerance >= 0 and self.adam_rate > 0 and self.memory > 0):
+        if not (
+            self.tolerance >= 0
+            and self.slow >= 0
+            and self.gradient_tolerance >= 0
+            and self.adam_rate > 0
+            and self.memory > 0
+        ):
             raise InvalidInput("tolerances must be >= 0, adam_rate and memory > 0")
 
 
@@ -168,6 +181,15 @@ def minimize_objective(
         if progress is not None:
             progress(len(history) - 1, value)
 
+    def after_iteration(intermediate_result: OptimizeResult) -> None:
+        record(float(intermediate_result.fun), intermediate_result.x)
+        if (
+            options.slow
+            and len(history) > SLOW_ITERATIONS
+            and history[-1 - SLOW_ITERATIONS] - history[-1] < options.slow
+        ):
+            raise StopIteration  # ends the search at this point
+
     if options.adam_steps:
         _adam(search, options, record)
     if search.best_point.size:
@@ -184,7 +206,7 @@ def minimize_objective(
             search.best_point,
             jac=True,
             method="L-BFGS-B",
-            callback=lambda intermediate_result: record(float(intermediate_result.fun), intermediate_result.x),
+            callback=after_iteration,
             options={
                 "maxiter": remaining,
                 "maxfun": 4 * remaining,
@@ -194,7 +216,7 @@ def minimize_objective(
             },
         )
         remaining -= int(result.nit)
-        converged = bool(result.success)
+        converged = bool(result.success) or result.status == HALTED
         status = _sentence(int(result.status), str(result.message), options)
         steep = bool(np.abs(search.best_slope).max() > options.gradient_tolerance)
         if result.status == LINE_SEARCH_FAILED and search.failures > failures_before:
@@ -225,6 +247,8 @@ def _sentence(status: int, message: str, options: OptimizerOptions) -> str:
         return f"converged: the largest gradient entry is below {options.gradient_tolerance:g}"
     if status == 0:
         return f"converged: an iteration lowers the objective by less than {options.tolerance:g} of it"
+    if status == HALTED:
+        return f"converged: {SLOW_ITERATIONS} iterations lower the objective by less than {options.slow:g} nats"
     if status == LINE_SEARCH_FAILED:
         return "stopped where no step lowers the objective, as far as rounding lets it be seen"
     return f"stopped at the limit of {options.iterations} iterations; raise `iterations` to search on"

@@ -46,8 +46,10 @@ Objective = Callable[[Mapping[str, Tensor]], Tensor]
 Outcome = TypeVar("Outcome")
 
 
-LARGE = OptimizerOptions(tolerance=1e-5)
-"""The search on more rows than that, where an iteration takes seconds and the objective is thousands of nats."""
+LARGE = OptimizerOptions(tolerance=1e-6, slow=1.0)
+"""The search on more rows than that, where an evaluation takes seconds, and a nat over many iterations changes nothing
+that is predicted.
+"""
 
 
 def default_options(points: int) -> OptimizerOptions:

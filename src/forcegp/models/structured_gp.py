@@ -55,8 +55,8 @@ from forcegp.models.surface_distance import check_distance
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
 
-CONTINUE_FROM = 250
-"""Rows of the fit at whose end a search on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
+CONTINUE_FROM = (250, 500)
+"""Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +118,8 @@ class StructuredGP(Model):
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
         restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
             factors, every other one from a smoother start; the best final value wins. None means 4 up to 400 points,
-            where local optima cost most and searches cost little, and 1 beyond, which then begins where a fit to 250
-            of the rows ended. They draw kernel parameters only: all begin at the same physical values.
+            where local optima cost most and searches cost little, and 1 beyond, which then begins where searches on
+            250 and 500 of the rows ended. They draw kernel parameters only: all begin at the same physical values.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
         backend: where restarts run: `Serial()`, `Joblib(jobs)`, `Ray(address)` or a name, "serial", "joblib", "ray"
@@ -127,8 +127,7 @@ class StructuredGP(Model):
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
             maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood. With
             `learn` the variances of the processes have a weak one as well (`models.objective.with_variance_priors`).
-        options: the search itself; None stops beyond 400 points when an iteration lowers the objective by less than
-            1e-5 of it, and by less than 1e-8 up to there.
+        options: the search itself; None is `models.search.default_options`, which is content sooner beyond 400 points.
         start: unconstrained parameters at which the first search begins instead of moments, for example
             `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
         learn: physical parameters to estimate along with all others, from the values that the system has:
@@ -173,16 +172,19 @@ class StructuredGP(Model):
     def _continuation(
         self, rows: Dataset, dataset: Dataset, restarts: int | None, how: Mapping[str, Any]
     ) -> dict[str, Tensor] | None:
-        """Where a single search on many rows begins: at the end of one on few of them; None for few rows."""
+        """Where a single search on many rows begins: at the end of searches on fewer of them; None for few rows."""
         if len(rows) <= MOST_POINTS_FOR_RESTARTS or restarts not in (None, 1):
             return None
-        few = farthest_rows(rows, CONTINUE_FROM)
         options = how["options"] or default_options(len(rows))
-        shorter = replace(options, iterations=min(100, options.iterations), tolerance=max(1e-6, options.tolerance))
-        begin = {**how, "options": shorter}
+        stages = [stage for stage in CONTINUE_FROM if 1.5 * stage < len(rows)]
+        ordered = farthest_rows(rows, stages[-1])
+        start = None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # the fit to all rows will say it
-            return dict(self._fit(few, dataset, 1, None, None, 0.0, **begin).parameters)
+            for stage in stages:
+                begin = {**how, "options": options}
+                start = dict(self._fit(ordered.rows(slice(stage)), dataset, 1, start, None, 0.0, **begin).parameters)
+        return start
 
     def _with_refined_loads(
         self, first: StructuredPosterior, rows: Dataset, dataset: Dataset, how: Mapping[str, Any]
