@@ -111,9 +111,13 @@ class _FromNumbers(TorchFunctionMode):
             return func(*args, **{**kwargs, "device": "cpu"}).to(PRETEND)
         if func in (torch.Tensor.__getitem__, torch.Tensor.__setitem__) and isinstance(args[0], PretendTensor):
             index = args[1] if isinstance(args[1], tuple) else (args[1],)
-            index = tuple(torch.tensor(part).to(PRETEND) if isinstance(part, list) else part for part in index)
+            index = tuple(_index(part) if isinstance(part, list) else part for part in index)
             args = (args[0], index, *args[2:])
         return func(*args, **kwargs)
+
+
+def _index(entries: list[Any]) -> torch.Tensor:
+    return torch.tensor(entries, dtype=None if entries else torch.long).to(PRETEND)
 
 
 def _is_pretended(device: Any) -> bool:

@@ -141,7 +141,7 @@ def likelihood_and_gradients(model, data, device, trips=None):
     return before, value.detach(), dict(zip(parameters, slopes, strict=True))
 
 
-@pytest.mark.parametrize("prior", ["load-friction + joint-friction", "joint:kernel=deep"])
+@pytest.mark.parametrize("prior", ["load-friction:expected=0.1 + joint-friction", "joint:kernel=deep"])
 def test_structured_models_on_the_pretended_device(prior, tmp_path):
     data, test = arm_data(14, seed=1), arm_data(3, seed=2)
     posterior = StructuredGP(data.system, named_prior(prior)).fit(data.rows(slice(0, 10)), restarts=1, options=QUICK)
@@ -184,6 +184,17 @@ def test_fits_with_several_starts_on_the_pretended_device():
             data, restarts=1, options=QUICK
         )
         assert math.isfinite(forces.result.value)
+
+
+@pytest.mark.parametrize("engine", ["iterative", "inducing"])
+def test_engines_for_many_rows_on_the_pretended_device(engine):
+    data, test = arm_data(16, seed=10), arm_data(2, seed=11)
+    posterior = StructuredGP(data.system).fit(data, restarts=1, options=QUICK, engine=engine)
+    expected = posterior.predict(test.q, test.v, test.u)
+    with pretend_device():
+        found = posterior.to(PRETEND).predict(test.q, test.v, test.u)
+        torch.testing.assert_close(found.mean.inner, expected.mean, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(found.covariance.inner, expected.covariance, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("model", [IndependentGP, NeuralNetwork, NetworkEnsemble])

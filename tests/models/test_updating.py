@@ -281,6 +281,14 @@ def test_a_posterior_that_was_carried_elsewhere_is_updated_before(posterior):
         posterior.with_contacts([]).update(arm_data(3, seed=17))
 
 
+@pytest.mark.parametrize("engine", ["iterative", "inducing"])
+def test_posteriors_that_are_not_exact_say_what_to_do(engine):
+    data = arm_data(20, seed=20)
+    posterior = StructuredGP(data.system).fit(data, restarts=1, options=QUICK, engine=engine)
+    with pytest.raises(InvalidInput, match="engine='exact'"):
+        posterior.update(data)
+
+
 @pytest.mark.parametrize("model", [IndependentGP, NeuralNetwork])
 def test_models_that_would_have_to_be_trained_again_say_so(model):
     data = arm_data(12, seed=19)
