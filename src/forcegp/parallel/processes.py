@@ -67,10 +67,13 @@ class _Processes(Pool):
 
     @override
     def finished(self) -> list[tuple[Any, Future[Any]]]:
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
         while True:
             ended, _ = wait(self._at_work, return_when=FIRST_COMPLETED)
             tasks = [(future, self._at_work.pop(future)) for future in ended]
-            died = [task for future, task in tasks if isinstance(future.exception(), BrokenProcessPool)]
+            # Other breaks of the pool are exceptions of the task: what a worker cannot unpickle, say.
+            died = [task for future, task in tasks if isinstance(future.exception(), TerminatedWorkerError)]
             if died:
                 self._begin_again(died)
             whole = [(task.key, _with_warnings(future)) for future, task in tasks if task not in died]
