@@ -141,8 +141,14 @@ def likelihood_and_gradients(model, data, device, trips=None):
     return before, value.detach(), dict(zip(parameters, slopes, strict=True))
 
 
-@pytest.mark.parametrize("prior", ["load-friction:expected=0.1 + joint-friction", "joint:kernel=deep"])
-def test_structured_models_on_the_pretended_device(prior, tmp_path):
+@pytest.mark.parametrize(
+    ("prior", "integrators"),
+    [
+        ("load-friction:expected=0.1 + joint-friction", ["symplectic-euler"]),
+        ("joint:kernel=deep", ["rk4", "projected"]),
+    ],
+)
+def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path):
     data, test = arm_data(14, seed=1), arm_data(3, seed=2)
     posterior = StructuredGP(data.system, named_prior(prior)).fit(data.rows(slice(0, 10)), restarts=1, options=QUICK)
     expected = posterior.predict(test.q, test.v, test.u)
@@ -154,8 +160,8 @@ def test_structured_models_on_the_pretended_device(prior, tmp_path):
                 found, known = (getattr(getattr(p, name), part) for p in (prediction, expected))
                 torch.testing.assert_close(found.inner, known, rtol=1e-7, atol=1e-7)
         there.components(test.q, test.v, test.u)
-        for integrator in ("symplectic-euler", "rk4", "projected"):
-            motion = there.rollout(test.q[0], test.v[0], test.u, 0.001, integrator=integrator, samples=2)
+        for integrator in integrators:
+            motion = there.rollout(test.q[0], test.v[0], test.u[:1], 0.001, integrator=integrator, samples=2)
             assert isinstance(motion.q, PretendTensor)
         assert there.leave_out([[1, 2], [5]]).total == pytest.approx(posterior.leave_out([[1, 2], [5]]).total)
         updated = there.update(data.rows(slice(10, 14)), budget=12)
