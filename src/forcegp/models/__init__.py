@@ -10,6 +10,7 @@ from forcegp.models.neural_network import NeuralNetwork
 from forcegp.models.noise import Noise
 from forcegp.models.physical_parameters import Coefficients
 from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.predictor import Linearization, Predictor
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.rollout import Rollout
 from forcegp.models.storage import load_posterior, save_posterior
@@ -22,6 +23,7 @@ __all__ = [
     "Identification",
     "IndependentGP",
     "IndependentPosterior",
+    "Linearization",
     "MarginalLikelihood",
     "Model",
     "NetworkEnsemble",
@@ -30,6 +32,7 @@ __all__ = [
     "Noise",
     "Posterior",
     "Prediction",
+    "Predictor",
     "Rollout",
     "StructuredGP",
     "StructuredPosterior",

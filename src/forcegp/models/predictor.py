@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -152,9 +153,11 @@ class Predictor:
         return (x[None], True) if len(shape) == 1 else (x, False)
 
     def _blocks(self, x: Tensor) -> Sequence[Tensor]:
-        width = max(1, sum(len(centers) for centers in self.latent.features))
-        height = max(1, BLOCK_NUMBERS // width)
-        return (x,) if len(x) <= height else x.split(height)
+        return (x,) if len(x) <= self._block_rows else x.split(self._block_rows)
+
+    @cached_property
+    def _block_rows(self) -> int:
+        return max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
 
 
 def _finished(blocks: list[Tensor], single: bool) -> Tensor:
@@ -181,24 +184,21 @@ def make_predictor(
     begin = time.perf_counter()
     latent, nv = posterior.latent, posterior.system.robot.nv
     prepared = PreparedKernels.of(latent, compile)
-    function, groups = terms_function(posterior, prepared), len(prepared.groups)
+    function, groups = terms_function(posterior, prepared, covariance == "exact"), len(prepared.groups)
     example = [x[:1] for x in (posterior.training.q, posterior.training.v, posterior.training.u)]
     terms = TapedTerms(function, example, groups) if compile else EagerTerms(function, nv, groups)
     compressed = None
     if covariance == "compressed" and groups:
-        compressed = _compressed(posterior, prepared, terms, tolerance, largest_rank)
+        compressed = _compressed(posterior, prepared, tolerance, largest_rank)
     seconds = time.perf_counter() - begin
     return Predictor(nv, posterior.system.robot.device, latent, prepared, terms, covariance, compressed, seconds)
 
 
 def _compressed(
-    posterior: StructuredPosterior,
-    prepared: PreparedKernels,
-    terms: TapedTerms | EagerTerms,
-    tolerance: float,
-    largest_rank: int,
+    posterior: StructuredPosterior, prepared: PreparedKernels, tolerance: float, largest_rank: int
 ) -> CompressedCovariance:
     latent = exact(posterior.latent, "a predictor with covariance='compressed'")
+    terms = EagerTerms(terms_function(posterior, prepared, True), posterior.system.robot.nv, len(prepared.groups))
 
     def sample(count: int, seed: int) -> Sample:
         with torch.no_grad():

@@ -22,7 +22,7 @@ TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 
 
 class Terms(NamedTuple):
-    """At n states: a = offset + W f, (n, nv) and (n, nv, C); what the kernels need; the prepared features.
+    """At n states: a = offset + W f, (n, nv) and (n, nv, C); what the kernels need; the prepared features if asked for.
 
     Their derivatives in [q, v, u] have one dimension (3 nv) more.
     """
@@ -38,16 +38,20 @@ class Terms(NamedTuple):
         return cls(parts[0], parts[1], list(parts[2 : 2 + groups]), list(parts[2 + groups :]))
 
 
-def terms_function(posterior: StructuredPosterior, prepared: PreparedKernels) -> TermsFunction:
-    """The terms as a function of the state, differentiable, by the same code as `posterior.predict`."""
+def terms_function(posterior: StructuredPosterior, prepared: PreparedKernels, features: bool) -> TermsFunction:
+    """The terms as a function of the state, differentiable, by the same code as `posterior.predict`.
+
+    Without `features` that list of them stays empty.
+    """
     system, prior, known = posterior.system, posterior.model.prior, posterior.model.mean == "analytical"
     inertials = {name: value.detach() for name, value in inertials_of(posterior.parameters).items()} or None
     standardize = posterior.likelihood.standardization
 
     def terms(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
         dynamics = system.dynamics(q, v, u, inertials)
-        affine, features = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
-        return [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(features), *features]
+        affine, given = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
+        joined = [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(given)]
+        return [*joined, *given] if features else joined
 
     return terms
 
@@ -101,7 +105,7 @@ class TapedTerms:
         return self._split(values, ()), self._split(slopes, x.shape[1:])
 
     def _split(self, joined: Tensor, trailing: Sequence[int]) -> Terms:
-        parts = joined.split(self.sizes, dim=1)
+        parts = torch.split_with_sizes(joined, self.sizes, 1)
         return Terms.of(
             [
                 part if len(shape) == 1 else part.reshape(len(joined), *shape, *trailing)
