@@ -65,7 +65,8 @@ class TrainingData:
         """The same rows on another device."""
         states = (getattr(self, name).to(device) for name in ("q", "v", "u", "a"))
         noise_std = None if self.noise_std is None else self.noise_std.to(device)
-        return TrainingData(*states, noise_std, None if self.reference is None else self.reference.to(device))
+        reference = None if self.reference is None else self.reference.to(device)
+        return TrainingData(*states, noise_std=noise_std, reference=reference)
 
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:
