@@ -139,6 +139,19 @@ def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Pat
     assert done.stdout.splitlines()[-1] == "70 40"
 
 
+def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "large-data.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    engine, refined, left_out = done.stdout.splitlines()
+    assert engine == "inducing: as asked for"
+    assert refined.startswith("on all rows, ")
+    assert float(left_out.split()[2]) <= 1.0
+    (commands,) = re.findall(r"```console\n(.*?)```", page, re.DOTALL)
+    names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
+    assert names == ["Fit", "Fit", "Fit"]
+
+
 def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "gpu.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -42,7 +42,7 @@ class CompressedCovariance:
     `inflation` holds the standard deviations of y over the exact ones, minus 1, at states that did not choose B.
     """
 
-    factors: tuple[Float[Tensor, "G N R"], ...]
+    factors: tuple[Float[Tensor, "_ _ R"], ...]
     inflation: Float[Tensor, " _"]
 
     @property
@@ -50,7 +50,7 @@ class CompressedCovariance:
         """R: how many combinations of the data are used."""
         return self.factors[0].shape[-1]
 
-    def roots(self, cross: Sequence[Float[Tensor, "n G N"]]) -> list[Float[Tensor, "n G R"]]:
+    def roots(self, cross: Sequence[Float[Tensor, "n _ _"]]) -> list[Float[Tensor, "n _ _"]]:
         """P from the kernel functions of every group."""
         return [torch.bmm(k.transpose(0, 1), F).transpose(0, 1) for k, F in zip(cross, self.factors, strict=True)]
 

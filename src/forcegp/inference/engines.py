@@ -39,8 +39,8 @@ MOST_EXACT_ENTRIES = 16_000
 FEW_FEATURES = 3
 """Features of a latent up to which inducing points can be expected to leave nothing out."""
 
-ENOUGH = 1.0
-"""Nats that inducing points may leave out where the engine is chosen by itself: far below what data can tell."""
+ENOUGH = 0.02
+"""Prior variance of a row in units of its noise that inducing points may leave out: measured, docs/large-data.md."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,9 @@ class Iterative(Engine):
 
 @dataclass(frozen=True)
 class Inducing(Engine):
-    """Variational inducing points: at most `points` for each latent, fewer where they leave out `tolerance` nats.
+    """Variational inducing points: at most `points` for each latent, fewer where they leave out little.
+
+    `tolerance` is what they may leave out of the prior variance of a row in units of its noise, on average.
 
     With `refine` iterations the hyper-parameters are improved on all rows by the collapsed bound, where the points
     leave out no more than `tolerance`: elsewhere the bound prefers what few points can describe.
@@ -192,7 +194,7 @@ class Inducing(Engine):
 
     def __post_init__(self) -> None:
         _require(self.points >= 1, "Inducing points", self.points, "at least 1")
-        _require(self.tolerance >= 0.0, "Inducing tolerance", self.tolerance, "at least 0 (nats)")
+        _require(self.tolerance >= 0.0, "Inducing tolerance", self.tolerance, "at least 0")
         _require(self.refine >= 0, "Inducing refine", self.refine, "at least 0 iterations")
 
     @override

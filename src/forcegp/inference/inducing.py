@@ -6,10 +6,10 @@ for several latents that share their data through mixing vectors:
     -log p(y) <= -log N(t; 0, Phi Phi^T + I) + 1/2 sum_i sum_c |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2) + the rest
 
 and for data as the model draws them the expected difference, like the expected divergence of the posteriors, is at
-most the sum itself, `left_out` (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational inference in
-Gaussian process regression", theorem 4): where the points leave nothing of the prior variance unexplained, bound and
-posterior are exact. For functions of one or two features (friction curves) a few dozen points do that, and the cost is
-linear in the number of rows.
+most the sum itself, rows times `left_out` (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational
+inference in Gaussian process regression", theorem 4): where the points leave nothing of the prior variance
+unexplained, bound and posterior are exact. For functions of one or two features (friction curves) some dozens of points
+come close, and the cost is linear in the number of rows.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class InducingPosterior(LatentPosterior):
     ) -> InducingPosterior:
         """Condition on residual = y - m through at most `points` inducing points for each latent.
 
-        Fewer where each latent leaves out less than its share of `tolerance` nats. The first arguments are those of
-        `negative_log_likelihood`.
+        Fewer where each latent leaves out less than its share of `tolerance`, see `left_out`. The first arguments are
+        those of `negative_log_likelihood`.
         """
         with torch.no_grad():
             W_white, y_white, _ = whiten(W, residual, noise)
@@ -75,7 +75,7 @@ class InducingPosterior(LatentPosterior):
 
     @property
     def left_out(self) -> float:
-        """The sum above, in nats."""
+        """What the points leave out of the prior variance of a row, in units of its noise, on average."""
         return self.space.left_out
 
     @property
@@ -122,13 +122,13 @@ def inducing_pivots(
 ) -> list[Int[Tensor, " m"]]:
     """Numbers of the rows that are inducing points of each latent: greedy, at most `points` of them.
 
-    Fewer where every latent leaves out less than its share of `tolerance` nats. They are sought among `CANDIDATES` rows
-    at most, spread evenly over all.
+    Fewer where every latent leaves out less than its share of `tolerance`, see `InducingPosterior.left_out`. They are
+    sought among `CANDIDATES` rows at most, spread evenly over all.
     """
     count = len(C)
     candidates = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
     relevance = C.square().sum(1)[candidates]
-    share = tolerance / max(1, C.shape[-1]) * len(candidates) / max(1, count)
+    share = tolerance / max(1, C.shape[-1]) * len(candidates)
     return [
         candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share).indices]
         for c, (kernel, z) in enumerate(zip(kernels, features, strict=True))

@@ -98,7 +98,7 @@ class PreparedKernels:
     """The kernels of all latents by what they share, and the weights of the posterior mean."""
 
     groups: tuple[KernelGroup, ...]
-    weights: tuple[Float[Tensor, "G N"], ...]
+    weights: tuple[Float[Tensor, "_ _"], ...]
     order: Tensor | None
     compiled: tuple[CompiledSums | None, ...]
 
@@ -121,7 +121,7 @@ class PreparedKernels:
 
     def mean(
         self, inputs: Sequence[Float[Tensor, "n _"]], keep: bool = False
-    ) -> tuple[Float[Tensor, "n C"], list[Float[Tensor, "n G N"]]]:
+    ) -> tuple[Float[Tensor, "n C"], list[Float[Tensor, "n _ _"]]]:
         """E f_c, and with `keep` the kernel functions of every group about its centres."""
         found = [self._group_mean(number, x, keep) for number, x in enumerate(inputs)]
         return self.ordered([f for f, _ in found]), [cross for _, cross in found if cross is not None]

@@ -33,8 +33,8 @@ class WeightSpace:
     """The weights of all latents, conditioned on deflated data; the weights of the latents follow each other.
 
     `points` and `lowers` are p_c and L_c, `precision` the Cholesky factor of B, `mean` the posterior mean of the
-    weights, `left_out` what they leave out of the prior variance in units of the noise, the sum over rows and latents of
-    |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2).
+    weights, `left_out` what they leave out of the prior variance of a row in units of the noise: the mean over rows of
+    the sum over latents of |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2).
     """
 
     kernels: LatentKernels
@@ -84,7 +84,7 @@ class WeightSpace:
                     B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
         precision = factorize(B.clone)
         mean = precision.solve(right[:, None])[:, 0] if prior.count else right
-        return cls(kernels, points, lowers, precision, mean, float(left_out))
+        return cls(kernels, points, lowers, precision, mean, float(left_out) / max(1, len(C)))
 
     @property
     def count(self) -> int:

@@ -120,15 +120,15 @@ def _another(
 ) -> tuple[Choice, LatentPosterior]:
     """An engine without inducing points, where these leave too much out and there are not too many rows for it."""
     assert isinstance(latent, InducingPosterior)
-    short = f"inducing points leave out {latent.left_out:.3g} nats"
+    short = f"inducing points leave out {latent.left_out:.2g} of the noise variance of a row"
     if size.rows > MOST_ITERATIVE_ROWS:
         warnings.warn(
-            f"{short} of {size.rows} rows, so that the posterior is an approximation; give Inducing more points, or "
+            f"{short}, so that the posterior of {size.rows} rows is an approximation; give Inducing more points, or "
             "fewer rows to another engine",
             NumericalWarning,
             stacklevel=4,
         )
-        return Choice(choice.engine, f"{choice.reason}; they leave out {latent.left_out:.3g} nats"), latent
+        return Choice(choice.engine, f"{choice.reason}; {short}"), latent
     other = choose_engine(size, likelihood.training.q.device, inducing=False)
     other = Choice(other.engine, f"{other.reason}; {short}")
     return other, likelihood.condition(fitted.kernels, fitted.parameters, other.engine, report=report)
