@@ -234,6 +234,16 @@ def test_operations_that_no_tape_holds_are_named(posterior, states):
     assert_close(eager.mean(*states), bent.predict(*states).mean)
 
 
+def test_it_takes_what_another_engine_knows(states):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = StructuredGP(arm_system(), JointFriction())
+        posterior = model.fit(arm_data(30, 0), restarts=1, options=SHORT, engine="inducing")
+    check(posterior, states)
+    with pytest.raises(InvalidInput, match=r"InducingPosterior does not have; give covariance='exact'"):
+        posterior.predictor()
+
+
 def test_other_models_have_none():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

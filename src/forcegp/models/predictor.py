@@ -21,7 +21,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.compressed_covariance import CompressedCovariance, Sample, compress
-from forcegp.inference.posterior import LatentPosterior, exact
+from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.models.predictor_terms import EagerTerms, TapedTerms, Terms, terms_function
 from forcegp.models.sample_states import sample_states
@@ -197,7 +197,13 @@ def make_predictor(
 def _compressed(
     posterior: StructuredPosterior, prepared: PreparedKernels, tolerance: float, largest_rank: int
 ) -> CompressedCovariance:
-    latent = exact(posterior.latent, "a predictor with covariance='compressed'")
+    latent = posterior.latent
+    if not isinstance(latent, ExactPosterior):
+        raise InvalidInput(
+            "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
+            f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, or 'none', "
+            "or fit with engine='exact'."
+        )
     terms = EagerTerms(terms_function(posterior, prepared, True), posterior.system.robot.nv, len(prepared.groups))
 
     def sample(count: int, seed: int) -> Sample:
