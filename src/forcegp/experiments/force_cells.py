@@ -109,31 +109,26 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
             kept[f"mae_{name}"] = evaluate(posterior, test.rows(chosen)).mae if chosen.size else None
     if not posterior.speaks_of_forces:
         return kept
-    return kept | _normal_force(posterior, test) | _components(posterior, test)
+    return kept | _forces(posterior, test)
 
 
-def _normal_force(posterior: Any, test: Dataset) -> dict[str, Any]:
-    """Relative root-mean-square error and coverage of lambda against the truth."""
-    if "lambda" not in test.truth or not posterior.system.contacts:
-        return {}
-    predicted = posterior.predict(test.q, test.v, test.u).multiplier
-    truth = torch.tensor(test.truth["lambda"])
-    error = (predicted.mean - truth).abs()
-    covered = (error <= 1.959963984540054 * predicted.std).double().mean()
-    relative = error.square().mean().sqrt() / truth.square().mean().sqrt()
-    return {"normal_force_error": float(relative), "normal_force_coverage": float(covered)}
+def _forces(posterior: Any, test: Dataset) -> dict[str, Any]:
+    """Scores of lambda, how far the components are from their sum, and the error of every known joint force [Nm].
 
-
-def _components(posterior: Any, test: Dataset) -> dict[str, Any]:
-    """How far the components are from their sum, and the error of every joint force that the truth knows [Nm]."""
+    Without contacts there is nothing about lambda; its coverage is None where the model has no uncertainty of it.
+    """
     from forcegp.evaluation import force_scores
 
+    known = force_scores(posterior, test)
+    out: dict[str, Any] = {}
+    if known.multiplier is not None:
+        out["normal_force_error"] = known.multiplier.relative_rmse
+        out["normal_force_coverage"] = known.multiplier.coverage_95
     found = posterior.components(test.q, test.v, test.u, covariance=False)
-    if not found:
-        return {}
-    total = sum(part.joint_force.mean for part in found.values())
-    out = {"component_sum_error": float((total - found.total.mean).abs().max())}
-    return out | {f"force_mae.{name}": score.mae for name, score in force_scores(posterior, test).joint_force.items()}
+    if found:
+        total = sum(part.joint_force.mean for part in found.values())
+        out["component_sum_error"] = float((total - found.total.mean).abs().max())
+    return out | {f"force_mae.{name}": score.mae for name, score in known.joint_force.items()}
 
 
 def curve_scores(posterior: Any) -> dict[str, Any]:

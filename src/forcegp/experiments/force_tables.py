@@ -26,18 +26,17 @@ COLUMNS = {
 """Score -> heading and decimals."""
 
 
-def score_table(trials: Iterable[Mapping[str, Any]], columns: Sequence[str], tested_on: bool = False) -> str:
+def score_table(trials: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
     """One row per trial and test, medians and ranges over seeds."""
-    head = ["model", "points", *(["tested on"] if tested_on else []), *(COLUMNS[name][0] for name in columns)]
+    head = ["model", "points", *(COLUMNS[name][0] for name in columns)]
     rows = [
         [
             trial["label"],
             str(trial["points"]),
-            *([label] if tested_on else []),
             *(shown(scores.get(name), COLUMNS[name][1]) for name in columns),
         ]
         for trial in trials
-        for label, scores in trial["tests"].items()
+        for scores in trial["tests"].values()
     ]
     return markdown_table(head, rows)
 
