@@ -201,6 +201,8 @@ def test_units_are_those_of_the_joints():
     assert JointAccelerations().latent_units(robot) == ("rad/s^2", "rad/s^2", "m/s^2")
     assert ContactFriction().latent_units(robot) == ("N",)
     assert ContactFriction(load=True, axes="two-axis").latent_units(robot) == ("", "")
+    assert ContactFriction(viscous=True, axes="two-axis").latent_units(robot) == ("N/(m/s)", "N/(m/s)")
+    assert ContactFriction(viscous=True, load=True).latent_units(robot) == ("s/m",)
     assert ToolForces(torque=True, axes="tool").latent_units(robot) == ("N",) * 3 + ("Nm",) * 3
     assert JointFriction().feature_names(robot)[1:] == (("velocity of lift [rad/s]",), ("velocity of bend [m/s]",))
     assert PeriodicJointForces().feature_names(robot)[2] == ("position of bend [m]",)

@@ -39,15 +39,23 @@ class ContactFriction(ExpressedKernels):
     """Q_U = -J_t^T f: tangential friction of contact number `contact`, positive latents resist the motion.
 
     Isotropic: f = g(|v_t|) v_t / |v_t| with one latent g on the sliding speed. Two-axis: one latent per tangent, each
-    on the velocity v_k along its own, f_k = g_k(v_k). Viscous: g v_t, and g_k v_k along every tangent. Without the
-    velocity among the inputs dry friction along two axes is g_k v_k / |v_t|, so that it turns with the motion.
+    on the velocity v_k along its own, f_k = g_k(v_k). Without the velocity among the inputs dry friction along two
+    axes is g_k v_k / |v_t|, so that it turns with the motion. Without the contact there is no friction.
 
-    With `load` the friction is proportional to the nominal normal force (what the contact would carry under the known
-    forces alone, `nominal_normal_force`), and the latents are friction coefficients without unit. Friction changes the
-    normal force in turn: `expected` counts with a friction coefficient (a number, or `ExpectedFriction`), which stays
-    as it is given; where it is None, `StructuredGP.fit` finds it for isotropic friction by itself, by fitting again
-    with what it has learned (`refined_loads`). The kernel "friction" is Coulomb, Stribeck and viscous friction with a
-    learned velocity scale (see `JointFriction`). Without the contact there is no friction.
+    axes: "isotropic" or "two-axis".
+    load: the friction is proportional to the nominal normal force (what the contact would carry under the known forces
+        alone, `nominal_normal_force`), and the latents are friction coefficients.
+    expected: only with `load`, since friction changes the normal force in turn: the friction that the normal force
+        counts with, as a coefficient or an `ExpectedFriction`, which stays as it is given. Where it is None,
+        `StructuredGP.fit` finds it for isotropic friction by itself, by fitting again with what it has learned
+        (`refined_loads`).
+    viscous: the latents are damping coefficients in N/(m/s) (with `load` in s/m): f = g v_t, and g_k v_k along every
+        tangent.
+    inputs: what the latents depend on, "velocity" (of sliding, see above), "position" (of the contact point along the
+        two tangents, which makes a map of the surface), or both.
+    kernel: an expression of `forcegp.priors.kernel_of`. None stands for "friction" (Coulomb, Stribeck and viscous
+        friction with a learned velocity scale, see `JointFriction`) where the velocity is the only input and the
+        friction not viscous, and for "squared-exponential" elsewhere.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -153,8 +161,11 @@ class ContactFriction(ExpressedKernels):
 
     @override
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
-        per_speed = "N/(m/s)" if self.viscous else "N"
-        return (per_speed.replace("N", "", 1).replace("/(m/s)", "s/m") if self.load else per_speed,) * self._count
+        if self.load:
+            unit = "s/m" if self.viscous else ""  # of a friction coefficient per speed, and of a friction coefficient
+        else:
+            unit = "N/(m/s)" if self.viscous else "N"
+        return (unit,) * self._count
 
     @property
     def _count(self) -> int:
