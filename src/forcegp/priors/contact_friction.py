@@ -16,8 +16,8 @@ from forcegp.priors.expected_friction import ExpectedFriction
 from forcegp.priors.expressed_kernels import ExpressedKernels
 from forcegp.priors.force_prior import Scaling
 from forcegp.priors.joint_forces import chosen_inputs
-from forcegp.priors.joint_friction import joint_indices
 from forcegp.priors.kernels import check_kernel
+from forcegp.priors.per_joint import joint_indices
 from forcegp.priors.tool_point import (
     ToolPoint,
     contact_axes,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import isfinite
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.priors.joint_friction import joint_indices
+from forcegp.priors.per_joint import joint_indices
 from forcegp.priors.tool_point import ToolPoint
 
 SMALLEST_SHARE = 0.1
@@ -120,7 +120,3 @@ def _finite(name: str, given: object) -> tuple[float, ...]:
     if not all(map(isfinite, values)):
         raise InvalidInput(f"a tabulated curve has {name} {given!r}; give finite numbers")
     return values
-
-
-Table = Callable[[str], TabulatedCurve]
-"""Name of a latent -> its posterior mean over the velocities that the data visited."""

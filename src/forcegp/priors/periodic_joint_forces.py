@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from gpytorch.constraints import Positive
@@ -15,11 +15,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.priors.force_prior import ForcePrior, Scaling
-from forcegp.priors.joint_friction import chosen_joints, joint_columns, joint_indices
-from forcegp.priors.joint_units import joint_labels, joint_units
+from forcegp.priors.force_prior import Scaling
 from forcegp.priors.kernel_parameters import log_scale, register_log_normal_prior
+from forcegp.priors.per_joint import PerJoint, chosen_joints
 from forcegp.priors.stationary_kernels import LOG_LENGTHSCALE_SPREAD
 from forcegp.robots import Robot
 
@@ -28,7 +26,7 @@ PERIOD_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
-class PeriodicJointForces(ForcePrior):
+class PeriodicJointForces(PerJoint):
     """Q_U,j = f_j(q_j) with f_j of period `period` (rad, or m for joints that slide), one independent function each.
 
     The kernel is s exp(-2 sin^2(pi (q - q') / period) / l) (MacKay 1998; Rasmussen & Williams 2006, eq. 4.31, with l
@@ -38,6 +36,7 @@ class PeriodicJointForces(ForcePrior):
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
     __no_type_check__: ClassVar[bool] = True
+    depends_on: ClassVar[Literal["q", "v"]] = "q"
 
     period: float = 2.0 * math.pi
     joints: tuple[str, ...] | None = None
@@ -49,33 +48,8 @@ class PeriodicJointForces(ForcePrior):
         object.__setattr__(self, "period", float(self.period))
 
     @override
-    def latent_names(self, robot: Robot) -> tuple[str, ...]:
-        return robot.joint_names if self.joints is None else self.joints
-
-    @override
-    def check(self, system: MechanicalSystem) -> None:
-        joint_indices(self.joints, system.robot)
-
-    @override
-    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
-        return joint_columns(self.joints, dynamics)
-
-    @override
-    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
-        q = dynamics.state.q
-        return tuple(q[..., index, None] for index in joint_indices(self.joints, dynamics.state.kinematics.robot))
-
-    @override
     def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
         return ("none",) * len(self.latent_names(robot))  # the period is in rad
-
-    @override
-    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
-        return tuple((label,) for label in joint_labels("position", "q", self.latent_names(robot), robot))
-
-    @override
-    def latent_units(self, robot: Robot) -> tuple[str, ...]:
-        return joint_units("u", self.latent_names(robot), robot)
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from forcegp.priors.contact_friction import ContactFriction
-from forcegp.priors.expected_friction import ExpectedFriction, Table
+from forcegp.priors.expected_friction import ExpectedFriction, TabulatedCurve
 from forcegp.priors.force_prior import ForcePrior, SumPrior
 from forcegp.priors.joint_friction import JointFriction
 from forcegp.robots import Robot
+
+Table = Callable[[str], TabulatedCurve]
+"""Name of a latent -> its posterior mean over the velocities that the data visited."""
 
 
 def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior | None:
