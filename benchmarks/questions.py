@@ -99,7 +99,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
     "large_data": {
         "fit_n1000_cpu_s": ("<= 480", "fit to 1000 rows, joint prior, to convergence [CPU s]"),
         "fit_n1000_memory_mib": ("<= 400", "the same: peak memory above the data [MiB]"),
-        "fit_n10000_cpu_s": ("<= 480", "hyper-parameters from 1000 rows, posterior from 10,000, joint prior [CPU s]"),
+        "fit_n10000_cpu_s": ("<= 480", "hyper-parameters from 600 rows, posterior from 10,000, joint prior [CPU s]"),
         "fit_n10000_memory_mib": ("<= 8192", "the same: peak memory above the data [MiB]"),
         "fit_n1000_mae_noise_free": ("", "Coulomb friction in the joints, N = 1000: noise-free MAE [rad/s^2]"),
         "fit_n10000_mae_noise_free": ("", "the same at N = 10,000"),

@@ -81,7 +81,7 @@ class Fit(FitOptions):
     the number of points, the features and the free memory, and says why. See docs/large-data.md."""
     learning_points: Annotated[
         int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint="(default: all points up to 1500, else 1000)"),
+        arg(metavar="N", constructor=int, help_behavior_hint="(default: all points up to 1500, else 600)"),
     ] = None
     """Find the hyper-parameters on N of the points; the posterior is that of all points."""
     mean: Annotated[

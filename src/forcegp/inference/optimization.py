@@ -23,7 +23,7 @@ LINE_SEARCH_FAILED = 2
 HALTED = 99
 """The status that scipy gives where its callback ended the search."""
 
-SLOW_ITERATIONS = 10
+SLOW_ITERATIONS = 5
 """Iterations over which the progress of a search is judged."""
 
 SOME_FAILURES = 10

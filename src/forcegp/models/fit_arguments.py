@@ -35,7 +35,7 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
         return dataset
     if not 2 <= points <= len(dataset):
         raise InvalidInput(f"points={points} is not between 2 and the {len(dataset)} rows of the dataset")
-    return farthest_rows(dataset, points)
+    return dataset if points == len(dataset) else farthest_rows(dataset, points)
 
 
 def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:

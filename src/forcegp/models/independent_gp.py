@@ -13,6 +13,7 @@ from typing_extensions import override
 from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, minimize_objective
+from forcegp.inference.memory import require_memory
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.fit_arguments import (
     check_search_numbers,
@@ -90,13 +91,17 @@ class IndependentGP(Model):
         ------
         InvalidInput: the dataset does not fit the robot, or an argument is out of range.
         FitError: no restart could be evaluated for some joint; the message names it and the cause.
+        NotEnoughMemory: the covariances of so many rows would need more than is free.
         """
         workers = backend_for(backend, jobs)
         rows = training_rows(self.system.robot.joint_names, dataset, points)
         noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, seed)
-        training = TrainingData.of(rows, self.system.robot.device)
+        nv, device = self.system.robot.nv, self.system.robot.device
+        needed = 8 * len(rows) ** 2 * (nv + 4)  # a factor for every joint, and what the gradients of one of them take
+        require_memory(needed, f"an IndependentGP of N={len(rows)} rows", "give fewer points (--points)", device)
+        training = TrainingData.of(rows, device)
         likelihood = IndependentLikelihood(self.inputs, training)
         kernels = likelihood.kernels()
         noise_parameters = noise.parameters(self.system.robot.nv, self.system.robot.device)

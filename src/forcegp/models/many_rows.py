@@ -36,7 +36,7 @@ from forcegp.models.search import blas_threads
 if TYPE_CHECKING:
     from forcegp.models.structured_posterior import StructuredPosterior
 
-LEARNING_ROWS = 1000
+LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
 
 MOST_ITERATIVE_ROWS = 20_000
@@ -46,7 +46,7 @@ MOST_ITERATIVE_ROWS = 20_000
 def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
     """The rows that hyper-parameters are found on: all, or those that lie farthest apart.
 
-    `ordered`: the rows come in that order already. None means all rows up to 1500, and 1000 beyond.
+    `ordered`: the rows come in that order already. None means all rows up to 1500, and 600 beyond.
     Raises InvalidInput for a number out of range.
     """
     count = len(rows)
@@ -63,7 +63,7 @@ def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
     """Raise NotEnoughMemory where the exact likelihood of these rows does not fit into memory."""
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
-    remedy = "find hyper-parameters on fewer rows: learning_points=1000 (--learning-points 1000), or give fewer points"
+    remedy = "find hyper-parameters on fewer rows: learning_points=600 (--learning-points 600), or give fewer points"
     what = f"the likelihood of N={size.rows} rows with its gradients"
     require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
 

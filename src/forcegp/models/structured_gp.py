@@ -17,6 +17,7 @@ from forcegp.inference import (
     LatentKernels,
     OptimizationResult,
     OptimizerOptions,
+    ProblemSize,
     best_of,
     engine_of,
     minimize_objective,
@@ -140,7 +141,7 @@ class StructuredGP(Model):
             `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
             memory, and says why in `settings["engine_reason"]`.
         learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
-            up to 1500, and 1000 beyond. The posterior is that of all points.
+            up to 1500, and 600 beyond. The posterior is that of all points.
         progress: called as progress(restart, iteration, nll) where the restarts run in this process. The restart is
             `models.search.ALL_ROWS` while the engine takes in all points.
 
@@ -160,7 +161,9 @@ class StructuredGP(Model):
         how: dict[str, Any] = {"seed": seed, "hyperprior": hyperprior, "options": options, "progress": progress}
         how["backend"] = backend_for(backend, jobs)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
-        rows = learning_rows(all_rows, learning_points, ordered=points is not None)
+        if chosen is not None:
+            chosen.require_memory(self._size(len(all_rows)), self.system.robot.device)  # now, not after the search
+        rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
         if start is None and learn is None:
             start = self._continuation(rows, dataset, restarts, how)
         first = self._fit(rows, dataset, restarts, start, learn, prior_strength, **how)
@@ -168,6 +171,11 @@ class StructuredGP(Model):
             first = self._with_refined_loads(first, rows, dataset, how)
         report = None if progress is None else partial(progress, ALL_ROWS)
         return on_all_rows(first, all_rows, chosen, described_rows(all_rows, dataset), hyperprior, report)
+
+    def _size(self, rows: int) -> ProblemSize:
+        """Of the posterior of so many rows, without computing anything; contacts count as independent."""
+        nv, latents = self.system.robot.nv, len(self.prior.latent_names(self.system.robot))
+        return ProblemSize(rows, nv, min(latents, nv - len(self.system.contacts)), latents, 0)
 
     def _continuation(
         self, rows: Dataset, dataset: Dataset, restarts: int | None, how: Mapping[str, Any]

@@ -1,0 +1,64 @@
+"""`--engine` and `--learning-points`: said in the report, stored with the model, refused where they mean nothing."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.models.arm import arm_data
+
+from forcegp.cli.main import main
+from forcegp.models import load_posterior
+
+FIT = ("fit", "arm.h5", "--points", 40, "--iterations", 3, "--restarts", 1)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    arm_data(50, seed=0).save(tmp_path / "arm.h5")
+    return tmp_path
+
+
+def test_the_engine_is_said_and_stored(forcegp, folder):
+    done = forcegp(*FIT, "--engine", "iterative", "--learning-points", 20, "--out", "run", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "iterative: as asked for" in done.stdout
+    assert "learned from 40 points" in done.stdout
+    posterior = load_posterior(folder / "run")
+    assert posterior.engine.name == "iterative"
+    assert (len(posterior.training.q), len(posterior.training.reference.q)) == (40, 20)
+    config = json.loads((folder / "run" / "config.json").read_text())
+    assert config["resolved"]["learning_points"] == 20
+    scored = forcegp("evaluate", "run", "arm.h5", folder=folder)
+    assert scored.returncode == 0, scored.stderr
+
+
+def test_more_rows_than_memory_holds_is_one_line(forcegp, folder):
+    few, count = arm_data(50, seed=0), 100_000
+    again = {name: np.tile(getattr(few, name), (count // 50, 1)) for name in ("q", "v", "u", "a")}
+    episode = np.zeros(count, dtype=few.episode.dtype)
+    replace(few, **again, time=0.01 * np.arange(count), episode=episode, truth={}).save(folder / "many.h5")
+    words = ("fit", "many.h5", "--engine", "exact", "--points", 100_000, "--learning-points", 20)
+    refused = forcegp(*words, "--restarts", 1, "--out", "run", folder=folder)
+    assert refused.returncode == 2
+    (line,) = refused.stderr.strip().splitlines()
+    assert "N=100000 rows needs" in line
+    assert "use engine='iterative'" in line
+    assert not (folder / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--engine", "fast"), "engine"),
+        (("--learning-points", "1"), "learning_points is 1"),
+        (("--model", "independent-gp", "--engine", "iterative"), "--engine means nothing to --model independent-gp"),
+        (("--model", "ensemble", "--learning-points", "9"), "--learning-points means nothing to --model ensemble"),
+    ],
+)
+def test_what_is_wrong_is_one_line(capsys, folder, monkeypatch, words, message):
+    monkeypatch.chdir(folder)
+    assert main([*map(str, FIT[:4]), *words, "--out", "run"]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert not (folder / "run").exists()
