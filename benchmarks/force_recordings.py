@@ -41,7 +41,7 @@ def with_force(data: Dataset, prior: ForcePrior, *laws: Law, seed: int = 5) -> D
 
 def fitted(data: Dataset, prior: ForcePrior, points: int, mean: str = "analytical", **options: Any) -> Any:
     assert data.system is not None
-    return StructuredGP(data.system, prior, mean).fit(data, points=points, restarts=1, **options)  # type: ignore[arg-type]
+    return StructuredGP(data.system, prior, mean).fit(data, points=points, restarts=1, **options)  # type: ignore[arg-type]  # one of the names in Mean
 
 
 def turntable(torque: Law) -> Dataset:

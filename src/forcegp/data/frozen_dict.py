@@ -15,8 +15,8 @@ class FrozenDict(dict[str, Any]):
     def _refuse(self, *_: object, **__: object) -> NoReturn:
         raise TypeError("this mapping belongs to a frozen value; change a copy: dict(mapping)")
 
-    __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]
-    clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]
+    __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
+    clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
 
     def __reduce__(
         self,

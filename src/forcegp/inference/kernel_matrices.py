@@ -210,7 +210,7 @@ class _Stationary(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor, smoothness: float) -> Tensor:  # type: ignore[override]
+    def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor, smoothness: float) -> Tensor:  # type: ignore[override]  # the base takes *args
         scaled = z / lengthscale
         if smoothness == math.inf:
             K = squared_distance(scaled, scaled).mul_(-0.5)
@@ -224,7 +224,7 @@ class _Stationary(torch.autograd.Function):
         return K
 
     @staticmethod
-    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
         # With create_graph=True: `once_differentiable` would let it pass where upstream is a constant.
         if torch.is_grad_enabled():
             raise NotImplementedError(

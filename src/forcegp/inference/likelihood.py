@@ -108,7 +108,7 @@ class _DeflatedNLL(torch.autograd.Function):
     """1/2 y~^T S~^-1 y~ + 1/2 log|S~|; the gradients are computed in the forward pass while T^-1 is in memory."""
 
     @staticmethod
-    def forward(ctx, W_white: Tensor, y_white: Tensor, *kernel_matrices: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx, W_white: Tensor, y_white: Tensor, *kernel_matrices: Tensor) -> Tensor:  # type: ignore[override]  # the base takes *args
         deflation = deflate(W_white, y_white)
         system = solve_deflated(deflation, kernel_matrices)
         alpha, beta = system.alpha, system.beta
@@ -132,7 +132,7 @@ class _DeflatedNLL(torch.autograd.Function):
         return value
 
     @staticmethod
-    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
         if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
             raise NotImplementedError(
                 "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its "

@@ -47,7 +47,7 @@ class KnownForce(ABC):
         bound = {
             name: _per_joint(f"{type(self).__name__} {name}", getattr(self, name), robot) for name in self.per_joint
         }
-        return type(self)(**{f.name: bound.get(f.name, getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
+        return type(self)(**{f.name: bound.get(f.name, getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]  # forces with numbers are dataclasses
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class ViscousJointFriction(KnownForce):
 
     @override
     def force(self, state: State) -> Tensor:
-        return -self.coefficients * state.v  # type: ignore[operator]
+        return -self.coefficients * state.v  # type: ignore[operator]  # a tensor once it is bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +103,13 @@ class CoulombJointFriction(KnownForce):
     @override
     def bound_to(self, robot: Robot) -> KnownForce:
         bound = super().bound_to(robot)
-        if bool((torch.as_tensor(bound.velocity_scale) <= 0).any()):  # type: ignore[attr-defined]
+        if bool((torch.as_tensor(bound.velocity_scale) <= 0).any()):  # type: ignore[attr-defined]  # bound to the same class
             raise InvalidInput("CoulombJointFriction velocity_scale must be positive for every joint (rad/s or m/s).")
         return bound
 
     @override
     def force(self, state: State) -> Tensor:
-        return -self.coefficients * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]
+        return -self.coefficients * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]  # tensors once they are bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class Armature(KnownForce):
 
     @override
     def added_inertia(self) -> Tensor:
-        return self.inertia  # type: ignore[return-value]
+        return self.inertia  # type: ignore[return-value]  # a tensor once it is bound
 
 
 KNOWN_FORCES: dict[str, type[KnownForce]] = {
@@ -145,7 +145,7 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
     if name is None:
         raise InvalidInput(f"a {type(force).__name__} cannot be stored; files carry {', '.join(KNOWN_FORCES)}")
     stored: dict[str, Any] = {"type": name}
-    for f in fields(force):  # type: ignore[arg-type]
+    for f in fields(force):  # type: ignore[arg-type]  # every entry of KNOWN_FORCES is a dataclass
         stored[f.name] = torch.as_tensor(getattr(force, f.name)).tolist()
     return stored
 

@@ -173,7 +173,7 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
             f"a {type(surface).__name__} cannot be stored: files carry numbers, never code. Use one of "
             f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
         )
-    return {"type": name, **asdict(surface)}  # type: ignore[call-overload]
+    return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
 
 
 def surface_from_dict(stored: dict[str, Any]) -> Surface:
@@ -194,7 +194,7 @@ def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
 
 def _number(name: str, value: object) -> float:
     try:
-        number = math.nan if isinstance(value, str) else float(value)  # type: ignore[arg-type]
+        number = math.nan if isinstance(value, str) else float(value)  # type: ignore[arg-type]  # what is no number is an error below
     except (TypeError, ValueError, RuntimeError):
         raise InvalidInput(f"{name} is {value!r}; give a number.") from None
     if not math.isfinite(number):
@@ -211,12 +211,12 @@ def _positive(name: str, value: object) -> float:
 
 def _vector(name: str, values: object) -> Vector:
     try:
-        entries = tuple(_number(name, entry) for entry in values)  # type: ignore[attr-defined]
+        entries = tuple(_number(name, entry) for entry in values)  # type: ignore[attr-defined]  # what is no sequence is an error below
     except TypeError:
         entries = ()
     if len(entries) != 3:
         raise InvalidInput(f"{name} is {values!r}; give three numbers x, y, z.")
-    return entries  # type: ignore[return-value]
+    return entries  # type: ignore[return-value]  # three of them, as checked
 
 
 def _direction(name: str, values: object) -> tuple[Vector, float]:
@@ -230,4 +230,4 @@ def _direction(name: str, values: object) -> tuple[Vector, float]:
         raise InvalidInput(f"{name} is {values!r}; give a direction, for example (0, 0, 1).")
     if abs(length - 1.0) < 1e-15:
         return entries, 1.0
-    return tuple(entry / length for entry in entries), length  # type: ignore[return-value]
+    return tuple(entry / length for entry in entries), length  # type: ignore[return-value]  # three of them, as the others

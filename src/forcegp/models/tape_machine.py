@@ -223,7 +223,7 @@ class TapeMachine:
     def __call__(self, x: Float[Tensor, "n inputs"]) -> Float[Tensor, "n outputs"]:
         """All outputs at every row of x; differentiable once in x."""
         if torch.is_grad_enabled() and x.requires_grad:
-            return _Differentiable.apply(x, self)  # type: ignore[return-value]
+            return _Differentiable.apply(x, self)  # type: ignore[return-value]  # torch does not type `apply`
         return self.values(x)
 
     def values(self, x: Float[Tensor, "n inputs"]) -> Float[Tensor, "n outputs"]:
