@@ -13,12 +13,12 @@ from forcegp.mechanics import ConstrainedDynamics
 from forcegp.priors.expressed_kernels import ExpressedKernels
 from forcegp.priors.force_prior import Scaling
 from forcegp.priors.kernels import check_kernel
-from forcegp.priors.per_joint import PerJoint, chosen_joints
+from forcegp.priors.per_joint import PerJointPrior, chosen_joints
 from forcegp.robots import Robot
 
 
 @dataclass(frozen=True)
-class JointFriction(PerJoint, ExpressedKernels):
+class JointFriction(PerJointPrior, ExpressedKernels):
     """Q_U,j = -f_j(v_j): what resists joint j, positive for positive velocity, an independent function per joint.
 
     The kernel "friction" gives f_j(v) = tanh(v / w) g(v) + d v with a learned velocity scale w and an unknown level g

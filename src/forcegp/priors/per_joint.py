@@ -18,7 +18,7 @@ from forcegp.priors.joint_units import joint_labels, joint_units
 from forcegp.robots import Robot
 
 
-class PerJoint(ForcePrior):
+class PerJointPrior(ForcePrior):
     """Q_U,j = f_j(x_j), or minus that, in Nm or N: an independent function per joint, of its own position or velocity.
 
     A subclass is a dataclass with the field `joints` (names as `chosen_joints` gives them, None: all), and says by

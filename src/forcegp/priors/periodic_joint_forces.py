@@ -17,7 +17,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.priors.force_prior import Scaling
 from forcegp.priors.kernel_parameters import log_scale, register_log_normal_prior
-from forcegp.priors.per_joint import PerJoint, chosen_joints
+from forcegp.priors.per_joint import PerJointPrior, chosen_joints
 from forcegp.priors.stationary_kernels import LOG_LENGTHSCALE_SPREAD
 from forcegp.robots import Robot
 
@@ -26,7 +26,7 @@ PERIOD_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
-class PeriodicJointForces(PerJoint):
+class PeriodicJointForces(PerJointPrior):
     """Q_U,j = f_j(q_j) with f_j of period `period` (rad, or m for joints that slide), one independent function each.
 
     The kernel is s exp(-2 sin^2(pi (q - q') / period) / l) (MacKay 1998; Rasmussen & Williams 2006, eq. 4.31, with l
