@@ -39,7 +39,7 @@ from benchmarks.solver_problem import ROWS, Problem, Task
 LEVELS = (1e-2, 1e-4)
 CAP, TRIAL = 120.0, 10.0
 BLOCKS = ((150, False), (300, False), (500, False), (500, True))
-STEP_SIZES, BATCH = tuple(product((0.1, 0.3, 1.0), (False, True))), 100
+STEP_SIZES, BATCH = tuple(product((0.3, 1.0, 2.0), (False, True))), 100
 DIVERGED = 1e6
 
 Method = Callable[[Problem], Steps]
