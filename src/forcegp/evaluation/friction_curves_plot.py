@@ -39,7 +39,7 @@ LARGEST_GRID = 12
 BEYOND = 0.18
 """Part of the visited range that is drawn on either side of it."""
 POINTS = 241
-TRUE_POINTS = 400
+TRUE_POINTS = 200
 TRUE_DOTS = "#A8A8A8"
 ALONG = 0.15
 """Largest |velocity along other axes| relative to that along its own of rows whose true force belongs on a slice."""
