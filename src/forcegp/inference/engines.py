@@ -144,8 +144,8 @@ class Iterative(Engine):
         _require(self.memory is None or self.memory >= 0.0, "Iterative memory", self.memory, "at least 0 (GiB)")
 
     def points_for(self, rows: int) -> int:
-        """A tenth of the rows, at least 200 and at most 1000: measured, see docs/large-data.md."""
-        return min(rows, self.points if self.points is not None else min(1000, max(200, rows // 10)))
+        """A fifth of the rows, at least 200 and at most 1000: measured, see docs/solvers.md."""
+        return min(rows, self.points if self.points is not None else min(1000, max(200, rows // 5)))
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:

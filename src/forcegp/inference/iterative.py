@@ -2,9 +2,9 @@
 
 In deflated coordinates T alpha = t with T = sum_c (C_c C_c^T) K_c + I. A product with T needs the kernel matrices one
 panel after the other; the preconditioner is the covariance of the same model with a few weights per latent and the rest
-of the prior variance as noise of every point (`weight_space`), inverted by Woodbury's identity. Preconditioners of T
-itself, or latent by latent, need several times as many iterations, for what is ill-conditioned is how the latents share
-the accelerations.
+of the prior variance as noise of every point (`weight_space`), inverted by Woodbury's identity. docs/solvers.md
+compares it with others: a pivoted Cholesky factor of T is as good where its rank is chosen well, but gives no
+covariance.
 """
 
 from __future__ import annotations

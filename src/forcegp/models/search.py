@@ -46,9 +46,9 @@ Objective = Callable[[Mapping[str, Tensor]], Tensor]
 Outcome = TypeVar("Outcome")
 
 
-LARGE = OptimizerOptions(tolerance=1e-6, slow=1.0)
-"""The search on more rows than that, where an evaluation takes seconds, and a nat over many iterations changes nothing
-that is predicted.
+LARGE = OptimizerOptions(tolerance=1e-6, slow=2.0)
+"""The search on more rows than that, where an evaluation takes seconds, and two nats of thousands over several
+iterations change nothing that is predicted.
 """
 
 
