@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from forcegp.data import Dataset
     from forcegp.evaluation import Evaluation, PriorComparison, compare_priors, evaluate
+    from forcegp.inference import Exact, Inducing, Iterative, Stochastic
     from forcegp.mechanics import (
         Actuation,
         Armature,
@@ -86,7 +87,11 @@ __all__ = [
     "NetworkEnsemble",
     "save_posterior",
     "load_posterior",
-    # where it is computed
+    # how and where it is computed
+    "Exact",
+    "Iterative",
+    "Inducing",
+    "Stochastic",
     "Serial",
     "Joblib",
     "Ray",
@@ -104,6 +109,7 @@ _ROOMS = {
     "data": {"Dataset"},
     "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}
     | {"JointAccelerations", "NoForces"},
+    "inference": {"Exact", "Iterative", "Inducing", "Stochastic"},
     "models": {"IndependentGP", "NeuralNetwork", "NetworkEnsemble"}
     | {"StructuredGP", "Noise", "Coefficients", "save_posterior", "load_posterior"},
     "parallel": {"Serial", "Joblib", "Ray"},
