@@ -6,66 +6,42 @@ import re
 import shutil
 
 import pytest
+from tests.cli.reproductions import Reproduced
 
 FIGURES = ("fig2b", "fig2c", "fig3", "fig4", "extrapolation", "ablation")
 
 
 @pytest.fixture(scope="module")
 def reproduced(forcegp, tmp_path_factory):
-    """The folder of `forcegp reproduce all --preset smoke`."""
-    pytest.importorskip("pybullet")
-    folder = tmp_path_factory.mktemp("reproduce")
-    words = ("reproduce", "all", "--preset", "smoke", "--out", "out", "--docs", "docs", "--jobs", 2)
-    done = forcegp(*words, folder=folder, timeout=1200.0)
-    assert done.returncode == 0, done.stderr
-    assert "reproduction.md tells what was found" in done.stdout
-    return folder
+    return Reproduced.everything(forcegp, tmp_path_factory.mktemp("reproduce"), "smoke", "reproduction")
 
 
 def test_all_figures_tables_and_the_page_are_there(reproduced):
-    for root in (reproduced / "out", reproduced / "docs"):
-        page = (root / "reproduction.md").read_text()
+    for root in reproduced.roots:
+        page = reproduced.text(root)
         for name in FIGURES:
-            document = json.loads((root / "reproduction" / f"{name}.json").read_text())
-            assert document["preset"] == "smoke"
+            document = reproduced.document(name, root)
             assert document["config"]["data"]["rows"] == 400
             with (root / "reproduction" / f"{name}.csv").open() as file:
                 assert list(csv.DictReader(file))
-            for figure in document["figures"]:
-                assert f"(reproduction/{figure}.png)" in page
-                assert (root / "reproduction" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
-                assert (root / "reproduction" / f"{figure}.svg").read_text().startswith("<?xml")
+            reproduced.check_pictures(root, document["figures"])
         assert "Its numbers say nothing about the models" in page
         assert "nan" not in page.lower().replace("covariance", "")
 
 
-def test_a_second_run_computes_nothing_and_changes_no_number(reproduced, forcegp):
-    before = (reproduced / "out" / "reproduction.md").read_text()
-    cells = {file: file.stat().st_mtime_ns for file in (reproduced / "out" / "cells").glob("**/cell.json")}
-    assert len(cells) > 40
-    again = forcegp("reproduce", "all", "--out", "out", "--json", folder=reproduced)
-    assert again.returncode == 0, again.stderr
-    assert set(json.loads(again.stdout)["figures"]) == set(FIGURES)
-    assert (reproduced / "out" / "reproduction.md").read_text() == before
-    assert cells == {file: file.stat().st_mtime_ns for file in (reproduced / "out" / "cells").glob("**/cell.json")}
+def test_a_second_run_computes_nothing_and_changes_no_number(reproduced):
+    reproduced.check_a_second_run_changes_nothing(FIGURES)
 
 
-def test_one_figure_has_a_page_of_its_own_that_names_its_command(reproduced, forcegp, tmp_path):
-    shutil.copytree(reproduced / "out", tmp_path / "out")
-    before = (tmp_path / "out" / "reproduction.md").read_text()
-    words = ("reproduce", "fig3", "--points", 20, "--out", "out", "--jobs", 1)
-    done = forcegp(*words, folder=tmp_path, timeout=600.0)
-    assert done.returncode == 0, done.stderr
-    page = (tmp_path / "out" / "fig3.md").read_text()
+def test_one_figure_has_a_page_of_its_own_that_names_its_command(reproduced, tmp_path):
+    page = reproduced.page_of_one("fig3", "--points", 20, folder=tmp_path)
     assert "    forcegp reproduce fig3 --preset smoke --points 20\n" in page
-    assert (tmp_path / "out" / "reproduction.md").read_text() == before
 
 
 def test_published_values_stand_beside_ours(reproduced):
-    rows = json.loads((reproduced / "out" / "reproduction" / "fig2b.json").read_text())["summary"]["curves"]
+    rows = reproduced.document("fig2b")["summary"]["curves"]
     assert set(rows) == {"gp", "s-gp-38", "s-gp", "s-gp-mean"}
-    page = (reproduced / "out" / "reproduction.md").read_text()
-    assert re.search(r"\| analytical model \| 0\.57 \|", page)
+    assert re.search(r"\| analytical model \| 0\.57 \|", reproduced.text())
 
 
 @pytest.mark.parametrize(
@@ -84,18 +60,12 @@ def test_published_values_stand_beside_ours(reproduced):
         (("all", "--out", "out", "--docs", "docs/reproduction.md"), "cannot be made"),
     ],
 )
-def test_refusals_are_one_line_and_leave_everything(reproduced, forcegp, arguments, message):
-    before = sorted(reproduced.glob("**/*"))
-    refused = forcegp("reproduce", *arguments, folder=reproduced)
-    assert refused.returncode == 2
-    assert refused.stderr.startswith("forcegp: ")
-    assert len(refused.stderr.strip().splitlines()) == 1
-    assert message in refused.stderr
-    assert sorted(reproduced.glob("**/*")) == before
+def test_refusals_are_one_line_and_leave_everything(reproduced, arguments, message):
+    reproduced.check_refusal(arguments, message)
 
 
 def test_a_half_written_cell_and_another_version_are_named_and_nothing_is_lost(reproduced, forcegp, tmp_path):
-    shutil.copytree(reproduced / "out", tmp_path / "out")
+    shutil.copytree(reproduced.folder / "out", tmp_path / "out")
     file = next((tmp_path / "out" / "cells" / "fits").glob("**/cell.json"))
     whole = file.read_text()
     file.write_text(whole[:100])
