@@ -11,7 +11,7 @@ from tests.mechanics.systems import POINT, regular_states, solve_kkt
 from tests.mechanics.systems import system as system_of
 from tests.robots.robot_models import FRAMES
 
-from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint
+from forcegp.errors import FileFormatError, InvalidInput, NumericalWarning, UnknownJoint
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.priors import ContactFriction, JointFriction, named_prior, prior_from_dict, prior_to_dict
 from forcegp.priors.expected_friction import SMALLEST_SHARE, ExpectedFriction, TabulatedCurve
@@ -151,10 +151,29 @@ def test_no_friction_leaves_the_nominal_force():
 def test_jamming_stays_finite():
     """Where friction and normal force would lift each other without end, the force grows tenfold and no further."""
     dynamics = rows_of("plane")
-    jammed = ContactFriction(load=True, expected=1e6).point_force(dynamics)[..., 0].norm(dim=-1)
+    with pytest.warns(NumericalWarning) as caught:
+        jammed = ContactFriction(load=True, expected=1e6).point_force(dynamics)[..., 0].norm(dim=-1)
     nominal = ContactFriction(load=True).point_force(dynamics)[..., 0].norm(dim=-1)
     assert bool(torch.isfinite(jammed).all())
     torch.testing.assert_close((jammed / nominal).max().item(), 1.0 / SMALLEST_SHARE, rtol=1e-9, atol=0.0)
+    tenfold = int(torch.isclose(jammed / nominal, torch.tensor(1.0 / SMALLEST_SHARE).double(), rtol=1e-9).sum())
+    (message,) = [str(warning.message) for warning in caught]
+    assert message.startswith(f"the expected friction nearly jams contact 0 in {tenfold} of 12 states: ")
+    assert "taken as 10 times that without sliding friction" in message
+    assert "give a smaller coefficient, expected=COEFFICIENT" in message
+
+
+def test_jamming_is_not_asked_for_where_no_value_is_known():
+    """Derivatives of the mixing by torch.func: a branch on a value would be an error there."""
+    system = system_of(MODEL).with_contacts([Contact(FRAME, POINT, PLANE)])
+    q, v, u = regular_states(system, 3)
+    prior = ContactFriction(load=True, expected=1e6)
+
+    def mixing(one):
+        return prior.mixing(system.dynamics(one[None], v[:1], u[:1]))
+
+    slope = torch.func.vmap(torch.func.jacrev(mixing))(q)
+    assert bool(torch.isfinite(slope).all())
 
 
 def test_it_survives_a_file():

@@ -10,7 +10,7 @@ import torch
 
 from forcegp.errors import NumericalWarning
 from forcegp.priors import ForcePrior
-from forcegp.priors.expected_friction import TabulatedCurve
+from forcegp.priors.expected_friction import JAMMING, TabulatedCurve
 from forcegp.priors.refined_loads import refined_loads
 
 if TYPE_CHECKING:
@@ -42,8 +42,21 @@ def fit_with_refined_loads(
     Every round is an exact fit of a legitimate prior: friction proportional to a given function of the state. What
     changes from round to round is that function, towards the normal force under the friction that was found.
     `again(prior, posterior)` fits with another prior, beginning from the parameters of a posterior. Warns
-    (NumericalWarning) where the normal forces have not settled after `rounds` fits.
+    (NumericalWarning) where the normal forces have not settled after `rounds` fits, and where friction as the last one
+    expects it nearly jams a contact.
     """
+    with warnings.catch_warnings():  # what an early round expects may jam without meaning anything
+        warnings.filterwarnings("ignore", JAMMING, NumericalWarning)
+        kept = _refined(first, again, rounds)
+    if kept is not first:
+        with torch.no_grad():
+            kept.model.prior.mixing(kept.likelihood.dynamics())  # says where the friction that was found jams
+    return kept
+
+
+def _refined(
+    first: StructuredPosterior, again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior], rounds: int
+) -> StructuredPosterior:
     given = first.model.prior  # whose terms tell which expectations are the user's
     best = last = first
     for fits in range(rounds + 1):
@@ -59,7 +72,7 @@ def fit_with_refined_loads(
                 f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
                 "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
                 NumericalWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
             break
         last = again(prior, last).with_settings(load_refinements=fits + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,14 +12,17 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils._python_dispatch import _get_current_dispatch_mode
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.priors.per_joint import joint_indices
 from forcegp.priors.tool_point import ToolPoint
 
 SMALLEST_SHARE = 0.1
 """Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""
+JAMMING = "the expected friction nearly jams"
+"""How the warning of it begins."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,8 @@ class ExpectedFriction:
 
         With the multiplier lambda_0 under known forces and joint friction, and sliding along the unit vector d with the
         coefficient mu, lambda = lambda_0 - mu |s_p lambda| g, where g = (d lambda / d Q_U) J_p^T d, so that
-        |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g).
+        |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g). Where that divisor is below `SMALLEST_SHARE`, it is set
+        to it, and a NumericalWarning says so.
         """
         state, multiplier = dynamics.state, dynamics.multiplier_map()
         robot = state.kinematics.robot
@@ -109,7 +114,24 @@ class ExpectedFriction:
         J = ToolPoint.of_contact(dynamics, contact).jacobian[..., :3, :]
         g = (rows * (J.mT @ direction[..., None])[..., 0]).sum(-1)
         growth = 1.0 + free.sign() * self.sliding(speed) * size * g
+        _warn_of_jamming(growth, contact)
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
+
+
+def _warn_of_jamming(growth: Tensor, contact: int) -> None:
+    """Nothing is said while torch transforms or records the function, where no value may decide anything."""
+    if torch._C._are_functorch_transforms_active() or _get_current_dispatch_mode() is not None:
+        return
+    jammed = growth.detach() < SMALLEST_SHARE
+    if bool(jammed.any()):
+        warnings.warn(
+            f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states: "
+            "friction and normal force lift each other almost without end, and the normal force is taken as "
+            f"{1.0 / SMALLEST_SHARE:g} times that without sliding friction. Check the contact's frame, point and "
+            "surface, leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none).",
+            NumericalWarning,
+            stacklevel=3,
+        )
 
 
 def _finite(name: str, given: object) -> tuple[float, ...]:
