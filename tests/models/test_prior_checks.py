@@ -14,6 +14,7 @@ from forcegp.mechanics import Contact, Plane
 from forcegp.models import Noise, StructuredGP
 from forcegp.priors import (
     ContactFriction,
+    JointAccelerations,
     JointForces,
     JointFriction,
     NoForces,
@@ -249,3 +250,29 @@ def test_no_residual_at_all_is_refused(data):
     exact = with_columns(data, a=data.system.dynamics(*states).acceleration_map().offset.numpy())
     with pytest.raises(InvalidInput, match="the accelerations equal the mean exactly, so no unknown force"):
         fit(exact, JointFriction(), noise=Noise(0.1))
+
+
+@pytest.mark.parametrize("prior", [ContactFriction(), JointFriction(("lift",))], ids=["tool", "joint"])
+def test_known_forces_that_no_latent_can_carry_are_pointed_out(data, prior):
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    dynamics = data.system.dynamics(*states)
+    B, Q_K = prior.mixing(dynamics).numpy(), dynamics.Q_K.numpy()
+    left, size = 0.0, 0.0
+    for H, b, force in zip(dynamics.H.numpy(), B, Q_K, strict=True):
+        weights, *_ = np.linalg.lstsq(H @ b, H @ force, rcond=1e-9)
+        left += np.sum((H @ force - H @ b @ weights) ** 2)
+        size += np.sum((H @ force) ** 2)
+    with pytest.warns(DataWarning, match=r"^with the mean 'zero' the prior carries gravity") as caught:
+        fit(data, prior, mean="zero")
+    assert len(caught) == 1
+    assert f"but {np.sqrt(left / size):.0%} of the acceleration that they cause" in str(caught[0].message)
+    assert "take mean='analytical' (--mean analytical), or add a force on every joint" in str(caught[0].message)
+
+
+@pytest.mark.parametrize(
+    "prior", [JointForces(), ContactFriction() + JointForces(), JointAccelerations()], ids=["joints", "sum", "all"]
+)
+def test_priors_that_act_on_every_joint_can_carry_the_known_forces(data, prior):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(data, prior, mean="zero")

@@ -20,14 +20,20 @@ ROUNDING = 1e-12
 EQUAL = 1e-9
 """Relative difference of two latents' effects and features below which they are the same."""
 
+LEFT_OUT = 0.1
+"""Share of what the known forces do that may lie where no latent acts, without a word."""
+SPAN = 1e-9
+"""Singular values of unit effects relative to the largest below which they are one effect fewer."""
+ROWS_LOOKED_AT = 500
+
 
 def check_prior(likelihood: MarginalLikelihood) -> None:
     """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
 
     Raises InvalidInput if no latent changes the acceleration at any training point, if all of one term do nothing at
     all, if all features of a latent are constant (a tool or joint that never moves), and if latents of two terms do the
-    same in every row. Warns (DataWarning) of single features that are constant, and of latents that move nothing or
-    that the constraint hides while others show.
+    same in every row. Warns (DataWarning) of single features that are constant, of latents that move nothing or that
+    the constraint hides while others show, and, with the mean "zero", of known forces that no latent can take over.
     """
     names = likelihood.prior.latent_names(likelihood.system.robot)
     if not names:
@@ -40,6 +46,8 @@ def check_prior(likelihood: MarginalLikelihood) -> None:
     terms = [number for number, (*_, which) in enumerate(_terms(likelihood)) for _ in range(which.stop - which.start)]
     shows = _check_visible(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
     _check_distinct(names, terms, shows, effect, likelihood.standardization(features))
+    if likelihood.mean == "zero":
+        _check_known_forces(effect, (dynamics.H @ dynamics.Q_K[..., None])[..., 0])
 
 
 def _terms(likelihood: MarginalLikelihood) -> list[tuple[str, ForcePrior, slice]]:
@@ -130,6 +138,24 @@ def _check_distinct(
                 f"no data can tell {names[first]!r} and {names[second]!r} apart: both act in the same direction and "
                 "depend on the same inputs; leave one of them out"
             )
+
+
+def _check_known_forces(effect: Tensor, known: Tensor) -> None:
+    """Whether the latents act where the known forces do: the part of `known` (N, nv) outside the span of `effect`."""
+    step = -(-len(known) // ROWS_LOOKED_AT)
+    effect, known = effect[::step], known[::step]
+    columns = effect / torch.linalg.vector_norm(effect, dim=-2, keepdim=True).clamp_min(torch.finfo(effect.dtype).tiny)
+    carried = (columns @ (torch.linalg.pinv(columns, rtol=SPAN) @ known[..., None]))[..., 0]
+    size = float(known.square().sum().sqrt())
+    share = float((known - carried).square().sum().sqrt()) / size if size > 0.0 else 0.0
+    if share > LEFT_OUT:
+        warnings.warn(
+            f"with the mean 'zero' the prior carries gravity, actuation and all known forces, but {share:.0%} of the "
+            "acceleration that they cause lies where none of its forces acts; take mean='analytical' (--mean "
+            "analytical), or add a force on every joint, JointForces() (--prior joint)",
+            DataWarning,
+            stacklevel=5,
+        )
 
 
 def _ways(scaling: Sequence[str] | str, z: Tensor) -> Sequence[str]:
