@@ -10,6 +10,7 @@ from forcegp.inference.deflation import deflate, whiten
 from forcegp.inference.inducing import InducingPosterior, collapsed_bound, inducing_pivots
 from forcegp.inference.iterative import IterativePosterior, LowRankPlusDiagonal
 from forcegp.inference.pivots import pivoted_cholesky
+from forcegp.inference.terms import Terms
 
 SHAPES = {
     "no constraint": {"constraints": 0},
@@ -34,11 +35,13 @@ def exact(given: Problem) -> ExactPosterior:
 
 def iterative(given: Problem, **changes) -> IterativePosterior:
     how = {"points": 10, "tolerance": 1e-11, "iterations": 400, "memory": 0, **changes}
-    return IterativePosterior.condition(given.kernels, given.features, *given.data, **how)
+    return IterativePosterior.condition(given.kernels, Terms(given.features, *given.data), **how)
 
 
 def inducing(given: Problem, points: int = COUNT, tolerance: float = 0.0) -> InducingPosterior:
-    return InducingPosterior.condition(given.kernels, given.features, *given.data, points=points, tolerance=tolerance)
+    return InducingPosterior.condition(
+        given.kernels, Terms(given.features, *given.data), points=points, tolerance=tolerance
+    )
 
 
 MAKERS = {

@@ -16,7 +16,7 @@ def given():
 
 
 def inducing(given, points=8) -> InducingPosterior:
-    return InducingPosterior.condition(given.kernels, given.features, *given.data, points=points, tolerance=0.0)
+    return InducingPosterior.condition(given.kernels, terms_of(given), points=points, tolerance=0.0)
 
 
 def terms_of(given) -> Terms:

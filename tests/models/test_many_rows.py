@@ -1,13 +1,16 @@
 """Engines behind `StructuredGP.fit`: choice, hyper-parameters from some of the rows, the posterior from all."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from tests.models.arm import arm_data
 
-from forcegp import JointFriction, StructuredGP, load_posterior, save_posterior
-from forcegp.errors import InvalidInput, NotEnoughMemory, NumericalError
-from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, Stochastic
+from forcegp import JointFriction, NoForces, StructuredGP, load_posterior, save_posterior
+from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalError, NumericalWarning
+from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, ProblemSize, Stochastic, choose_engine
 from forcegp.inference import memory as memory_module
 
 QUICK = OptimizerOptions(iterations=5)
@@ -87,14 +90,16 @@ def test_refining_on_all_rows_lowers_the_objective(data):
 
 
 def test_mini_batches_of_all_rows_lower_the_objective(data):
-    still = fit(data, Stochastic(points=20, steps=0), learning_points=15, points=60)
+    with pytest.warns(NumericalWarning, match="leave out"):
+        still = fit(data, Stochastic(points=20, steps=0), learning_points=15, points=60)
     engine = Stochastic(points=20, steps=40, batch=30, rate=0.05)
-    moved = fit(data, engine, learning_points=15, points=60)
+    with pytest.warns(NumericalWarning, match="leave out"):
+        moved = fit(data, engine, learning_points=15, points=60)
     assert moved.negative_log_likelihood < still.negative_log_likelihood
     assert "30 rows each" in moved.settings["refined"]
 
 
-@pytest.mark.parametrize("engine", [Iterative(tolerance=1e-8, points=20), Inducing(points=30)], ids=["cg", "inducing"])
+@pytest.mark.parametrize("engine", [Iterative(tolerance=1e-8, points=20), Inducing(points=60)], ids=["cg", "inducing"])
 def test_stored_and_loaded_it_predicts_the_same(data, states, engine, tmp_path):
     posterior = fit(data, engine, learning_points=30)
     save_posterior(posterior, tmp_path / "model")
@@ -167,3 +172,48 @@ def test_functions_are_drawn_and_curves_read_from_every_engine(data, states):
         assert bool(torch.isfinite(sampled).all())
         curve = posterior.curve(posterior.latent_names[0], points=5)
         assert bool((curve.std > 0).all())
+
+
+@pytest.mark.parametrize("engine", ["auto", "exact", "iterative", "inducing", "stochastic"])
+def test_without_unknown_forces_every_engine_is_the_exact_one(data, states, engine, monkeypatch):
+    monkeypatch.setattr("forcegp.inference.engines.MOST_EXACT_ROWS", 10)
+    posterior = fit(data, engine, prior=NoForces())
+    assert posterior.engine == Exact()
+    assert posterior.settings["engine_reason"] == "exact: there is no unknown force to learn"
+    torch.testing.assert_close(posterior.predict(*states).mean, fit(data, prior=NoForces()).predict(*states).mean)
+
+
+def test_too_few_inducing_points_are_said(data):
+    with pytest.warns(NumericalWarning, match=r"15 inducing points leave out \S+ of the noise variance of a row"):
+        posterior = fit(data, Inducing(points=5))
+    assert posterior.latent.left_out > 0.02
+    assert "refined" not in posterior.settings
+
+
+def test_mini_batches_that_make_it_worse_are_an_error(data):
+    with pytest.raises(NumericalError, match=r"raised the bound on all rows from .* smaller rate"):
+        fit(data, Stochastic(points=60, steps=10, batch=10, rate=5.0))
+
+
+def test_far_rows_beyond_the_learning_rows_are_said(data):
+    lifted = replace(data, q=np.where(np.arange(60)[:, None] < 50, data.q + 0.3, data.q))
+    near = lifted.rows(np.arange(59, -1, -1))  # the ten near ones first
+    with pytest.warns(DataWarning, match="half of the training points lie more than"):
+        fit(near, Iterative(points=20), learning_points=30)
+
+
+@pytest.mark.parametrize("stored", [["inducing"], "inducing", {"name": "inducing", "points": "5"}, {"name": "gone"}])
+def test_a_damaged_engine_is_refused(data, stored, tmp_path):
+    save_posterior(fit(data), tmp_path / "model")
+    file = tmp_path / "model" / "model.json"
+    document = json.loads(file.read_text())
+    document["settings"]["engine"] = stored
+    file.write_text(json.dumps(document))
+    with pytest.raises(FileFormatError):
+        load_posterior(tmp_path / "model")
+
+
+def test_many_rows_of_many_features_take_mini_batches():
+    chosen = choose_engine(ProblemSize(60_000, 7, 6, 7, 21), torch.device("cpu"))
+    assert chosen.engine == Stochastic()
+    assert "hours" in chosen.reason

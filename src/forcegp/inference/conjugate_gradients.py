@@ -72,6 +72,11 @@ def conjugate_gradients(
             return Solved(x, done, reached)
         if done >= iterations:
             break
+    else:
+        raise NumericalError(
+            f"conjugate gradients stay at a relative residual of {reached:.1e} after {done} iterations, not "
+            f"{tolerance:.0e}: rounding does not let it fall; give a larger tolerance, or raise the noise level."
+        )
     raise NumericalError(
         f"conjugate gradients reached a relative residual of {reached:.1e} in {done} iterations, not {tolerance:.0e}; "
         "allow more iterations, give the preconditioner more points, or raise the noise level."

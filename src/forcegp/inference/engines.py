@@ -12,8 +12,9 @@ with N rows, r the rank of the mixing vectors, C latents and P points of all lat
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
@@ -35,6 +36,9 @@ MOST_EXACT_ROWS = 1500
 
 MOST_EXACT_ENTRIES = 16_000
 """Size rN of the covariance up to which factorising it takes about as long as conjugate gradients on it."""
+
+MOST_ITERATIVE_ROWS = 20_000
+"""Rows beyond which conjugate gradients take hours rather than minutes."""
 
 FEW_FEATURES = 3
 """Features of a latent up to which inducing points can be expected to leave nothing out."""
@@ -65,6 +69,9 @@ class ProblemSize:
 
 class Engine(ABC):
     """One way to compute a posterior; a frozen value whose fields are its settings."""
+
+    # Constructors are the check, with messages for people; run-time checks of annotations must not come before.
+    __no_type_check__: ClassVar[bool] = True
 
     name: ClassVar[str]
 
@@ -103,6 +110,7 @@ class Engine(ABC):
 class Exact(Engine):
     """The factorised covariance of all rows (the default up to 1500 rows): the only engine that can leave rows out."""
 
+    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "exact"
 
     @override
@@ -130,6 +138,7 @@ class Iterative(Engine):
     what is free). `solve_covariance`: see `IterativePosterior`.
     """
 
+    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "iterative"
     points: int | None = None
     tolerance: float = 1e-4
@@ -138,10 +147,12 @@ class Iterative(Engine):
     solve_covariance: bool = False
 
     def __post_init__(self) -> None:
-        _require(self.points is None or self.points >= 1, "Iterative points", self.points, "at least 1")
-        _require(0.0 < self.tolerance < 1.0, "Iterative tolerance", self.tolerance, "between 0 and 1")
-        _require(self.iterations >= 1, "Iterative iterations", self.iterations, "at least 1")
-        _require(self.memory is None or self.memory >= 0.0, "Iterative memory", self.memory, "at least 0 (GiB)")
+        if self.points is not None:
+            _require_whole(self, 1, "points")
+        _require_whole(self, 1, "iterations")
+        _require_number(self, "tolerance", "between 0 and 1", lambda x: 0.0 < x < 1.0)
+        if self.memory is not None:
+            _require_number(self, "memory", "at least 0 (GiB)", lambda x: 0.0 <= x < math.inf)
 
     def points_for(self, rows: int) -> int:
         """A fifth of the rows, at least 200 and at most 1000: measured, see docs/solvers.md."""
@@ -162,7 +173,7 @@ class Iterative(Engine):
         spare = max(0, free_memory(device) - self.required_bytes(size))
         return IterativePosterior.condition(
             kernels,
-            *terms,
+            terms,
             points=self.points_for(size.rows),
             tolerance=self.tolerance,
             iterations=self.iterations,
@@ -187,15 +198,16 @@ class Inducing(Engine):
     leave out no more than `tolerance`: elsewhere the bound prefers what few points can describe.
     """
 
+    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "inducing"
     points: int = 500
     tolerance: float = ENOUGH
     refine: int = 20
 
     def __post_init__(self) -> None:
-        _require(self.points >= 1, "Inducing points", self.points, "at least 1")
-        _require(self.tolerance >= 0.0, "Inducing tolerance", self.tolerance, "at least 0")
-        _require(self.refine >= 0, "Inducing refine", self.refine, "at least 0 iterations")
+        _require_whole(self, 1, "points")
+        _require_whole(self, 0, "refine")
+        _require_number(self, "tolerance", "at least 0", lambda x: x >= 0.0)
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:
@@ -207,7 +219,7 @@ class Inducing(Engine):
         self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
     ) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
-        return InducingPosterior.condition(kernels, *terms, points=self.points, tolerance=self.tolerance)
+        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -218,6 +230,7 @@ class Stochastic(Engine):
     variational one at the parameters that were found, from one pass over all rows.
     """
 
+    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "stochastic"
     points: int = 200
     steps: int = 200
@@ -226,10 +239,9 @@ class Stochastic(Engine):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("points", "batch"):
-            _require(getattr(self, name) >= 1, f"Stochastic {name}", getattr(self, name), "at least 1")
-        _require(self.steps >= 0 and self.seed >= 0, "Stochastic steps or seed", (self.steps, self.seed), "at least 0")
-        _require(self.rate > 0.0, "Stochastic rate", self.rate, "positive")
+        _require_whole(self, 1, "points", "batch")
+        _require_whole(self, 0, "steps", "seed")
+        _require_number(self, "rate", "positive", lambda x: 0.0 < x < math.inf)
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:
@@ -241,7 +253,7 @@ class Stochastic(Engine):
         self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
     ) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
-        return InducingPosterior.condition(kernels, *terms, points=self.points, tolerance=0.0)
+        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=0.0)
 
 
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing, Stochastic)}
@@ -261,15 +273,17 @@ def engine_of(given: Engine | str) -> Engine | None:
         return given
     if given == "auto":
         return None
-    if given not in ENGINES:
+    if not isinstance(given, str) or given not in ENGINES:
         raise InvalidInput(unknown_name_message("engine", str(given), "forcegp", ("auto", *ENGINES)))
     return ENGINES[given]()
 
 
-def engine_from_dict(stored: Mapping[str, Any] | None) -> Engine:
+def engine_from_dict(stored: object) -> Engine:
     """The engine that `to_dict` stored; exact for None. Raises InvalidInput for anything else."""
     if stored is None:
         return Exact()
+    if not isinstance(stored, Mapping):
+        raise InvalidInput(f"stored engine {stored!r} is not a name with settings; there are {', '.join(ENGINES)}")
     kind = ENGINES.get(str(stored.get("name")))
     known = {field.name for field in fields(kind)} if kind is not None else set()  # type: ignore[arg-type]  # a dataclass
     settings = {name: value for name, value in stored.items() if name != "name"}
@@ -286,17 +300,30 @@ def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = T
     exact, rows = Exact(), f"{size.rows} rows"
     needed, free = exact.required_bytes(size), free_memory(device)
     fits = needed <= USABLE * free
+    if not size.latents:
+        return Choice(exact, "exact: there is no unknown force to learn")
     if size.rows <= MOST_EXACT_ROWS and fits:
         return Choice(exact, f"exact: {rows} need {gib(needed)}")
     if inducing and size.features <= FEW_FEATURES:
         return Choice(Inducing(), f"inducing: {rows}, and the processes have {size.features} features at most")
     if fits and size.rows * size.rank <= MOST_EXACT_ENTRIES:
         return Choice(exact, f"exact: {rows} need {gib(needed)}, {gib(free)} are free")
+    if size.rows > MOST_ITERATIVE_ROWS:
+        reason = f"stochastic: {rows} of {size.features} features, on which conjugate gradients would take hours"
+        return Choice(Stochastic(), reason)
     iterative = Iterative()
     iterative.require_memory(size, device)
     return Choice(iterative, f"iterative: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")
 
 
-def _require(fine: bool, what: str, given: object, allowed: str) -> None:
-    if not fine:
-        raise InvalidInput(f"{what} is {given!r}; it must be {allowed}")
+def _require_whole(engine: Engine, least: int, *names: str) -> None:
+    for name in names:
+        given = getattr(engine, name)
+        if isinstance(given, bool) or not isinstance(given, int) or given < least:
+            raise InvalidInput(f"{type(engine).__name__} {name} is {given!r}; it must be a whole number >= {least}")
+
+
+def _require_number(engine: Engine, name: str, allowed: str, fine: Callable[[float], bool]) -> None:
+    given = getattr(engine, name)
+    if isinstance(given, bool) or not isinstance(given, int | float) or not fine(given):
+        raise InvalidInput(f"{type(engine).__name__} {name} is {given!r}; it must be {allowed}")

@@ -25,10 +25,11 @@ from torch.utils.checkpoint import checkpoint
 from typing_extensions import override
 
 from forcegp.errors import NumericalError
-from forcegp.inference.deflation import deflate, whiten
+from forcegp.inference.deflation import whiten
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.pivots import pivoted_cholesky
 from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.terms import Terms
 from forcegp.inference.weight_space import WeightSpace
 
 CHUNK_BYTES = 64 * 2**20
@@ -50,25 +51,13 @@ class InducingPosterior(LatentPosterior):
     space: WeightSpace
 
     @classmethod
-    def condition(
-        cls,
-        kernels: LatentKernels,
-        features: Sequence[Float[Tensor, "N _"]],
-        W: Float[Tensor, "N D C"],
-        residual: Float[Tensor, "N D"],
-        noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
-        *,
-        points: int,
-        tolerance: float,
-    ) -> InducingPosterior:
-        """Condition on residual = y - m through at most `points` inducing points for each latent.
+    def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> InducingPosterior:
+        """Condition on the data through at most `points` inducing points for each latent.
 
-        Fewer where each latent leaves out less than its share of `tolerance`, see `left_out`. The first arguments are
-        those of `negative_log_likelihood`.
+        Fewer where each latent leaves out less than its share of `tolerance`, see `left_out`.
         """
         with torch.no_grad():
-            W_white, y_white, _ = whiten(W, residual, noise)
-            deflation = deflate(W_white, y_white)
+            deflation, features = terms.deflated(), terms.features
             pivots = inducing_pivots(kernels, features, deflation.C, points, tolerance)
             places = [z[found] for z, found in zip(features, pivots, strict=True)]
             return cls(kernels, WeightSpace.of(kernels, features, places, deflation.C, deflation.t))

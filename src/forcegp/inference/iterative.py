@@ -19,11 +19,12 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.conjugate_gradients import Iteration, Solved, conjugate_gradients
-from forcegp.inference.deflation import Deflation, deflate, whiten
+from forcegp.inference.deflation import Deflation
 from forcegp.inference.kernel_panels import KernelPanels
 from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
 from forcegp.inference.pivots import Pivots, pivoted_cholesky
 from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.terms import Terms
 from forcegp.inference.weight_space import WeightSpace
 
 
@@ -75,8 +76,9 @@ class IterativePosterior(LatentPosterior):
     """The posterior from conjugate gradients: mean to `tolerance`, covariance from the preconditioner's model.
 
     That model has the same prior variance at every point, but keeps only `points` weights per latent in common between
-    points. `solve_covariance=True` takes conjugate gradients for the covariance, too: as good as the mean, and as
-    expensive for every few points as the whole fit.
+    points; drawn functions are those of the exact posterior, and vary less where the weights are few.
+    `solve_covariance=True` takes conjugate gradients for the covariance, too: as good as the mean, and as expensive for
+    every few points as the whole fit.
     """
 
     kernels: LatentKernels
@@ -98,10 +100,7 @@ class IterativePosterior(LatentPosterior):
     def condition(
         cls,
         kernels: LatentKernels,
-        features: Sequence[Float[Tensor, "N _"]],
-        W: Float[Tensor, "N D C"],
-        residual: Float[Tensor, "N D"],
-        noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
+        terms: Terms,
         *,
         points: int,
         tolerance: float,
@@ -111,15 +110,14 @@ class IterativePosterior(LatentPosterior):
         start: Float[Tensor, "n 1"] | None = None,
         report: Iteration | None = None,
     ) -> IterativePosterior:
-        """Condition on residual = y - m; the first arguments are those of `negative_log_likelihood`.
+        """Condition on the data.
 
         `points` of each latent for the preconditioner, `memory` bytes for kernel matrices that are kept, `start` an
         earlier solution alpha. Raises NumericalError where the tolerance is not reached.
         """
         with torch.no_grad():
-            W_white, y_white, _ = whiten(W, residual, noise)
-            deflation = deflate(W_white, y_white)
-            features = tuple(z.detach() for z in features)
+            deflation = terms.deflated()
+            features = tuple(z.detach() for z in terms.features)
             panels = KernelPanels(kernels, features, memory)
             preconditioner = LowRankPlusDiagonal.of(kernels, features, deflation.C, deflation.t, points)
             _check_start(start, deflation)
@@ -177,13 +175,16 @@ class IterativePosterior(LatentPosterior):
 
     def solve(self, right: Float[Tensor, "n S"]) -> Float[Tensor, "n S"]:
         """T^-1 right, to the same tolerance. Raises NumericalError where it is not reached."""
-        return conjugate_gradients(
-            lambda x: _covariance_product(self.deflation.C, self.panels, x),
-            self.preconditioner.solve,
-            right,
-            tolerance=self.tolerance,
-            iterations=self.iterations,
-        ).solution
+        try:
+            return conjugate_gradients(
+                lambda x: _covariance_product(self.deflation.C, self.panels, x),
+                self.preconditioner.solve,
+                right,
+                tolerance=self.tolerance,
+                iterations=self.iterations,
+            ).solution
+        finally:
+            self.panels.release()
 
 
 def _check_start(start: Tensor | None, deflation: Deflation) -> None:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from forcegp.inference.deflation import Deflation, deflate, whiten
+
 
 class Terms(NamedTuple):
     """Features z_c (N, d_c) of every latent, W (N, D, C), residual y - m (N, D), and the noise.
@@ -17,3 +19,8 @@ class Terms(NamedTuple):
     W: Tensor
     residual: Tensor
     noise: Tensor
+
+    def deflated(self) -> Deflation:
+        """Whitened, and split into what depends on the latents and what does not."""
+        W_white, y_white, _ = whiten(self.W, self.residual, self.noise)
+        return deflate(W_white, y_white)

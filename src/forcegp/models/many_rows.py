@@ -6,7 +6,6 @@ engine condition on all rows at the same hyper-parameters, with features prepare
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.errors import InvalidInput
 from forcegp.inference import (
     Choice,
     Engine,
@@ -26,21 +25,19 @@ from forcegp.inference import (
     choose_engine,
 )
 from forcegp.inference.conjugate_gradients import Iteration
-from forcegp.inference.engines import MOST_EXACT_ROWS
+from forcegp.inference.engines import MOST_EXACT_ROWS, MOST_ITERATIVE_ROWS
 from forcegp.inference.memory import require_memory
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
 from forcegp.models.noise import ACCELERATION
 from forcegp.models.refinement import refined
 from forcegp.models.search import blas_threads
+from forcegp.models.surface_distance import check_distance
 
 if TYPE_CHECKING:
     from forcegp.models.structured_posterior import StructuredPosterior
 
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
-
-MOST_ITERATIVE_ROWS = 20_000
-"""Rows beyond which conjugate gradients take hours rather than minutes; approximate inducing points are kept then."""
 
 
 def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
@@ -84,11 +81,14 @@ def on_all_rows(
     training = reference if len(rows) == len(reference.q) else _training(rows, reference)
     likelihood = replace(fitted.likelihood, training=training)
     fitted.model.system.check_states(training.q, training.v, training.u)
+    if training is not reference:
+        check_distance(fitted.model.system, training)
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms(fitted.parameters))
-    choice = (
-        choose_engine(size, training.q.device) if engine is None else Choice(engine, f"{engine.name}: as asked for")
-    )
+    if engine is None or not size.latents:
+        choice = choose_engine(size, training.q.device)
+    else:
+        choice = Choice(engine, f"{engine.name}: as asked for")
     settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
     if isinstance(choice.engine, Exact) and training is reference:
         return fitted.with_settings(**settings, engine=choice.engine.to_dict(), engine_reason=choice.reason)
@@ -122,12 +122,6 @@ def _another(
     assert isinstance(latent, InducingPosterior)
     short = f"inducing points leave out {latent.left_out:.2g} of the noise variance of a row"
     if size.rows > MOST_ITERATIVE_ROWS:
-        warnings.warn(
-            f"{short}, so that the posterior of {size.rows} rows is an approximation; give Inducing more points, or "
-            "fewer rows to another engine",
-            NumericalWarning,
-            stacklevel=4,
-        )
         return Choice(choice.engine, f"{choice.reason}; {short}"), latent
     other = choose_engine(size, likelihood.training.q.device, inducing=False)
     other = Choice(other.engine, f"{other.reason}; {short}")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import torch
+
+from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import (
     Inducing,
     InducingPosterior,
@@ -14,6 +18,7 @@ from forcegp.inference import (
     minimize_objective,
 )
 from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.engines import ENOUGH
 from forcegp.inference.stochastic import stochastic_search
 from forcegp.models.objective import FitObjective
 
@@ -30,8 +35,10 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
     Where physical parameters were learned they and all others stay, for their standard errors belong together.
     """
     engine, latent = posterior.engine, posterior.latent
-    if not isinstance(latent, InducingPosterior) or posterior.identification is not None:
+    if not isinstance(latent, InducingPosterior):
         return posterior
+    if posterior.identification is not None:
+        return _checked(posterior)
     noise = posterior.model.noise
     assert noise is not None, "a fitted model has its noise"
     names = () if noise.learn else noise.parameters(posterior.model.system.robot.nv)
@@ -41,7 +48,7 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
     objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
     if isinstance(engine, Inducing) and engine.refine and latent.left_out <= engine.tolerance:
         options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
-        return _with(posterior, minimize_objective(objective, start, options, report))
+        return _checked(_with(posterior, minimize_objective(objective, start, options, report)))
     if isinstance(engine, Stochastic) and engine.steps:
         result = stochastic_search(
             kernels,
@@ -55,7 +62,29 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
             seed=engine.seed,
             report=report,
         )
-        return _with(posterior, result)
+        with torch.no_grad():  # steps are noisy: what they came to is told by the bound on all rows
+            before, after = (float(objective(point)) for point in (start, result.parameters))
+        if not after <= before:
+            raise NumericalError(
+                f"{result.status} raised the bound on all rows from {before:.1f} to {after:.1f} nats; give Stochastic "
+                f"a smaller rate ({engine.rate} now), a larger batch or more steps"
+            )
+        return _checked(_with(posterior, replace(result, history=(before, after), value=after)))
+    return _checked(posterior)
+
+
+def _checked(posterior: StructuredPosterior) -> StructuredPosterior:
+    """The posterior; a warning where its inducing points leave out so much that it is an approximation."""
+    latent, engine = posterior.latent, posterior.engine
+    assert isinstance(latent, InducingPosterior)
+    if latent.left_out > max(ENOUGH, getattr(engine, "tolerance", 0.0)):
+        warnings.warn(
+            f"{latent.space.count} inducing points leave out {latent.left_out:.2g} of the noise variance of a row, so "
+            "that the posterior is an approximation with wider intervals than the exact one; give more points, or take "
+            "engine='exact' or 'iterative'",
+            NumericalWarning,
+            stacklevel=4,
+        )
     return posterior
 
 
