@@ -9,8 +9,9 @@ import torch
 from safetensors.torch import load_file
 from tests.models.arm import arm_data, arm_system
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.errors import ContactError, FileFormatError, InvalidInput, NotEnoughMemory
 from forcegp.inference import OptimizerOptions, likelihood
+from forcegp.inference import memory as memory_module
 from forcegp.mechanics import Contact, Plane
 from forcegp.models import IndependentGP, NeuralNetwork, Noise, StructuredGP, load_posterior, save_posterior
 from forcegp.models.updating import updated
@@ -274,6 +275,24 @@ def test_noise_of_every_row_must_be_stated_for_all_or_none(posterior):
     one_for_all = dataclasses.replace(silent, noise_std=np.full(3, 0.05))
     every_row = dataclasses.replace(silent, noise_std=np.full((4, 3), 0.05))
     assert_same(uneven.update(one_for_all), uneven.update(every_row), data)
+
+
+def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(posterior, monkeypatch):
+    few = arm_data(60, seed=17)
+    again = {name: np.tile(getattr(few, name), (1000, 1)) for name in ("q", "v", "u", "a")}
+    many = dataclasses.replace(few, **again, time=0.01 * np.arange(60_000), episode=np.zeros(60_000, int), truth={})
+    wide = posterior.update(arm_data(28, seed=18))
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 2**30)
+    with pytest.raises(NotEnoughMemory, match=r"12 \+ 60000 rows needs .* GiB, 1.0 GiB are free: give a budget"):
+        posterior.update(many)
+    with pytest.raises(NotEnoughMemory, match=r"budget=40000 needs .* GiB are free: give a smaller budget$"):
+        posterior.update(many, budget=40_000)
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 40_000)
+    with pytest.raises(NotEnoughMemory, match="give a budget"):
+        posterior.update(few)
+    assert posterior.update(few, budget=12).settings["points"] == 12
+    with pytest.raises(NotEnoughMemory, match=r"a smaller budget, or a posterior of fewer rows \(it has 40\)"):
+        wide.update(few, budget=12)
 
 
 def test_a_posterior_that_was_carried_elsewhere_is_updated_before(posterior):

@@ -62,6 +62,17 @@ def with_rows(
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
 
 
+def bytes_to_append(rows: int, more: int, rank: int, latents: int) -> int:
+    """Memory that `with_rows` takes beside the old factor: the new one, blocks of the new rows and their copies."""
+    old, new = rank * rows, rank * more
+    return 8 * ((old + new) ** 2 + 2 * new * (old + new) + latents * more**2)
+
+
+def bytes_to_choose(rows: int, rank: int) -> int:
+    """Memory of `rows_to_keep`: the factor, its inverse, and two whole matrices while both halves of it are joined."""
+    return 8 * 4 * (rank * rows) ** 2
+
+
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
     """The posterior of some of the rows, in the order given: their covariance is factorised anew.
 

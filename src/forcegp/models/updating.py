@@ -13,7 +13,8 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import ExactPosterior, exact
-from forcegp.inference.growing import rows_to_keep, with_only, with_rows
+from forcegp.inference.growing import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
+from forcegp.inference.memory import require_memory
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
 from forcegp.models.search import blas_threads
 from forcegp.models.surface_distance import check_distance
@@ -35,11 +36,12 @@ def updated(
     checked_update(posterior, rows, budget)
     likelihood, parameters = posterior.likelihood, posterior.parameters
     training, latent = likelihood.training, exact(posterior.latent, "learning from more rows")
+    height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
+    _require_memory(latent, len(rows), height, budget)
     reference = training if training.reference is None else training.reference
     added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
     likelihood.system.check_states(added.q, added.v, added.u)
     check_distance(likelihood.system, added)
-    height = len(added.q) if budget is None else max(1, budget // SHARE_AT_ONCE)
     with torch.no_grad(), blas_threads(training.q.numel()):
         features, W, residual, noise = _on(likelihood, added).terms(parameters)
         noise = noise.expand(len(W), *noise.shape[1:])
@@ -70,6 +72,21 @@ def checked_update(posterior: StructuredPosterior, rows: Dataset, budget: int | 
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
+
+
+def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int | None) -> None:
+    """Raise NotEnoughMemory where `added` rows, `height` at a time, do not fit: before anything is computed."""
+    count, rank, latents = latent.system.deflation.C.shape
+    height = min(height, added)
+    before = count if budget is None else min(max(count, budget), count + added - height)  # at the largest step
+    needed = bytes_to_append(before, height, rank, latents)
+    what, remedy = f"a posterior of {count} + {added} rows", "give a budget of rows to keep (budget=N), or fewer rows"
+    if budget is not None:
+        needed = max(needed, bytes_to_choose(before + height, rank))
+        what, remedy = f"learning from {added} rows with budget={budget}", "give a smaller budget"
+        if count > budget:
+            remedy += f", or a posterior of fewer rows (it has {count})"
+    require_memory(needed, what, remedy, latent.system.alpha.device)
 
 
 def _on(likelihood: MarginalLikelihood, training: TrainingData) -> MarginalLikelihood:
