@@ -17,17 +17,28 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 # The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
 ROOMS = {
     "errors": set(),
+    "native_code": {"errors"},
     "parallel": {"errors"},
-    "robots": {"errors"},
+    "robots": {"errors", "native_code"},
     "mechanics": {"errors", "robots"},
     "data": {"errors", "robots", "mechanics"},
     "priors": {"errors", "robots", "mechanics"},
-    "inference": {"errors"},
+    "inference": {"errors", "native_code"},
     "integration": {"errors", "robots", "mechanics"},
-    "models": {"errors", "parallel", "robots", "mechanics", "data", "priors", "inference", "integration"},
+    "models": {
+        "errors",
+        "native_code",
+        "parallel",
+        "robots",
+        "mechanics",
+        "data",
+        "priors",
+        "inference",
+        "integration",
+    },
     "simulation": {"errors", "robots", "mechanics", "data"},
-    "evaluation": {"errors", "parallel", "robots", "mechanics", "data", "priors", "inference", "integration", "models"},
 }
+ROOMS["evaluation"] = set(ROOMS) - {"simulation"}
 ROOMS["experiments"] = set(ROOMS)
 ROOMS["cli"] = set(ROOMS)
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError
+from forcegp.native_code import require_plain
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
 from forcegp.robots.arguments import Inertials, broadcast_batch
 from forcegp.robots.compiled_programs import CompiledProgram, compiled_program, default_folder
@@ -20,6 +20,9 @@ from forcegp.robots.unrolled import UnrolledRobot
 if TYPE_CHECKING:
     from forcegp.robots.robot import Robot
 
+INSTEAD_OF_TRANSFORMS = (
+    "use batch dimensions and backward passes, or the robot itself (compiled.robot), whose results are the same"
+)
 ROWS, COLUMNS = (list(entries) for entries in zip(*INERTIA_ENTRIES, strict=True))
 
 
@@ -141,7 +144,7 @@ class CompiledRobot:
             own = bodies.shape[3:]
             tensors.append(bodies[:, ROWS, COLUMNS].flatten(0, 1).movedim(0, -1))
             shapes["inertials"] = own
-        _require_plain(tensors)
+        require_plain(tensors, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
         batch = broadcast_batch(shapes)
         flat = [
             value.reshape(1, -1)
@@ -205,15 +208,4 @@ class _Derivative(torch.autograd.Function):
         raise InvalidInput(
             "compiled dynamics has first derivatives only; for second ones use the robot itself (compiled.robot), "
             "whose results are the same."
-        )
-
-
-def _require_plain(tensors: list[Tensor]) -> None:
-    """:class:`~forcegp.errors.InvalidInput` under a transform of torch.func and in forward-mode differentiation."""
-    transformed = torch._C._are_functorch_transforms_active()
-    if transformed or any(forward_ad.unpack_dual(x).tangent is not None for x in tensors):
-        what = "transforms of torch.func (vmap, grad, jacrev, ...)" if transformed else "forward-mode differentiation"
-        raise InvalidInput(
-            f"compiled dynamics does not support {what}; use batch dimensions and backward passes, or the robot itself "
-            "(compiled.robot), whose results are the same."
         )

@@ -14,9 +14,7 @@ import os
 import platform
 import re
 import shlex
-import shutil
 import stat
-import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -28,6 +26,7 @@ import torch
 from torch import Tensor
 
 from forcegp.errors import CompilerError
+from forcegp.native_code import C, compile_library
 from forcegp.robots.dynamics_programs import Request, trace
 from forcegp.robots.machine_code import input_arrays, write_c
 from forcegp.robots.unrolled import UnrolledRobot
@@ -150,34 +149,13 @@ def _require_own(path: Path) -> None:
         )
 
 
-def _compiler() -> list[str]:
-    chosen = shlex.split(os.environ.get("CC", ""))
-    for command in [chosen] if chosen else (["cc"], ["gcc"], ["clang"]):
-        if shutil.which(command[0]):
-            return command
-    looked_for = f"{chosen[0]!r}, which the environment variable CC names" if chosen else "cc, gcc or clang"
-    raise CompilerError(
-        f"compiled dynamics needs a C compiler, and there is none here (looked for {looked_for}); install one "
-        "(Debian, Ubuntu: apt install gcc; Fedora: dnf install gcc; macOS: xcode-select --install; conda: conda "
-        "install gcc), name it by CC, or use the robot itself, whose results are the same."
-    )
-
-
 def compile_c(source: str, options: tuple[str, ...], path: Path) -> None:
     """Compile a source text to the library ``path``, whole or not at all."""
-    compiler = _compiler()
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".compiling-") as work:
-            text, library = Path(work) / "dynamics.c", Path(work) / "dynamics.so"
-            text.write_text(source, encoding="ascii")
-            command = [*compiler, *OPTIONS, *options, str(text), "-o", str(library)]
-            done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-            if done.returncode != 0:
-                why = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-                raise CompilerError(
-                    f"the C compiler failed: {shlex.join(compiler)}: {why}; name another (GCC or Clang) by the "
-                    "environment variable CC, or use the robot itself, whose results are the same."
-                )
+            library = Path(work) / "dynamics.so"
+            options = (*OPTIONS, *options)
+            compile_library(C, source, options, library, purpose="compiled dynamics", instead="use the robot itself")
             library.chmod(0o700)
             os.replace(library, path)  # whoever else compiles the same meanwhile
     except OSError as error:
