@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 from tests.models.arm import arm_data, arm_system
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput, NotEnoughMemory
+from forcegp.errors import ContactError, DataWarning, FileFormatError, InvalidInput, NotEnoughMemory
 from forcegp.inference import OptimizerOptions, likelihood
 from forcegp.inference import memory as memory_module
 from forcegp.mechanics import Contact, Plane
@@ -275,6 +276,43 @@ def test_noise_of_every_row_must_be_stated_for_all_or_none(posterior):
     one_for_all = dataclasses.replace(silent, noise_std=np.full(3, 0.05))
     every_row = dataclasses.replace(silent, noise_std=np.full((4, 3), 0.05))
     assert_same(uneven.update(one_for_all), uneven.update(every_row), data)
+
+
+def stating(data, noise_std):
+    return dataclasses.replace(data, noise_std=noise_std)
+
+
+def test_rows_that_state_another_noise_than_the_fit_are_warned_of(posterior, tmp_path):
+    rows = arm_data(3, seed=17)
+    other = stating(rows, rows.noise_std * [1.0, 1.0, 2.0])
+    say = r"0.05 \(0.05\), 0.05 \(0.05\), 0.1 \(0.05\).*level of the fit is used.*noise_std of shape \(rows, nv\)"
+    with pytest.warns(DataWarning, match=say):
+        grown = posterior.update(other)
+    assert_same(grown, posterior.update(rows), rows)
+    assert_same(grown, posterior.update(stating(rows, rows.noise_std * 1.09)), rows)  # warnings are errors here
+    save_posterior(posterior, tmp_path / "run")
+    with pytest.warns(DataWarning, match="another noise"):
+        load_posterior(tmp_path / "run").update(other)
+
+
+@pytest.mark.parametrize("noise", [Noise(0.05), Noise(0.05, learn=True), Noise(None, learn=True)], ids=repr)
+def test_a_level_that_was_given_or_learned_is_meant(noise):
+    data = arm_data(15, seed=16)
+    posterior = fit(data, model=StructuredGP(data.system, noise=noise))
+    rows = data.rows(slice(12, 15))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grown = posterior.update(stating(rows, rows.noise_std * 10.0))
+    assert_same(grown, posterior.update(stating(rows, None)), data)
+
+
+def test_rows_that_state_their_own_noise_are_as_noisy_as_they_say():
+    data = arm_data(16, seed=18)
+    uneven = stating(data, np.tile(data.noise_std, (16, 1)))
+    posterior = fit(uneven)
+    rows = stating(uneven.rows(slice(12, 16)), 10.0 * data.noise_std)
+    noise = posterior.update(rows).likelihood.terms(posterior.parameters).noise
+    torch.testing.assert_close(noise[12:].sqrt(), torch.full((4, 3), 10.0) * torch.tensor(data.noise_std))
 
 
 def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(posterior, monkeypatch):

@@ -273,6 +273,7 @@ class StructuredGP(Model):
             "mean": self.mean,
             "prior": prior_to_dict(self.prior),
             "noise": noise.to_dict(),
+            "noise_from_data": not noise.learn and (self.noise is None or self.noise.acceleration is None),
             "optimizer": {name: getattr(options, name) for name in options.__dataclass_fields__},
             "hyperprior": hyperprior,
             "restart_objective": [r.value if isinstance(r, OptimizationResult) else None for r in results],

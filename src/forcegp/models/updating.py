@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -11,11 +12,12 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import DataWarning, InvalidInput
 from forcegp.inference import ExactPosterior, exact
 from forcegp.inference.growing import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
 from forcegp.inference.memory import require_memory
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
+from forcegp.models.noise import ACCELERATION
 from forcegp.models.search import blas_threads
 from forcegp.models.surface_distance import check_distance
 
@@ -28,6 +30,9 @@ Keep = Callable[[ExactPosterior, int], Tensor]
 SHARE_AT_ONCE = 4
 """With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
 
+OTHER_NOISE = 0.1
+"""Part of the fit's level of noise by which rows may state another one without a warning."""
+
 
 def updated(
     posterior: StructuredPosterior, rows: Dataset, budget: int | None, keep: Keep = rows_to_keep
@@ -39,6 +44,7 @@ def updated(
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
     _require_memory(latent, len(rows), height, budget)
     reference = training if training.reference is None else training.reference
+    _warn_of_another_noise(posterior, rows, reference)
     added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
     likelihood.system.check_states(added.q, added.v, added.u)
     check_distance(likelihood.system, added)
@@ -71,6 +77,23 @@ def checked_update(posterior: StructuredPosterior, rows: Dataset, budget: int | 
         raise InvalidInput(
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
+        )
+
+
+def _warn_of_another_noise(posterior: StructuredPosterior, rows: Dataset, reference: TrainingData) -> None:
+    """DataWarning where rows state one noise for all of them, another than the fit's data did, which stays in use."""
+    stated = rows.noise_std
+    if stated is None or stated.ndim == 2 or reference.noise_std is not None:
+        return  # nothing stated, or stated row by row: then every row is as noisy as it says
+    level = posterior.parameters[ACCELERATION].exp().cpu().numpy()
+    if posterior.settings.get("noise_from_data") and bool((np.abs(stated / level - 1.0) > OTHER_NOISE).any()):
+        say = ", ".join(f"{mine:.3g} ({fit:.3g})" for mine, fit in zip(stated, level, strict=True))
+        warnings.warn(
+            f"the new rows state another noise per joint than the data of the fit (in brackets): {say}. The level of "
+            "the fit is used for them, too; state the noise of every row (noise_std of shape (rows, nv)) in the fit "
+            "and here, or fit again to all rows",
+            DataWarning,
+            stacklevel=4,
         )
 
 
