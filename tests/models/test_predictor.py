@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tests.models.arm import arm_data, arm_system
+from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference import OptimizerOptions
@@ -202,6 +203,50 @@ def test_predictions_without_a_graph_need_none(means, states):
         assert not means.mean(*x).requires_grad
     with pytest.raises(InvalidInput, match="first derivatives only"):
         torch.autograd.grad(means.mean(*x).sum(), x, create_graph=True)
+
+
+TRANSFORMS = {
+    "jacrev": lambda f, x: torch.func.jacrev(f)(x),
+    "grad": lambda f, x: torch.stack([torch.func.grad(lambda y, i=i: f(y)[i])(x) for i in range(3)]),
+    "vjp": lambda f, x: torch.stack([torch.func.vjp(f, x)[1](row)[0] for row in torch.eye(3, dtype=x.dtype)]),
+    "jacfwd": lambda f, x: torch.func.jacfwd(f)(x),
+    "jvp": lambda f, x: torch.stack([torch.func.jvp(f, (x,), (row,))[1] for row in torch.eye(3, dtype=x.dtype)], 1),
+}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+def test_transforms_are_refused_by_code_and_taken_by_torch(posterior, means, compressed, states, transform):
+    q, v, u = (x[0] for x in states)
+    take = TRANSFORMS[transform]
+    refused = r"does not support transforms of torch\.func .*linearize.*compile=False"
+    for function in (means.mean, compressed, means.linearize):
+        with pytest.raises(InvalidInput, match=refused):
+            take(lambda y, f=function: f(y, v, u), q)
+    eager = posterior.predictor(covariance="none", compile=False)
+    assert_close(take(lambda y: eager.mean(y, v, u), q), means.linearize(q, v, u).da_dq)
+    with pytest.raises(InvalidInput, match="linearize does not support transforms"):  # it would give zeros
+        take(lambda y: eager.linearize(y, v, u).a, q)
+
+
+def test_rows_replace_vmap(means, states):
+    with pytest.raises(InvalidInput, match=r"transforms of torch\.func .*rows \(n, nv\)"):
+        torch.func.vmap(means.mean)(*states)
+
+
+def test_forward_mode_derivatives_are_not_lost(posterior, means, states):
+    q, v, u = (x[0] for x in states)
+    direction = torch.linspace(-1.0, 1.0, 3, dtype=torch.float64)
+    eager = posterior.predictor(covariance="none", compile=False)
+    with forward_ad.dual_level():
+        assert_close(means.mean(q, v, u), eager.mean(q, v, u))  # numbers alone are taken as ever
+        x = forward_ad.make_dual(q, direction)
+        for function in (means.mean, means.linearize):
+            with pytest.raises(InvalidInput, match=r"compiled predictor does not support forward-mode .*linearize"):
+                function(x, v, u)
+        with pytest.raises(InvalidInput, match="linearize does not support forward-mode"):
+            eager.linearize(x, v, u)
+        tangent = forward_ad.unpack_dual(eager.mean(x, v, u)).tangent
+    assert_close(tangent, means.linearize(q, v, u).da_dq @ direction)
 
 
 def test_errors_name_the_remedy(posterior, means, states):

@@ -25,11 +25,16 @@ from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.models.predictor_terms import EagerTerms, TapedTerms, Terms, terms_function
 from forcegp.models.sample_states import sample_states
+from forcegp.native_code import require_plain
 
 if TYPE_CHECKING:
     from forcegp.models.structured_posterior import StructuredPosterior
 
 COVARIANCES = ("compressed", "exact", "none")
+INSTEAD_OF_TRANSFORMS = (
+    "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
+    "compile=False"
+)
 BLOCK_NUMBERS = 2**18
 """Kernel values that are worked on at once: 2 MiB, so that they stay in the processor's cache."""
 
@@ -53,12 +58,13 @@ class Predictor:
     States are float64 tensors or arrays (nv,) or (n, nv) in the units of `posterior.predict`; results are tensors with
     the same leading dimension. They are those of `predict`: means to rounding, covariances exactly or never below, as
     `kind` says. Differentiable once in q, v and u where these are tensors that require gradients; with `compile=False`
-    any number of times.
+    any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
     `kind` is that of the covariance; `rank` and `inflation` tell how it was compressed; `prepare_seconds` is what
     preparing took, the C++ compiler included, which runs once per process.
 
-    Raises InvalidInput for wrong shapes and values that are not finite, NumericalError where the result is not finite.
+    Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
+    NumericalError where the result is not finite.
     """
 
     __no_type_check__: ClassVar[bool] = True
@@ -104,8 +110,9 @@ class Predictor:
         return _finished(means, single), _finished(covariances, single)
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
-        """The mean acceleration and its Jacobians in q, v and u."""
+        """The mean acceleration and its Jacobians in q, v and u, without a graph."""
         x, single = self._rows(q, v, u)
+        require_plain([x], "linearize", "take derivatives of `mean` instead, of a predictor with compile=False")
         parts = [self._linearize(part.detach()) for part in self._blocks(x)]
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
         return Linearization(a, *jacobian.split(self.nv, dim=-1))
@@ -148,6 +155,8 @@ class Predictor:
         if any(x.device.type != self.device.type for x in states):
             raise InvalidInput(f"q, v or u is on another device than the predictor; move all three to {self.device}.")
         x = torch.cat(states, dim=-1)
+        if isinstance(self.tape, TapedTerms):
+            require_plain([x], "a compiled predictor", INSTEAD_OF_TRANSFORMS)
         if not math.isfinite(float(x.detach().sum())):
             raise InvalidInput("q, v or u has values that are not finite; a predictor needs finite states.")
         return (x[None], True) if len(shape) == 1 else (x, False)
