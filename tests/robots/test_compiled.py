@@ -296,6 +296,49 @@ def test_folders_that_others_can_write_to(robot, tmp_path):
         robot.compile(file).gravity_forces(random(3))
 
 
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o722])
+def test_folders_in_folders_that_others_can_write_to(robot, tmp_path, mode):
+    shared = tmp_path / "shared"
+    own = shared / "mine" / "dynamics"
+    own.mkdir(parents=True, mode=0o700)
+    shared.chmod(mode)
+    link = tmp_path / "link"
+    link.symlink_to(own)
+    for folder in (own, link, shared / "new"):
+        with pytest.raises(
+            CompilerError, match=r"shared can be written to by others than you, .*chmod go-w .*shared\)"
+        ):
+            robot.compile(folder).gravity_forces(random(3))
+    assert not (shared / "new").exists()
+    assert list(own.iterdir()) == []
+    shared.chmod(mode | stat.S_ISVTX)  # as /tmp: nobody can exchange what is there
+    robot.compile(own).gravity_forces(random(3))
+    assert len(list(own.iterdir())) == 1
+    with pytest.raises(CompilerError, match="shared can be written to by others"):  # not the folder of the files itself
+        robot.compile(shared).gravity_forces(random(3))
+
+
+def test_folders_of_others(robot, tmp_path):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    try:
+        os.chown(theirs, os.getuid() + 12345, -1)
+    except PermissionError:
+        pytest.skip("only root may give a folder away")
+    with pytest.raises(CompilerError, match="theirs belongs to another user, .*choose a folder of your own"):
+        robot.compile(theirs / "mine").gravity_forces(random(3))
+
+
+def test_missing_folders_are_made_for_the_user_alone(robot, tmp_path):
+    before = os.umask(0)
+    try:
+        robot.compile(tmp_path / "a" / "b" / "c").gravity_forces(random(3))
+    finally:
+        os.umask(before)
+    made = [tmp_path / "a", tmp_path / "a" / "b", tmp_path / "a" / "b" / "c"]
+    assert [stat.S_IMODE(folder.stat().st_mode) for folder in made] == [0o700] * 3
+
+
 def test_files_that_are_not_whole_or_not_ones_own(robot, tmp_path):
     robot.compile(tmp_path).gravity_forces(random(3))
     (path,) = tmp_path.iterdir()

@@ -2,8 +2,8 @@
 
 A file of the folder is named by a hash of everything that decides what is in it: the robot's constants, the request,
 the sources of the modules that write the code, the processor's vector unit and the platform. Loading such a file runs
-the code in it with the rights of the process. So only files of the folder are loaded, and only if the folder and the
-file belong to the user (or to root) and no one else may write to them.
+the code in it with the rights of the process. So only files of the folder are loaded, and only if the file, the folder
+and all folders above it belong to the user (or to root) and no one else may write to them.
 """
 
 from __future__ import annotations
@@ -98,14 +98,13 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
     """The program of a request: from ``folder`` if it is there, else compiled into it.
 
     Raises :class:`~forcegp.errors.CompilerError` where there is no C compiler, where it fails, where ``folder`` cannot
-    be written to, and where others than the user can write to it.
+    be written to, and where others than the user can write to it or to a folder above it.
     """
     capability = torch.backends.cpu.get_cpu_capability()
     lanes, options = VECTOR_UNITS.get(capability, (2, ()))
     name = re.sub(r"\W+", "-", unrolled.robot.name)[:40]
     key = _key(unrolled, request, (capability, str(lanes), *options, *OPTIONS))
-    path = folder / f"{name}-{request.function}-{key[:32]}.so"
-    _make(folder)
+    path = _own_folder(folder) / f"{name}-{request.function}-{key[:32]}.so"
     if not path.exists():
         compile_c(write_c(trace(unrolled, request), request.inputs, lanes), options, path)
     _require_own(path)
@@ -127,22 +126,36 @@ def _code() -> str:
     return hashlib.sha256(b"\0".join((here / f"{name}.py").read_bytes() for name in SOURCES)).hexdigest()
 
 
-def _make(folder: Path) -> None:
+def _own_folder(folder: Path) -> Path:
+    """``folder`` without symbolic links, made if it is missing, where nobody else can put or exchange anything."""
+    folder = Path(os.path.realpath(folder))  # what is checked is what is used, wherever a link points later
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for part in (*reversed(folder.parents), folder):
+            if not part.is_dir():
+                part.mkdir(mode=0o700, exist_ok=True)  # another process may make it meanwhile
+            _require_own(part, parent=part != folder)
     except OSError as error:
         raise CompilerError(
             f"the folder {folder} for compiled dynamics cannot be made ({error.strerror}); choose another: "
             "robot.compile(folder=...)."
         ) from error
-    _require_own(folder)
+    return folder
 
 
-def _require_own(path: Path) -> None:
-    status = path.stat()
+def _require_own(path: Path, *, parent: bool = False) -> None:
+    """Nobody but the user and root may exchange the file or what is in the folder.
+
+    In a parent folder with the sticky bit, such as /tmp, everybody may make files, but exchange only their own.
+    """
     if not hasattr(os, "getuid"):
         return
-    if status.st_uid not in (os.getuid(), 0) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    status = path.stat()
+    if status.st_uid not in (os.getuid(), 0):
+        raise CompilerError(
+            f"{path} belongs to another user, and code from it would run with your rights; choose a folder "
+            "that lies in folders of your own: robot.compile(folder=...)."
+        )
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not (parent and status.st_mode & stat.S_ISVTX):
         raise CompilerError(
             f"{path} can be written to by others than you, and code from it would run with your rights; take that "
             f"away (chmod go-w {shlex.quote(str(path))}) or choose another folder: robot.compile(folder=...)."
