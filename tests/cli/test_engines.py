@@ -10,6 +10,7 @@ from tests.models.arm import arm_data
 from forcegp.cli.main import main
 from forcegp.models import load_posterior
 
+INDUCING = ("--engine", "inducing", "--learning-points", 20)
 FIT = ("fit", "arm.h5", "--points", 40, "--iterations", 3, "--restarts", 1)
 
 
@@ -23,12 +24,16 @@ def test_the_engine_is_said_and_stored(forcegp, folder):
     done = forcegp(*FIT, "--engine", "iterative", "--learning-points", 20, "--out", "run", folder=folder)
     assert done.returncode == 0, done.stderr
     assert "iterative: as asked for" in done.stdout
-    assert "learned from 40 points" in done.stdout
+    assert "learned from 40 points (parameters: from 20 of them)" in " ".join(done.stdout.split())
     posterior = load_posterior(folder / "run")
     assert posterior.engine.name == "iterative"
     assert (len(posterior.training.q), len(posterior.training.reference.q)) == (40, 20)
     config = json.loads((folder / "run" / "config.json").read_text())
     assert config["resolved"]["learning_points"] == 20
+    told = forcegp(*FIT, "--prior", "joint-friction", *INDUCING, "--json", "--out", "friction", folder=folder)
+    summary = json.loads(told.stdout)
+    assert (summary["points"], summary["learning_points"]) == (40, 20)
+    assert summary["refined"].startswith("on all rows")
     scored = forcegp("evaluate", "run", "arm.h5", folder=folder)
     assert scored.returncode == 0, scored.stderr
 

@@ -75,6 +75,19 @@ def test_what_is_not_identified_is_said_on_one_json_object(forcegp, folder):
     assert "upper.com.z/r" in summary["verdict"]
 
 
+def test_estimates_come_from_all_points_or_the_report_names_both_numbers(forcegp, folder):
+    words = ("identify", "arm.h5", "--learn", "hand:mass", "--model", "analytical", "--points", 50)
+    all_points = forcegp(*words, "--json", "--out", "all", folder=folder)
+    assert json.loads(all_points.stdout)["learning_points"] == 50
+    some = forcegp(*words, "--learning-points", 20, "--out", "some", folder=folder)
+    assert "identified from 20 of 50 points" in " ".join(some.stdout.split())
+    of_20 = forcegp(*words[:-1], 20, "--json", "--out", "few", folder=folder)
+    told = json.loads((folder / "some" / "identification.json").read_text())
+    assert told["parameters"] == json.loads(of_20.stdout)["parameters"]
+    found = json.loads(all_points.stdout)["parameters"]["hand.mass"]
+    assert found["standard_error"] < told["parameters"]["hand.mass"]["standard_error"]
+
+
 WRONG = [
     ("--learn hnd:mass", "no link 'hnd' in arm; did you mean 'hand'?"),
     ("--learn hand:weight", "inertial parts mass, com, inertia, and 'weight' was asked of 'hand'"),
@@ -88,6 +101,7 @@ WRONG = [
     ("--learn hand:mass --prior-strength -1", "prior_strength is -1.0"),
     ("--learn hand:mass --noise loud", "--noise is 'loud'"),
     ("--learn hand:mass --points 1", "points=1 is not between"),
+    ("--learn hand:mass --learning-points 1", "learning_points is 1"),
     ("", "nothing to estimate; add --learn"),
 ]
 

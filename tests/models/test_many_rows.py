@@ -57,6 +57,22 @@ def test_parameters_come_from_some_rows_and_the_posterior_from_all(data, states)
     torch.testing.assert_close(some.predict(*states).mean, by_hand.predict(*states).mean, rtol=1e-7, atol=1e-8)
 
 
+def test_physical_parameters_are_learned_from_all_rows(data, monkeypatch):
+    few = data.rows(slice(0, 24))
+    learn = few.system.robot.link("hand").inertial("mass")
+    exact = fit(few, learn=learn)
+    for module in ("inference.engines", "models.many_rows"):
+        monkeypatch.setattr(f"forcegp.{module}.MOST_EXACT_ROWS", 20)
+    monkeypatch.setattr("forcegp.models.many_rows.LEARNING_ROWS", 12)
+    assert fit(few).settings["learning_points"] == 12
+    every = fit(few, learn=learn)
+    assert every.settings["learning_points"] == 24
+    assert every.identification.values == pytest.approx(exact.identification.values, rel=1e-12)
+    some = fit(few, learn=learn, learning_points=15)
+    assert some.settings["learning_points"] == 15
+    assert some.identification.values["hand.mass"] != pytest.approx(exact.identification.values["hand.mass"], rel=1e-6)
+
+
 def rows_of(posterior, data) -> set[int]:
     q = posterior.training.q.numpy()
     return {int(np.flatnonzero((data.q == row).all(1))[0]) for row in q}

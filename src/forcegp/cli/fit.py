@@ -156,16 +156,18 @@ def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fittin
 
 def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
-    result = posterior.result
+    result, settings = posterior.result, posterior.settings
     force_noise = posterior.parameters.get("noise.log_force")
     return {
         "model": posterior.description,
         "objective_is": posterior.objective,
         "points": len(posterior.training.q),
+        "learning_points": settings.get("learning_points", len(posterior.training.q)),
         "objective_start": result.history[0],
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
-        **({"engine": settings["engine_reason"]} if "engine_reason" in (settings := posterior.settings) else {}),
+        **({"engine": settings["engine_reason"]} if "engine_reason" in settings else {}),
+        **({"refined": settings["refined"]} if "refined" in settings else {}),
         "restarts": posterior.settings.get("restarts", 1),
         "iterations": len(result.history) - 1 if "optimizer" in posterior.settings else result.evaluations,
         "evaluations": result.evaluations,
@@ -178,6 +180,15 @@ def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
     }
 
 
+def _told_points(summary: Mapping[str, Any]) -> str:
+    """How many points were conditioned on, and where parameters were found on fewer of them, on how many."""
+    points, learning = summary["points"], summary["learning_points"]
+    if learning == points:
+        return f"{points} points"
+    refined = " and refined on all" if "refined" in summary else ""
+    return f"{points} points (parameters: from {learning} of them{refined})"
+
+
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     from forcegp.cli.tables import facts
 
@@ -185,7 +196,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     status = summary["status"]  # names failed evaluations, too, and the number of starts
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
-        f"{run}: {summary['model']}, learned from {summary['points']} points",
+        f"{run}: {summary['model']}, learned from {_told_points(summary)}",
         {
             **({"engine": summary["engine"]} if "engine" in summary else {}),
             "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",

@@ -49,6 +49,10 @@ class Identify(FitOptions):
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
     points: Annotated[int, arg(metavar="N")] = 200
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
+    learning_points: Annotated[
+        int | None, arg(metavar="N", constructor=int, help_behavior_hint="(default: all points)")
+    ] = None
+    """Find the estimates and all other parameters on N of the points; standard errors are those of N points."""
     mean: Literal["analytical", "zero"] = "analytical"
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
     iterations: Annotated[int, arg(metavar="N")] = 200
@@ -90,6 +94,7 @@ class Identify(FitOptions):
             options=OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
             learn=learn,
             prior_strength=self.prior_strength,
+            learning_points=self.learning_points,
         )
         assert posterior.identification is not None
         with terminal.progress("standard errors") as report:
@@ -125,7 +130,9 @@ def _report(command: Identify, found: Identification, summary: Mapping[str, Any]
         rows += [[of]] if of != owner else []
         owner = of
         rows.append([f"  {part}", f"{start:.{digits}f}", f"{value:.{digits}f}", f"{error:.2g}", interval, unit])
-    title = f"{command.out}: identified from {summary['points']} points, with kernels and noise free to follow"
+    points, learning = summary["points"], summary["learning_points"]
+    used = f"{points} points" if learning == points else f"{learning} of {points} points"
+    title = f"{command.out}: identified from {used}, with kernels and noise free to follow"
     table = columns(title, ["parameter", "start", "identified", "std.\nerror", "95 % interval", "unit"], rows)
     state = summary["status"] if summary["converged"] else f"not converged: {summary['status']}"
     search = f"{summary['iterations']} iterations, {summary['cpu_seconds']:.1f} s CPU, {state}."

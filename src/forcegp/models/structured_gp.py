@@ -141,7 +141,7 @@ class StructuredGP(Model):
             `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
             memory, and says why in `settings["engine_reason"]`.
         learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
-            up to 1500, and 600 beyond. The posterior is that of all points.
+            up to 1500 and 600 beyond, with `learn` all. The posterior is that of all points.
         progress: called as progress(restart, iteration, nll) where the restarts run in this process. The restart is
             `models.search.ALL_ROWS` while the engine takes in all points.
 
@@ -163,6 +163,8 @@ class StructuredGP(Model):
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:
             chosen.require_memory(self._size(len(all_rows)), self.system.robot.device)  # now, not after the search
+        if learn is not None and learning_points is None:
+            learning_points = len(all_rows)  # standard errors are those of the rows that were learned from
         rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
         if start is None and learn is None:
             start = self._continuation(rows, dataset, restarts, how)
