@@ -262,7 +262,7 @@ def test_errors_name_the_remedy(posterior, means, states):
         predictor.mean(q.to("meta"), v, u)
     with pytest.raises(InvalidInput, match="covariance='compressed' or 'exact'"):
         predictor(q, v, u)
-    with pytest.raises(InvalidInput, match="covariance is 'dense'; give one of 'compressed', 'exact', 'none'"):
+    with pytest.raises(InvalidInput, match="covariance is 'dense'; give one of 'auto', 'compressed', 'exact', 'none'"):
         posterior.predictor(covariance="dense")
     with pytest.raises(InvalidInput, match=r"tolerance is 0\.0 .*give a positive number"):
         posterior.predictor(tolerance=0.0)
@@ -286,7 +286,14 @@ def test_it_takes_what_another_engine_knows(states):
         posterior = model.fit(arm_data(30, 0), restarts=1, options=SHORT, engine="inducing")
     check(posterior, states)
     with pytest.raises(InvalidInput, match=r"InducingPosterior does not have; give covariance='exact'"):
-        posterior.predictor()
+        posterior.predictor(covariance="compressed")
+    predictor = posterior.predictor()
+    assert (predictor.kind, predictor.rank, predictor.inflation) == ("exact", None, None)
+    assert_close(predictor(*states)[1], posterior.predict(*states).covariance, 1e-9)
+
+
+def test_the_covariance_is_compressed_unless_another_is_asked_for(compressed, means):
+    assert (compressed.kind, means.kind) == ("compressed", "none")
 
 
 def test_other_models_have_none():

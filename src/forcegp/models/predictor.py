@@ -30,7 +30,7 @@ from forcegp.native_code import require_plain
 if TYPE_CHECKING:
     from forcegp.models.structured_posterior import StructuredPosterior
 
-COVARIANCES = ("compressed", "exact", "none")
+COVARIANCES = ("auto", "compressed", "exact", "none")
 INSTEAD_OF_TRANSFORMS = (
     "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
     "compile=False"
@@ -60,8 +60,8 @@ class Predictor:
     `kind` says. Differentiable once in q, v and u where these are tensors that require gradients; with `compile=False`
     any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
-    `kind` is that of the covariance; `rank` and `inflation` tell how it was compressed; `prepare_seconds` is what
-    preparing took, the C++ compiler included, which runs once per process.
+    `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` tell how it was
+    compressed; `prepare_seconds` is what preparing took, the C++ compiler included, which runs once per process.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
     NumericalError where the result is not finite.
@@ -192,6 +192,8 @@ def make_predictor(
         )
     begin = time.perf_counter()
     latent, nv = posterior.latent, posterior.system.robot.nv
+    if covariance == "auto":
+        covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
     prepared = PreparedKernels.of(latent, compile)
     function, groups = terms_function(posterior, prepared, covariance == "exact"), len(prepared.groups)
     example = [x[:1] for x in (posterior.training.q, posterior.training.v, posterior.training.u)]

@@ -127,7 +127,7 @@ class Posterior(ABC):
     def predictor(
         self,
         *,
-        covariance: str = "compressed",
+        covariance: str = "auto",
         tolerance: float = 0.01,
         largest_rank: int = 512,
         compile: bool = True,
@@ -138,7 +138,8 @@ class Posterior(ABC):
         ----------
         covariance: "compressed" uses so few combinations of the data that standard deviations are up to `tolerance`
             (relative) larger than the exact ones at states around the training data, and never smaller; "exact" is the
-            covariance of `predict`; "none" leaves it out and prepares faster.
+            covariance of `predict`; "none" leaves it out and prepares faster. "auto" is "compressed" after exact
+            inference, and "exact" after another engine, which lacks what compression needs.
         tolerance, largest_rank: the rank is the smallest that keeps the tolerance, and at most `largest_rank`; a
             NumericalWarning says where that does not suffice.
         compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device.

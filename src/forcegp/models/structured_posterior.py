@@ -151,7 +151,7 @@ class StructuredPosterior(Posterior):
     def predictor(
         self,
         *,
-        covariance: str = "compressed",
+        covariance: str = "auto",
         tolerance: float = 0.01,
         largest_rank: int = 512,
         compile: bool = True,
