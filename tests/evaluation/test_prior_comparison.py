@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from tests.models.arm import arm_data
 
 from forcegp.data import time_blocks
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, NotEnoughMemory
 from forcegp.evaluation import PriorComparison, PriorScore, compare_priors, evaluate
 from forcegp.evaluation.prior_comparison import paired_difference
 from forcegp.inference import OptimizerOptions
-from forcegp.models import Noise
+from forcegp.inference import memory as memory_module
+from forcegp.models import Noise, StructuredGP
 from forcegp.priors import JointForces, JointFriction, NoForces
 
 QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=20)}
@@ -71,6 +72,40 @@ def test_every_number_is_that_of_the_fitted_model(comparison, train):
 def test_the_same_arguments_give_the_same(comparison, train):
     again = compare_priors(train, PRIORS, points=40, test=arm_data(60, seed=1), **QUICK)
     assert again.scores == comparison.scores
+
+
+def test_many_rows_are_conditioned_on_exactly_with_parameters_from_some(train, monkeypatch):
+    for module in ("inference.engines", "models.many_rows"):
+        monkeypatch.setattr(f"forcegp.{module}.MOST_EXACT_ROWS", 20)
+    monkeypatch.setattr("forcegp.models.many_rows.LEARNING_ROWS", 15)
+    assert StructuredGP(train.system, JointFriction()).fit(train, points=30, **QUICK).engine.name == "inducing"
+    found = compare_priors(train, PRIORS, points=30, **QUICK)
+    for posterior in found.posteriors.values():
+        assert posterior.engine.name == "exact"
+        assert (posterior.settings["points"], posterior.settings["learning_points"]) == (30, 15)
+    assert found.points == 30
+    posterior = found.posteriors["friction"]
+    features, W, residual, noise = posterior.likelihood.terms(posterior.parameters)
+    with torch.no_grad():  # log p(row | others) = log p(all) - log p(others), with dense covariances
+        kernels = torch.stack(list(posterior.kernels.matrices(posterior.parameters, features)))
+        covariance = torch.einsum("iac,jbc,cij->iajb", W, W, kernels).reshape(90, 90)
+        covariance += torch.diag(noise.expand(30, 3).reshape(-1))
+    density = 0.0
+    for row in range(30):
+        others = [k for k in range(90) if k // 3 != row]
+        density += log_density(residual.reshape(-1), covariance)
+        density -= log_density(residual.reshape(-1)[others], covariance[others][:, others])
+    assert found.scores[1].leave_one_out == pytest.approx(density / 30)
+
+
+def test_more_rows_than_memory_holds_are_refused_before_the_first_fit(train, monkeypatch):
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
+    with pytest.raises(NotEnoughMemory, match=r"^3 exact posteriors of N=40 rows needs .* free: give fewer points"):
+        compare_priors(train, PRIORS, points=40, **QUICK)
+
+
+def log_density(y, covariance):
+    return float(torch.distributions.MultivariateNormal(torch.zeros_like(y), covariance).log_prob(y))
 
 
 def test_noise_mean_and_stretches_are_as_given(train):
