@@ -25,9 +25,13 @@ from torch import Tensor
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.deflation import Deflation, deflate, whiten
+from forcegp.inference.memory import return_freed_memory
 
 PANEL_BYTES = 4 * 2**20
 """Working memory of one panel of rows; measured flat between 2 and 8 MiB, slower outside."""
+
+LARGE = 2000
+"""Rows of a covariance from which on it matters what else is held beside it (32 MB)."""
 
 
 def negative_log_likelihood(
@@ -62,6 +66,8 @@ class DeflatedSystem:
 def solve_deflated(deflation: Deflation, kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> DeflatedSystem:
     """Build and factorise T, then alpha = T^-1 t and beta_ic = sum_a C_iac alpha_ia."""
     count, rank, _ = deflation.C.shape
+    if count * rank >= LARGE:
+        return_freed_memory()
     factor = factorize(lambda: deflated_covariance(deflation.C, kernel_matrices))
     alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(count, rank)
     beta = torch.einsum("irc,ir->ic", deflation.C, alpha)
@@ -83,12 +89,22 @@ def deflated_covariance(
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """Rows start..stop against columns 0..stop: weighted[i, c, (j, b)] = k_c[i, j] C_jbc."""
+    """Rows start..stop against columns 0..stop; what is computed of them is computed where it is needed."""
 
     start: int
     stop: int
-    kernel: Float[Tensor, "i C j"]
-    weighted: Float[Tensor, "i C jb"]
+    kernel_matrices: Sequence[Float[Tensor, "N N"]]
+    C_by_latent: Float[Tensor, "C N r"]
+
+    @property
+    def kernel(self) -> Float[Tensor, "i C j"]:
+        """k_c[i, j]."""
+        return torch.stack([K[self.start : self.stop, : self.stop] for K in self.kernel_matrices], dim=1)
+
+    @property
+    def weighted(self) -> Float[Tensor, "i C jb"]:
+        """k_c[i, j] C_jbc."""
+        return (self.kernel[..., None] * self.C_by_latent[None, :, : self.stop, :]).flatten(2)
 
 
 def _panels(C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> Iterator[_Panel]:
@@ -98,10 +114,7 @@ def _panels(C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "
     C_by_latent = C.permute(2, 0, 1).contiguous()
     height = max(1, min(count, PANEL_BYTES // max(1, 8 * latents * count * rank)))
     for start in range(0, count, height):
-        stop = min(count, start + height)
-        kernel = torch.stack([K[start:stop, :stop] for K in kernel_matrices], dim=1)
-        weighted = kernel[..., None] * C_by_latent[None, :, :stop, :]
-        yield _Panel(start, stop, kernel, weighted.reshape(stop - start, latents, stop * rank))
+        yield _Panel(start, min(count, start + height), kernel_matrices, C_by_latent)
 
 
 class _DeflatedNLL(torch.autograd.Function):

@@ -46,8 +46,8 @@ Objective = Callable[[Mapping[str, Tensor]], Tensor]
 Outcome = TypeVar("Outcome")
 
 
-LARGE = OptimizerOptions(tolerance=1e-6, slow=2.0)
-"""The search on more rows than that, where an evaluation takes seconds, and two nats of thousands over several
+LARGE = OptimizerOptions(tolerance=1e-6, slow=3.0)
+"""The search on more rows than that, where an evaluation takes seconds, and three nats of hundreds over several
 iterations change nothing that is predicted.
 """
 
