@@ -206,9 +206,15 @@ def test_too_few_inducing_points_are_said(data):
     assert "refined" not in posterior.settings
 
 
-def test_mini_batches_that_make_it_worse_are_an_error(data):
-    with pytest.raises(NumericalError, match=r"raised the bound on all rows from .* smaller rate"):
-        fit(data, Stochastic(points=60, steps=10, batch=10, rate=5.0))
+def test_mini_batches_that_make_it_worse_change_nothing_and_say_so(data):
+    still = fit(data, Stochastic(points=60, steps=0))
+    with pytest.warns(
+        NumericalWarning, match=r"raise the bound on all rows from .* nothing was changed; .* smaller rate"
+    ):
+        tried = fit(data, Stochastic(points=60, steps=10, batch=10, rate=5.0))
+    assert tried.settings["refined"].startswith("unchanged: 10 steps on 10 rows each would raise")
+    for name, value in still.parameters.items():
+        torch.testing.assert_close(tried.parameters[name], value, rtol=0.0, atol=0.0)
 
 
 def test_far_rows_beyond_the_learning_rows_are_said(data):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from forcegp.errors import NumericalError, NumericalWarning
+from forcegp.errors import NumericalWarning
 from forcegp.inference import (
     Inducing,
     InducingPosterior,
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-6
 """Fraction of the bound by which an iteration must lower it for the search to go on."""
+
+NOISE = 1.0
+"""Nats by which noisy steps may end above a start that was at the optimum, without a warning."""
 
 
 def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration | None = None) -> StructuredPosterior:
@@ -65,10 +68,11 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
         with torch.no_grad():  # steps are noisy: what they came to is told by the bound on all rows
             before, after = (float(objective(point)) for point in (start, result.parameters))
         if not after <= before:
-            raise NumericalError(
-                f"{result.status} raised the bound on all rows from {before:.1f} to {after:.1f} nats; give Stochastic "
-                f"a smaller rate ({engine.rate} now), a larger batch or more steps"
-            )
+            told = f"{result.status} would raise the bound on all rows from {before:.1f} to {after:.1f} nats"
+            if not after <= before + NOISE:
+                remedy = f"give Stochastic a smaller rate ({engine.rate} now), a larger batch or more steps"
+                warnings.warn(f"{told}, so that nothing was changed; {remedy}", NumericalWarning, stacklevel=3)
+            return _checked(posterior.with_settings(refined=f"unchanged: {told}"))
         return _checked(_with(posterior, replace(result, history=(before, after), value=after)))
     return _checked(posterior)
 
