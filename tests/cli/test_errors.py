@@ -210,7 +210,7 @@ def test_the_report_of_a_fit_tells_how_the_search_ended(capsys, converged, statu
     summary = {
         **{name: 1.0 for name in ("objective_start", "objective", "nll", "cpu_seconds", "wall_seconds")},
         **{"model": "analytical mean", "objective_is": "nothing [nats]"},
-        **{"points": 5, "iterations": 1, "evaluations": 9, "restarts": 1, "noise_std": [0.1]},
+        **{"points": 5, "learning_points": 5, "iterations": 1, "evaluations": 9, "restarts": 1, "noise_std": [0.1]},
         "converged": converged,
         "status": status,
     }

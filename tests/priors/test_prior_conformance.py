@@ -2,6 +2,7 @@
 
 from math import pi
 
+import pytest
 from tests.priors.prior_conformance import PriorConformance
 from tests.priors.third_party_prior import AirDrag
 
@@ -18,6 +19,10 @@ from forcegp.priors import (
 from forcegp.priors.expected_friction import ExpectedFriction, TabulatedCurve
 
 TIP = ("hand", (0.0, 0.0, 0.2))  # where the arm touches its plane
+
+
+# random states and a fit of a few iterations: friction that was found may lift the contact without end somewhere
+JAMS = pytest.mark.filterwarnings("ignore:the expected friction nearly jams")
 
 
 class TestJointForces(PriorConformance):
@@ -65,6 +70,7 @@ class TestContactFriction(PriorConformance):
     acts_at = TIP
 
 
+@JAMS
 class TestContactFrictionUnderLoad(PriorConformance):
     prior = ContactFriction(load=True)
     acts_at = TIP
@@ -125,5 +131,6 @@ class TestAirDrag(PriorConformance):
     acts_at = ("hand", (0.0, 0.0, 0.0))
 
 
+@JAMS
 class TestSumWithAirDrag(PriorConformance):
     prior = AirDrag("hand") + ContactFriction(load=True)
