@@ -74,6 +74,8 @@ class Engine(ABC):
     __no_type_check__: ClassVar[bool] = True
 
     name: ClassVar[str]
+    remedy: ClassVar[str]
+    """What to do where it needs more memory than is free."""
 
     @abstractmethod
     def required_bytes(self, size: ProblemSize) -> int:
@@ -91,11 +93,7 @@ class Engine(ABC):
 
     def require_memory(self, size: ProblemSize, device: torch.device) -> None:
         """Raise NotEnoughMemory where conditioning needs more memory than is free."""
-        remedy = {
-            "exact": "use engine='iterative' or engine='inducing', or fewer points",
-            "iterative": "give Iterative fewer points, use engine='inducing', or fewer rows",
-        }.get(self.name, "give Inducing fewer points, or fewer rows")
-        require_memory(self.required_bytes(size), f"engine {self.name!r} on N={size.rows} rows", remedy, device)
+        require_memory(self.required_bytes(size), f"engine {self.name!r} on N={size.rows} rows", self.remedy, device)
 
     def solution(self, posterior: LatentPosterior) -> Tensor | None:
         """What makes conditioning again cheap, to be stored with a model; None where nothing does."""
@@ -112,6 +110,7 @@ class Exact(Engine):
 
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "exact"
+    remedy: ClassVar[str] = "use engine='iterative' or engine='inducing', or fewer points"
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:
@@ -140,6 +139,7 @@ class Iterative(Engine):
 
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "iterative"
+    remedy: ClassVar[str] = "give Iterative fewer points, use engine='inducing', or fewer rows"
     points: int | None = None
     tolerance: float = 1e-4
     iterations: int = 1000
@@ -200,6 +200,7 @@ class Inducing(Engine):
 
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "inducing"
+    remedy: ClassVar[str] = "give Inducing fewer points, or fewer rows"
     points: int = 500
     tolerance: float = ENOUGH
     refine: int = 20
@@ -232,6 +233,7 @@ class Stochastic(Engine):
 
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "stochastic"
+    remedy: ClassVar[str] = "give Stochastic fewer points or smaller batches, or fewer rows"
     points: int = 200
     steps: int = 200
     batch: int = 128

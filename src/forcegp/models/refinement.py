@@ -51,7 +51,7 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
     objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
     if isinstance(engine, Inducing) and engine.refine and latent.left_out <= engine.tolerance:
         options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
-        return _checked(_with(posterior, minimize_objective(objective, start, options, report)))
+        return _checked(_moved_to(posterior, minimize_objective(objective, start, options, report)))
     if isinstance(engine, Stochastic) and engine.steps:
         result = stochastic_search(
             kernels,
@@ -73,7 +73,7 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
                 remedy = f"give Stochastic a smaller rate ({engine.rate} now), a larger batch or more steps"
                 warnings.warn(f"{told}, so that nothing was changed; {remedy}", NumericalWarning, stacklevel=3)
             return _checked(posterior.with_settings(refined=f"unchanged: {told}"))
-        return _checked(_with(posterior, replace(result, history=(before, after), value=after)))
+        return _checked(_moved_to(posterior, replace(result, history=(before, after), value=after)))
     return _checked(posterior)
 
 
@@ -92,7 +92,8 @@ def _checked(posterior: StructuredPosterior) -> StructuredPosterior:
     return posterior
 
 
-def _with(posterior: StructuredPosterior, result: OptimizationResult) -> StructuredPosterior:
+def _moved_to(posterior: StructuredPosterior, result: OptimizationResult) -> StructuredPosterior:
+    """The posterior at the parameters that a search on all rows found."""
     parameters = {**posterior.parameters, **result.parameters}
     change = f"{result.history[0]:.1f} -> {result.value:.1f}"
     note = f"on all rows, {result.evaluations} evaluations: {change} ({result.status})"

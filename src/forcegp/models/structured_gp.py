@@ -199,6 +199,7 @@ class StructuredGP(Model):
     def _with_refined_loads(
         self, first: StructuredPosterior, rows: Dataset, dataset: Dataset, how: Mapping[str, Any]
     ) -> StructuredPosterior:
+        """`first`, or a fit with the normal force under the friction that was found."""
 
         def again(prior: ForcePrior, last: StructuredPosterior) -> StructuredPosterior:
             with warnings.catch_warnings():

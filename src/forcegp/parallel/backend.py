@@ -63,6 +63,23 @@ class Pool(ABC):
             self.stop()
 
 
+class Workers(Pool):
+    """A pool of up to `jobs` tasks at once in other processes; `_at_work` maps what stands for each to what it is."""
+
+    def __init__(self, jobs: int | float) -> None:
+        self._jobs = jobs
+        self._at_work: dict[Any, Any] = {}
+
+    @property
+    @override
+    def free(self) -> int | float:
+        return self._jobs - len(self._at_work)
+
+    @override
+    def __len__(self) -> int:
+        return len(self._at_work)
+
+
 class Backend(ABC):
     """Where work is done. Equal tasks have equal outcomes on every backend, in the order of the arguments.
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.errors import BackendError
-from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, Shared, check_jobs
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, Shared, Workers, check_jobs
 from forcegp.parallel.connection import connected, host_and_port
 from forcegp.parallel.worker import replayed
 
@@ -49,25 +49,15 @@ class Ray(Backend):
         return _Cluster(connected(self.address, self.jobs), self.jobs)
 
 
-class _Cluster(Pool):
+class _Cluster(Workers):
     def __init__(self, ray: Any, jobs: int | None) -> None:
         self._ray = ray
-        self._jobs = float("inf") if jobs is None else jobs
+        super().__init__(float("inf") if jobs is None else jobs)
         if not any(node["Alive"] and node["Resources"].get("CPU", 0) >= 1 for node in ray.nodes()):
             raise BackendError("no machine of the Ray cluster has a processor to offer; start one with --num-cpus")
         self._work = ray.remote(num_cpus=1, max_retries=MOST_DEATHS, scheduling_strategy="SPREAD")(_portable_work())
         self._expected = ray.put(versions())
-        self._at_work: dict[Any, Hashable] = {}
         self._sent: dict[Any, Any] = {}
-
-    @property
-    @override
-    def free(self) -> int | float:
-        return self._jobs - len(self._at_work)
-
-    @override
-    def __len__(self) -> int:
-        return len(self._at_work)
 
     @override
     def submit(self, key: Hashable, function: Callable[..., Any], *arguments: Any) -> None:

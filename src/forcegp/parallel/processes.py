@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.errors import BackendError, WorkerWarning
-from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, check_jobs
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, Workers, check_jobs
 from forcegp.parallel.worker import ONE_THREAD, begin_process, recorded, replayed
 
 IDLE_SECONDS = 300
@@ -46,20 +46,8 @@ class _Task:
     deaths: int = 0
 
 
-class _Processes(Pool):
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-        self._at_work: dict[Future[Any], _Task] = {}
-
-    @property
-    @override
-    def free(self) -> int | float:
-        # No more than there are processes: a process that dies takes all tasks with it that were handed over.
-        return self._jobs - len(self._at_work)
-
-    @override
-    def __len__(self) -> int:
-        return len(self._at_work)
+class _Processes(Workers):
+    # As many tasks as there are processes: one that dies takes all tasks with it that were handed over.
 
     @override
     def submit(self, key: Hashable, function: Callable[..., Any], *arguments: Any) -> None:
