@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         Actuation,
         Armature,
         Baumgarte,
+        ConstantJointForce,
         Contact,
         CoulombJointFriction,
         Cylinder,
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
         MechanicalSystem,
         Plane,
         RigidBodyBias,
+        RotorInertia,
         Sphere,
+        StribeckJointFriction,
         ViscousJointFriction,
     )
     from forcegp.models import (
@@ -65,7 +68,10 @@ __all__ = [
     "RigidBodyBias",
     "ViscousJointFriction",
     "CoulombJointFriction",
+    "StribeckJointFriction",
+    "ConstantJointForce",
     "Armature",
+    "RotorInertia",
     # what was measured
     "Dataset",
     "KukaSurfaceConfig",
@@ -105,7 +111,8 @@ __all__ = [
 _ROOMS = {
     "robots": {"Robot"},
     "mechanics": {"MechanicalSystem", "Contact", "Plane", "Sphere", "Cylinder", "ImplicitSurface", "Baumgarte"}
-    | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"},
+    | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"}
+    | {"StribeckJointFriction", "ConstantJointForce", "RotorInertia"},
     "data": {"Dataset"},
     "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}
     | {"JointAccelerations", "NoForces"},

@@ -15,11 +15,14 @@ from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint
 from forcegp.mechanics import (
     Actuation,
     Armature,
+    ConstantJointForce,
     CoulombJointFriction,
     KnownForce,
     MechanicalSystem,
     RigidBodyBias,
+    RotorInertia,
     State,
+    StribeckJointFriction,
     ViscousJointFriction,
 )
 from forcegp.mechanics.known_forces import KNOWN_FORCES, known_force_from_dict, known_force_to_dict
@@ -27,6 +30,8 @@ from forcegp.mechanics.known_forces import KNOWN_FORCES, known_force_from_dict, 
 JOINTS = ("slide", "spin", "skew", "tilt")
 NUMBERS = [0.5, 1.5, 0.0, 2.0]
 TENSOR = torch.tensor(NUMBERS, dtype=torch.float64)
+TENTHS = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+TRANSMISSION = ((6.0, 0.0, 0.0, 0.0), (-1.0, 6.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 1.0, -1.0))
 
 FORMULAS = {
     "actuation": (lambda: Actuation(), lambda q, v, u: u),
@@ -36,7 +41,13 @@ FORMULAS = {
         lambda: CoulombJointFriction(NUMBERS, 0.02),
         lambda q, v, u: -TENSOR * (v / 0.02).tanh(),
     ),
+    "Stribeck": (
+        lambda: StribeckJointFriction(NUMBERS, 3.0, [0.1, 0.2, 0.3, 0.4], 0.02),
+        lambda q, v, u: -(TENSOR + (3.0 - TENSOR) * (-((v / TENTHS) ** 2)).exp()) * (v / 0.02).tanh(),
+    ),
+    "constant": (lambda: ConstantJointForce(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
     "armature": (lambda: Armature(NUMBERS), lambda q, v, u: torch.zeros_like(u)),
+    "rotors": (lambda: RotorInertia(NUMBERS, TRANSMISSION), lambda q, v, u: torch.zeros_like(u)),
 }
 
 
@@ -121,6 +132,28 @@ def test_armature_as_a_known_force_equals_armature_of_the_robot():
     assert_close(one.acceleration(nothing), other.acceleration(nothing), 1e-10)
 
 
+def test_rotors_that_a_moving_link_carries():
+    """The kinetic energy of two rotors: the first sits in the base, the second turns with the first link, too."""
+    ratio, rotor = 6.0, [1e-3, 2e-3, 0.0, 0.0]
+    M = RotorInertia(rotor, TRANSMISSION).bound_to(chain()).added_inertia()
+    v = normal(4)
+    energy = 0.5 * rotor[0] * (ratio * v[0]) ** 2 + 0.5 * rotor[1] * (ratio * v[1] - v[0]) ** 2
+    assert_close(0.5 * v @ M @ v, energy, 1e-14)
+    q, v, u = states(4, 5)
+    added = known(Actuation(), RigidBodyBias(), RotorInertia(rotor, TRANSMISSION)).dynamics(q, v, u).M
+    assert_close(added, MechanicalSystem(chain()).dynamics(q, v, u).M + M, 1e-13)
+    one_each = RotorInertia(NUMBERS).bound_to(chain()).added_inertia()
+    assert_close(one_each, Armature(NUMBERS).bound_to(chain()).added_inertia(), 1e-14)
+
+
+def test_stribeck_friction_falls_from_static_to_coulomb():
+    slow, fast = torch.full((1, 4), 1e-4, dtype=torch.float64), torch.full((1, 4), 5.0, dtype=torch.float64)
+    nothing = torch.zeros_like(slow)
+    friction = known(StribeckJointFriction(1.0, 3.0, 0.1, 1e-6))
+    assert_close(friction.dynamics(nothing, slow, nothing).Q_K, torch.full((1, 4), -3.0).double(), 1e-4)
+    assert_close(friction.dynamics(nothing, fast, nothing).Q_K, torch.full((1, 4), -1.0).double(), 1e-12)
+
+
 # ---------------------------------------------------------------- one number per joint
 
 
@@ -164,8 +197,14 @@ def test_a_coefficient_may_be_learned():
         (ViscousJointFriction, ([1.0, 2.0],), InvalidInput, r"has \(2,\) values; chain has 4 joints: slide, spin"),
         (ViscousJointFriction, ([[1.0] * 4],), InvalidInput, r"has \(1, 4\) values"),
         (ViscousJointFriction, ([1.0, -2.0, 0.0, 0.0],), InvalidInput, "every joint needs a finite number >= 0"),
-        (ViscousJointFriction, (math.nan,), InvalidInput, "every joint needs a finite number >= 0"),
-        (ViscousJointFriction, (math.inf,), InvalidInput, "every joint needs a finite number >= 0"),
+        (ViscousJointFriction, (math.nan,), InvalidInput, "every joint needs a finite number"),
+        (ViscousJointFriction, (math.inf,), InvalidInput, "every joint needs a finite number"),
+        (ConstantJointForce, (math.nan,), InvalidInput, "every joint needs a finite number"),
+        (StribeckJointFriction, (1.0, 2.0, 0.0), InvalidInput, "stribeck_velocity is .* must be positive"),
+        (StribeckJointFriction, (1.0, -2.0, 1.0), InvalidInput, "StribeckJointFriction static"),
+        (RotorInertia, (-1.0,), InvalidInput, "RotorInertia inertia"),
+        (RotorInertia, (1.0, [[1.0, 0.0]]), InvalidInput, r"has shape \(1, 2\); chain needs a finite matrix \(4, 4\)"),
+        (RotorInertia, (1.0, "gears"), InvalidInput, "RotorInertia transmission is 'gears'"),
         (ViscousJointFriction, ({"elbow": 1.0},), UnknownJoint, "no joint 'elbow' in chain"),
         (ViscousJointFriction, ({"tlit": 1.0},), UnknownJoint, "did you mean 'tilt'"),
         (ViscousJointFriction, ({"tilt": None},), InvalidInput, "give a number, one per joint, or a mapping"),
@@ -178,7 +217,7 @@ def test_a_coefficient_may_be_learned():
                 0.0,
             ),
             InvalidInput,
-            "velocity_scale must be positive for every joint",
+            "velocity_scale is .* it must be positive for every joint",
         ),
         (
             CoulombJointFriction,
@@ -187,7 +226,7 @@ def test_a_coefficient_may_be_learned():
                 [1.0, 1.0, 0.0, 1.0],
             ),
             InvalidInput,
-            "velocity_scale must be positive",
+            "velocity_scale is .* must be positive",
         ),
         (
             CoulombJointFriction,
@@ -196,7 +235,7 @@ def test_a_coefficient_may_be_learned():
                 {"tilt": 0.1},
             ),
             InvalidInput,
-            "velocity_scale must be positive",
+            "velocity_scale is .* must be positive",
         ),
         (CoulombJointFriction, (-1.0,), InvalidInput, "CoulombJointFriction coefficients"),
         (Armature, (-1e-3,), InvalidInput, "Armature inertia"),

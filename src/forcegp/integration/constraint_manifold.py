@@ -116,11 +116,7 @@ class ConstraintManifold:
         return torch.stack(values, dim=-1), torch.stack(rows, dim=-2), torch.stack(slopes, dim=-1)
 
     def _inverse_lower(self, kinematics: Kinematics) -> Tensor:
-        M = kinematics.mass_matrix()
-        for force in self.system.known_forces:
-            inertia = force.added_inertia()
-            if inertia is not None:
-                M = M + torch.diag_embed(inertia)
+        M = self.system.mass_matrix(kinematics)
         try:
             lower = torch.linalg.cholesky(M)
         except torch.linalg.LinAlgError:

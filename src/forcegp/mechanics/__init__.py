@@ -5,9 +5,12 @@ from forcegp.mechanics.gauss_principle import AffineMap, ConstrainedDynamics
 from forcegp.mechanics.known_forces import (
     Actuation,
     Armature,
+    ConstantJointForce,
     CoulombJointFriction,
     KnownForce,
     RigidBodyBias,
+    RotorInertia,
+    StribeckJointFriction,
     ViscousJointFriction,
 )
 from forcegp.mechanics.state import State
@@ -21,6 +24,7 @@ __all__ = [
     "Armature",
     "Baumgarte",
     "ConstrainedDynamics",
+    "ConstantJointForce",
     "Contact",
     "CoulombJointFriction",
     "Cylinder",
@@ -29,8 +33,10 @@ __all__ = [
     "MechanicalSystem",
     "Plane",
     "RigidBodyBias",
+    "RotorInertia",
     "Sphere",
     "State",
+    "StribeckJointFriction",
     "Surface",
     "ViscousJointFriction",
     "surface_axes",

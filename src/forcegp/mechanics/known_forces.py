@@ -27,7 +27,13 @@ class KnownForce(ABC):
     """A joint force that the model takes as given."""
 
     per_joint: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields with one non-negative number per joint."""
+    """Names of the fields with one number per joint."""
+
+    positive: ClassVar[tuple[str, ...]] = ()
+    """Those of them that must be > 0."""
+
+    signed: ClassVar[tuple[str, ...]] = ()
+    """Those of them that may be negative; all others must be >= 0."""
 
     learned: ClassVar[str | None] = None
     """Name of the one of them that an identification estimates."""
@@ -36,18 +42,27 @@ class KnownForce(ABC):
     def force(self, state: State) -> Float[Tensor, "*#batch nv"]:
         """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""
 
-    def added_inertia(self) -> Float[Tensor, "nv"] | None:
-        """What this adds to the diagonal of the mass matrix, in kg m^2 or kg."""
+    def added_inertia(self) -> Float[Tensor, "nv nv"] | None:
+        """What this adds to the mass matrix, in kg m^2 or kg."""
         return None
 
     def bound_to(self, robot: Robot) -> KnownForce:
         """The same with per-joint numbers as tensors (nv,) in the order of robot.joint_names, checked."""
         if not self.per_joint:
             return self
-        bound = {
-            name: _per_joint(f"{type(self).__name__} {name}", getattr(self, name), robot) for name in self.per_joint
-        }
+        bound = {name: self._bound(name, robot) for name in self.per_joint}
         return type(self)(**{f.name: bound.get(f.name, getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]  # forces with numbers are dataclasses
+
+    def _bound(self, name: str, robot: Robot) -> Tensor:
+        what = f"{type(self).__name__} {name}"
+        values = _per_joint(what, getattr(self, name), robot)
+        if name in self.signed:
+            return values
+        if name in self.positive and not bool((values > 0).all()):
+            raise InvalidInput(f"{what} is {values.tolist()}; it must be positive for every joint.")
+        if not bool((values >= 0).all()):
+            raise InvalidInput(f"{what} is {values.tolist()}; every joint needs a finite number >= 0.")
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +108,7 @@ class CoulombJointFriction(KnownForce):
     coefficients: PerJoint
     velocity_scale: PerJoint = 0.01
     per_joint: ClassVar[tuple[str, ...]] = ("coefficients", "velocity_scale")
+    positive: ClassVar[tuple[str, ...]] = ("velocity_scale",)
     learned: ClassVar[str | None] = "coefficients"
 
     @classmethod
@@ -101,15 +117,43 @@ class CoulombJointFriction(KnownForce):
         return cls([joint.friction for joint in robot.joints], velocity_scale)
 
     @override
-    def bound_to(self, robot: Robot) -> KnownForce:
-        bound = super().bound_to(robot)
-        if bool((torch.as_tensor(bound.velocity_scale) <= 0).any()):  # type: ignore[attr-defined]  # bound to the same class
-            raise InvalidInput("CoulombJointFriction velocity_scale must be positive for every joint (rad/s or m/s).")
-        return bound
+    def force(self, state: State) -> Tensor:
+        return -self.coefficients * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]  # tensors once they are bound
+
+
+@dataclass(frozen=True, eq=False)
+class StribeckJointFriction(KnownForce):
+    """-(c + (s - c) exp(-(v / v_s)^2)) tanh(v / w): dry friction that falls from `static` to `coulomb` in motion.
+
+    `coulomb` c and `static` s (break-away) in Nm or N, `stribeck_velocity` v_s and `velocity_scale` w in rad/s or m/s.
+    Source: Olsson et al., "Friction models and friction compensation", Eur. J. Control (1998), eq. 4, with a smooth
+    sign.
+    """
+
+    coulomb: PerJoint
+    static: PerJoint
+    stribeck_velocity: PerJoint
+    velocity_scale: PerJoint = 0.01
+    per_joint: ClassVar[tuple[str, ...]] = ("coulomb", "static", "stribeck_velocity", "velocity_scale")
+    positive: ClassVar[tuple[str, ...]] = ("stribeck_velocity", "velocity_scale")
 
     @override
     def force(self, state: State) -> Tensor:
-        return -self.coefficients * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]  # tensors once they are bound
+        c, s, v_s, w = (torch.as_tensor(getattr(self, name)) for name in self.per_joint)  # tensors once they are bound
+        return -(c + (s - c) * torch.exp(-((state.v / v_s) ** 2))) * torch.tanh(state.v / w)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantJointForce(KnownForce):
+    """A constant of either sign in Nm or N: the offset of a torque sensor, or friction that differs by direction."""
+
+    values: PerJoint
+    per_joint: ClassVar[tuple[str, ...]] = ("values",)
+    signed: ClassVar[tuple[str, ...]] = ("values",)
+
+    @override
+    def force(self, state: State) -> Tensor:
+        return torch.as_tensor(self.values).expand_as(state.v)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +170,47 @@ class Armature(KnownForce):
 
     @override
     def added_inertia(self) -> Tensor:
-        return self.inertia  # type: ignore[return-value]  # a tensor once it is bound
+        return torch.diag_embed(torch.as_tensor(self.inertia))
+
+
+@dataclass(frozen=True, eq=False)
+class RotorInertia(KnownForce):
+    """Rotors that turn with several joints: T^T diag(I) T added to the mass matrix, for rotor speeds T v.
+
+    `inertia` I holds one rotor per joint (kg m^2), `transmission` T (nv, nv) how fast each rotor turns about its axis,
+    in a frame that does not, per joint velocity. One motor per joint, in the joint: T is diagonal and holds the gear
+    ratios, which `Armature` says shorter. A motor that sits on a moving link also turns with that link, and a
+    differential couples two joints. With transmission None, T is the identity. Gyroscopic forces of the rotors are
+    left out. Source: Murphy, Wen & Saridis, "Recursive calculation of geared robot manipulator dynamics", ICRA 1990.
+    """
+
+    inertia: PerJoint
+    transmission: Sequence[Sequence[float]] | Tensor | None = None
+    per_joint: ClassVar[tuple[str, ...]] = ("inertia",)
+    learned: ClassVar[str | None] = "inertia"
+
+    @override
+    def bound_to(self, robot: Robot) -> KnownForce:
+        given = torch.eye(robot.nv).tolist() if self.transmission is None else self.transmission
+        try:
+            matrix = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise InvalidInput(f"RotorInertia transmission is {given!r}; give {robot.nv} rows of numbers.") from None
+        if matrix.shape != (robot.nv, robot.nv) or not bool(torch.isfinite(matrix).all()):
+            raise InvalidInput(
+                f"RotorInertia transmission has shape {tuple(matrix.shape)}; {robot.name} needs a finite matrix "
+                f"({robot.nv}, {robot.nv}): a row per rotor, a column per joint {', '.join(robot.joint_names)}."
+            )
+        return RotorInertia(self._bound("inertia", robot), matrix)
+
+    @override
+    def force(self, state: State) -> Tensor:
+        return torch.zeros_like(state.q)
+
+    @override
+    def added_inertia(self) -> Tensor:
+        T = torch.as_tensor(self.transmission)
+        return T.mT @ (torch.as_tensor(self.inertia)[:, None] * T)
 
 
 KNOWN_FORCES: dict[str, type[KnownForce]] = {
@@ -134,7 +218,10 @@ KNOWN_FORCES: dict[str, type[KnownForce]] = {
     "rigid-body-bias": RigidBodyBias,
     "viscous-joint-friction": ViscousJointFriction,
     "coulomb-joint-friction": CoulombJointFriction,
+    "stribeck-joint-friction": StribeckJointFriction,
+    "constant-joint-force": ConstantJointForce,
     "armature": Armature,
+    "rotor-inertia": RotorInertia,
 }
 """Known forces that files can carry, by the name they have there."""
 
@@ -156,7 +243,7 @@ def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
 
 
 def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
-    """One non-negative float64 number per joint, on the robot's device: a copy, in which tensors keep their graph."""
+    """One finite float64 number per joint, on the robot's device: a copy, in which tensors keep their graph."""
     if isinstance(given, Mapping):
         unknown = next((joint for joint in given if joint not in robot.joint_names), None)
         if unknown is not None:
@@ -175,6 +262,6 @@ def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
             f"{name} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
             f"{', '.join(robot.joint_names)}"
         )
-    if not bool(((values >= 0) & torch.isfinite(values)).all()):
-        raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number >= 0.")
+    if not bool(torch.isfinite(values).all()):
+        raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number.")
     return values.clone()

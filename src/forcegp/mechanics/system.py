@@ -24,7 +24,7 @@ from forcegp.mechanics.known_forces import (
 )
 from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
-from forcegp.robots import Robot
+from forcegp.robots import Kinematics, Robot
 
 FORMAT_VERSION = 1
 STORED_PARTS = {"urdf": str, "gravity": list, "armature": list, "locked": dict, "contacts": list, "known_forces": list}
@@ -77,18 +77,26 @@ class MechanicalSystem:
         parameter moves them.
         """
         state = State.of(self.robot, q, v, u, inertials)
-        M = state.kinematics.mass_matrix(inertials)
+        M = self.mass_matrix(state.kinematics, inertials)
         Q_K = torch.zeros_like(state.q)
         for force in self.known_forces:
             Q_K = Q_K + force.force(state)
-            inertia = force.added_inertia()
-            if inertia is not None:
-                M = M + torch.diag_embed(inertia)
         A, b, normals = self._constraint(state)
         batch = M.shape[:-2]  # inertials may carry batch dimensions of their own
         A, normals = (part.expand(*batch, *part.shape[-2:]) for part in (A, normals))
         b, Q_K = b.expand(*batch, -1), Q_K.expand(*batch, -1)
         return ConstrainedDynamics.from_constraint(state, M, A, b, normals, Q_K, self.contacts)
+
+    def mass_matrix(
+        self, kinematics: Kinematics, inertials: Mapping[str, Tensor] | None = None
+    ) -> Float[Tensor, "*batch nv nv"]:
+        """M of the robot and of what known forces add to it, such as rotors."""
+        M = kinematics.mass_matrix(inertials)
+        for force in self.known_forces:
+            inertia = force.added_inertia()
+            if inertia is not None:
+                M = M + inertia
+        return M
 
     def _constraint(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """A (..., m, nv), b (..., m) and the surface gradients (..., m, 3)."""

@@ -41,6 +41,7 @@ COEFFICIENT_UNITS = {
     "viscous-joint-friction": ("Nms/rad", "Ns/m"),
     "coulomb-joint-friction": ("Nm", "N"),
     "armature": ("kg m^2", "kg"),
+    "rotor-inertia": ("kg m^2", "kg"),
 }
 """For revolute and for prismatic joints."""
 
@@ -51,7 +52,8 @@ class Coefficients:
 
     Parameters
     ----------
-    force: 'viscous-joint-friction', 'coulomb-joint-friction' or 'armature', which the system must list once.
+    force: 'viscous-joint-friction', 'coulomb-joint-friction', 'armature' or 'rotor-inertia', which the system must list
+        once.
     joints: names of the joints whose coefficient is learned; None means all, the others keep theirs.
     start: start value in the force's unit; None takes the system's own, which must be positive.
     """
