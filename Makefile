@@ -43,9 +43,9 @@ help:  ## list the targets
 # A larger installation contains the smaller ones, so it stamps them too.
 $(VENV)/.demo: EXTRAS := sim
 $(VENV)/.demo: STAMPS := $(VENV)/.demo
-$(VENV)/.test: EXTRAS := sim,test,scale
+$(VENV)/.test: EXTRAS := sim,test,scale,logs
 $(VENV)/.test: STAMPS := $(VENV)/.demo $(VENV)/.test
-$(VENV)/.check: EXTRAS := sim,test,scale,dev
+$(VENV)/.check: EXTRAS := sim,test,scale,logs,dev
 $(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
