@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from forcegp.errors import BackendError, FitError, ForceGPError
-from forcegp.experiments.machine import machine
+from forcegp.evaluation.machine import machine
 from forcegp.experiments.packed_cells import PackedCell
 from forcegp.experiments.results import CELL_FILE, Results, write_json
 from forcegp.parallel import Backend, Joblib, Pool, Shared

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from forcegp import __version__
+from forcegp.data.whole_files import LOCK, only_one_process
+from forcegp.data.whole_files import write_json as write_json
+from forcegp.data.whole_files import write_text as write_text
 from forcegp.errors import FileFormatError, InvalidInput
 
 KIND = "forcegp reproduce"
 FORMAT_VERSION = 1
-DESCRIPTION, CELLS, LOCK = "reproduction.json", "cells", ".lock"
+DESCRIPTION, CELLS = "reproduction.json", "cells"
 CELL_FILE = "cell.json"
 
 
@@ -62,15 +64,9 @@ class Results:
                 f"{self.folder} holds results of preset {stored.get('preset')!r}, not {preset!r}; choose another --out."
             )
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Only one process works on a folder; the lock dies with its process.
-
-        Raises InvalidInput if another one is at it.
-        """
-        with (self.folder / LOCK).open("w") as file:
-            _lock(file, self.folder)
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Only one process works on a folder. Raises InvalidInput if another one is at it."""
+        return only_one_process(self.folder, KIND)
 
     def cell_folder(self, name: str) -> Path:
         """Where the cell of this name lies, or will lie."""
@@ -126,21 +122,6 @@ class Results:
             entry.unlink(missing_ok=True)
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Readable JSON under a temporary name, then renamed."""
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Text under a temporary name, then renamed."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _is_own_start(entry: Path) -> bool:
     """What a run leaves that is killed before it has written its description."""
     return entry.name == LOCK or (entry.name.startswith(f".{DESCRIPTION}.") and entry.name.endswith(".tmp"))
@@ -154,10 +135,3 @@ def _read(file: Path, remedy: str) -> dict[str, Any]:
     if not isinstance(stored, dict):
         raise FileFormatError(f"{file} is damaged; {remedy}.")
     return stored
-
-
-def _lock(file: IO[str], folder: Path) -> None:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InvalidInput(f"another `{KIND}` is at work in {folder}; wait for it, or choose another --out.") from None
