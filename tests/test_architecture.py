@@ -22,6 +22,7 @@ ROOMS = {
     "robots": {"errors", "native_code"},
     "mechanics": {"errors", "robots"},
     "data": {"errors", "robots", "mechanics"},
+    "analytical": {"errors", "robots", "mechanics", "data"},
     "priors": {"errors", "robots", "mechanics"},
     "inference": {"errors", "native_code"},
     "integration": {"errors", "robots", "mechanics"},

@@ -130,6 +130,27 @@ def joint_forces(
     return (twists * wrenches).sum((1, 2)).mT
 
 
+def torque_regressor(
+    tree: Tree,
+    twists: Float[Tensor, "n 3 4 batch"],
+    accelerations: Float[Tensor, "n 3 4 batch"],
+    frames: Float[Tensor, "n 4 4 batch"],
+    basis: Float[Tensor, "16 parameters"],
+) -> Float[Tensor, "batch n n parameters"]:
+    """Joint force (first n) per unit of each parameter of each body (second n), without armature.
+
+    The pseudo-inertia of body k is ``frames[k] P frames[k]^T`` with P, row by row, equal to ``basis`` times the body's
+    parameters; so ``tau_i = tr((S_i T)^T (A_k - g) T P)``.
+    """
+    columns = []
+    for k in range(len(twists)):
+        frame = frames[k : k + 1]
+        left, right = product(twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
+        gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
+        columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
+    return torch.stack(columns, dim=2)
+
+
 def gravity_forces(
     tree: Tree, twists: Float[Tensor, "n 3 4 batch"], inertias: Float[Tensor, "n 4 4 batch"]
 ) -> Float[Tensor, "batch n"]:

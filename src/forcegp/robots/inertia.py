@@ -27,6 +27,32 @@ SINGULAR = 1e-12
 _PLACE = np.zeros((10, 16))
 _PLACE[np.arange(10), [0, 5, 10, 1, 6, 2, 3, 7, 11, 15]] = 1.0
 
+# standard parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz -> pseudo-inertia (4, 4), row by row
+_STANDARD = np.zeros((16, 10))
+_STANDARD[15, 0] = 1.0
+_STANDARD[[3, 12, 7, 13, 11, 14], [1, 1, 2, 2, 3, 3]] = 1.0
+_STANDARD[np.ix_([0, 5, 10], [4, 6, 9])] = 0.5 - np.eye(3)
+_STANDARD[[1, 4, 2, 8, 6, 9], [5, 5, 7, 7, 8, 8]] = -1.0
+
+
+def standard_basis(device: torch.device | None = None) -> Float[Tensor, "16 10"]:
+    """The matrix that turns standard parameters (10,) into the pseudo-inertia, its entries row by row.
+
+    Standard parameters are ``m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz`` in kg, kg m and kg m^2, inertia about
+    the *origin* of the frame (Pinocchio's order). Joint forces are linear in them.
+    """
+    return torch.as_tensor(_STANDARD, device=device)
+
+
+def pseudo_inertia_of_standard(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
+    """Pseudo-inertia of standard parameters (see :func:`standard_basis`); no body need have them."""
+    return (parameters @ standard_basis(parameters.device).mT).unflatten(-1, (4, 4))
+
+
+def standard_of_pseudo_inertia(pseudo: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 10"]:
+    """Standard parameters of a symmetric pseudo-inertia: the inverse of :func:`pseudo_inertia_of_standard`."""
+    return pseudo.flatten(-2) @ torch.linalg.pinv(standard_basis(pseudo.device)).mT
+
 
 def pseudo_inertia_factor(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
     """Upper-triangular ``U`` with ``P = U U^T`` from log-Cholesky parameters, differentiable.

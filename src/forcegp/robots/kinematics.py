@@ -12,6 +12,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.robots import algorithms
 from forcegp.robots.arguments import Inertials, Vector, broadcast_batch
+from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
 
 if TYPE_CHECKING:
@@ -93,6 +94,35 @@ class Kinematics:
         net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
         return at._rows(algorithms.solve_mass_matrix(at._mass_matrix(inertias), net))
 
+    # ------------------------------------------------------------------ linear in the standard parameters of bodies
+
+    def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
+        """Joint forces per unit of the standard parameters of each body (..., nv, nv, 10), armature left out.
+
+        Body i is what joint i moves as one: its child link and all that is fixed to it. Parameters are about the
+        origin and in the axes of the child link, in the order of :func:`forcegp.robots.inertia.standard_basis`.
+        """
+        self.robot.check_input("a", a)
+        at = self._expand(self._broadcast("a", a.shape[:-1]))
+        _, v = at._moving("torque_regressor")
+        tree = self.robot.tree
+        accelerations = algorithms.body_accelerations(tree, at.twists, v, _columns(a, at.batch_shape))
+        frames = algorithms.product(at.poses, self._child_frames()[..., None])
+        basis = standard_basis(self.robot.device)
+        return at._rows(algorithms.torque_regressor(tree, at.twists, accelerations, frames, basis))
+
+    def dynamics_of_bodies(
+        self, parameters: Float[Tensor, "bodies 10"]
+    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+        """Mass matrix and bias forces for any standard parameters of the bodies, as :meth:`torque_regressor` has them.
+
+        No body need have the parameters, so the mass matrix need not be positive definite.
+        """
+        frames = self._child_frames()
+        pseudo = frames @ pseudo_inertia_of_standard(parameters) @ frames.mT
+        inertias = algorithms.world_inertias(self.poses, pseudo[..., None])
+        return self._rows(self._mass_matrix(inertias)), self._rows(self._bias_forces(inertias))
+
     # ------------------------------------------------------------------ frames
 
     def frame_pose(self, frame: str) -> Float[Tensor, "... 4 4"]:
@@ -132,6 +162,9 @@ class Kinematics:
     def _rows(self, values: Tensor) -> Tensor:
         """Give values (batch, ...) their batch dimensions back."""
         return values.reshape(*self.batch_shape, *values.shape[1:])
+
+    def _child_frames(self) -> Tensor:
+        return torch.as_tensor(self.robot.layout.child_frames, device=self.robot.device)
 
     def _mass_matrix(self, inertias: Tensor) -> Tensor:
         return algorithms.mass_matrix(self.robot.tree, self.vectors, self.twists, inertias)

@@ -53,6 +53,11 @@ class Layout:
         """Names of the links that some joint moves."""
         return tuple(name for name, placement in self.links.items() if placement.body != WORLD)
 
+    @property
+    def child_frames(self) -> np.ndarray:
+        """Pose (n, 4, 4) of each joint's child link in the frame of the body that it leads."""
+        return np.stack([self.links[joint.child].offset for joint in self.joints])
+
     def require_moving(self, link: str, robot: str) -> None:
         """Raise where ``link`` has no inertia that matters: it does not exist, or it is fixed in the world."""
         placement = self.links.get(link)
