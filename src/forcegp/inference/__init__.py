@@ -16,6 +16,7 @@ from forcegp.inference.engines import (
     engine_from_dict,
     engine_of,
 )
+from forcegp.inference.functionals import FunctionalPosterior
 from forcegp.inference.inducing import InducingPosterior, collapsed_bound
 from forcegp.inference.iterative import IterativePosterior
 from forcegp.inference.kernels import LatentKernels
@@ -31,6 +32,7 @@ __all__ = [
     "Engine",
     "Exact",
     "ExactPosterior",
+    "FunctionalPosterior",
     "Inducing",
     "InducingPosterior",
     "Iterative",

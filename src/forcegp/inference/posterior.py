@@ -10,6 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,8 @@ class LatentPosterior(ABC):
 
     kernels: LatentKernels
     features: tuple[Float[Tensor, "_ _"], ...]
+    remedy: ClassVar[str] = "fit with engine='exact' (and fewer points, where memory does not suffice)"
+    """What to do where the factorised covariance of all rows is needed."""
 
     @property
     @abstractmethod
@@ -145,6 +148,6 @@ def exact(latent: LatentPosterior, what: str) -> ExactPosterior:
     if isinstance(latent, ExactPosterior):
         return latent
     raise InvalidInput(
-        f"{what} needs the factorised covariance of all rows, which a {type(latent).__name__} does not have; fit with "
-        "engine='exact' (and fewer points, where memory does not suffice)."
+        f"{what} needs the factorised covariance of all rows, which a {type(latent).__name__} does not have; "
+        f"{latent.remedy}."
     )
