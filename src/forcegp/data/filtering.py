@@ -95,7 +95,7 @@ def low_pass(
 
     def filtered(name: str, rows: Dataset, label: str) -> np.ndarray:
         if name == "q":
-            _require_no_turns(rows, label)
+            require_no_turns(rows, label)
         return zero_phase_low_pass(getattr(rows, name), 1.0 / uniform_step(rows.time, label), cutoff, order)
 
     changed = _by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
@@ -116,7 +116,7 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
     def derivatives(rows: Dataset, label: str) -> dict[str, np.ndarray]:
         if source == "v":
             return {"a": differentiate(rows.v, rows.time)}
-        _require_no_turns(rows, label)
+        require_no_turns(rows, label)
         velocity = differentiate(rows.q, rows.time)
         return {"v": velocity, "a": differentiate(velocity, rows.time)}
 
@@ -134,8 +134,8 @@ def resample(dataset: Dataset, step: float) -> Dataset:
     if not (np.isfinite(step) and step > 0):
         raise InvalidInput(f"step is {step} s; it must be > 0.")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "u", "a", "time", "episode")}
-    for number, rows, label in _episodes(dataset):
-        _require_no_turns(rows, label)
+    for number, rows, label in episodes_in_order(dataset):
+        require_no_turns(rows, label)
         duration = rows.time[-1] - rows.time[0]
         count = int(np.floor(duration / step * (1 + 1e-12))) + 1
         if count < 2:
@@ -149,7 +149,8 @@ def resample(dataset: Dataset, step: float) -> Dataset:
     return replace(dataset, **joined, truth={}, noise_std=None)
 
 
-def _episodes(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
+def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
+    """Number, rows and name for messages of every episode. Raises DatasetError for rows not in order of time."""
     if not dataset.time_ordered:
         raise DatasetError(
             "the rows are not in order of time (a sample of rows?); filter the whole recording, then sample."
@@ -160,7 +161,7 @@ def _episodes(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
 def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Apply `change` to each episode and put its rows back where they came from."""
     result: dict[str, np.ndarray] = {}
-    for number, rows, label in _episodes(dataset):
+    for number, rows, label in episodes_in_order(dataset):
         try:
             changed = change(rows, label)
         except DatasetError as error:
@@ -171,7 +172,7 @@ def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.
     return result
 
 
-def _require_no_turns(rows: Dataset, label: str) -> None:
+def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
     angular = [column for column, unit in enumerate(_position_units(rows)) if unit == "rad"]
     jumps = np.abs(np.diff(rows.q[:, angular], axis=0)) > np.pi
