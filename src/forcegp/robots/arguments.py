@@ -64,6 +64,14 @@ def finite_vector(name: str, values: Vector, size: int) -> np.ndarray:
     return array
 
 
+def checked_point(point: Vector, device: torch.device) -> Tensor:
+    """A point (..., 3) in m as a float64 tensor on ``device``; :class:`~forcegp.errors.InvalidInput` for others."""
+    if not isinstance(point, Tensor):
+        point = torch.as_tensor(finite_vector("point", point, 3), device=device)
+    check_tensor("point", point, 3, "x, y, z in m", device)
+    return point
+
+
 def armature_values(
     given: Vector | Mapping[str, float | int] | None, joints: tuple[str, ...], robot: str
 ) -> np.ndarray:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.robots import algorithms
-from forcegp.robots.arguments import Inertials, Vector, broadcast_batch
+from forcegp.robots.arguments import Inertials, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
 
@@ -196,7 +196,7 @@ class Kinematics:
         if point is None:
             local = offset[:, 3:, None]
         else:
-            point = self.robot.check_point(point)
+            point = checked_point(point, self.robot.device)
             homogeneous = offset[:, :3] @ point[..., None] + offset[:, 3:]
             if point.dim() == 1:
                 local = homogeneous[..., None]

@@ -25,6 +25,7 @@ from forcegp.robots.arguments import (
 from forcegp.robots.inertia import physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import WORLD, Layout, check_inertias, lay_out
+from forcegp.robots.nearest_inertia import InertiaChoice, with_chosen_inertias
 from forcegp.robots.parts import Joint, Link
 from forcegp.robots.tree import Tree, compile_tree, merged_inertias
 from forcegp.robots.urdf import RobotDescription, parse_urdf
@@ -68,16 +69,20 @@ class Robot:
         gravity: Vector = GRAVITY,
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
+        inertias: InertiaChoice = "strict",
     ) -> Robot:
         """Read a URDF file.
 
         Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
-        joint or by joint name; ``locked`` maps joint names to positions at which movable joints become fixed.
+        joint or by joint name; ``locked`` maps joint names to positions at which movable joints become fixed;
+        ``inertias`` of "nearest" replaces one that no body has by the nearest possible, with a DataWarning.
 
         Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, the link or joint, and the
         remedy.
         """
-        return cls.from_urdf_text(read_text(path), source=str(path), gravity=gravity, armature=armature, locked=locked)
+        return cls.from_urdf_text(
+            read_text(path), source=str(path), gravity=gravity, armature=armature, locked=locked, inertias=inertias
+        )
 
     @classmethod
     def from_urdf_text(
@@ -88,11 +93,13 @@ class Robot:
         gravity: Vector = GRAVITY,
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
+        inertias: InertiaChoice = "strict",
     ) -> Robot:
         """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
         description = parse_urdf(text, source=source)
         locked = locked_positions(locked or {})
         layout = lay_out(description, locked)
+        text, description = with_chosen_inertias(inertias, text, description, layout)
         names = tuple(joint.name for joint in layout.joints)
         rotor_inertias = armature_values(armature, names, description.name)
         check_inertias(description, layout, rotor_inertias)
@@ -330,13 +337,6 @@ class Robot:
     def check_input(self, name: str, value: object) -> None:
         """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""
         check_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
-
-    def check_point(self, point: Vector) -> Float[Tensor, "*batch 3"]:
-        """A point in frame coordinates as a float64 tensor (..., 3)."""
-        if not isinstance(point, Tensor):
-            point = torch.as_tensor(finite_vector("point", point, 3), device=self.device)
-        check_tensor("point", point, 3, "x, y, z in m", self.device)
-        return point
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
