@@ -1,0 +1,274 @@
+"""Windows: what a log tells about accelerations over short stretches of time, without differentiating it.
+
+For a test function phi on a window of length T, int phi dt = 1, integration by parts moves the derivatives from the
+signal to phi:
+
+    y = int phi a dt = - int phi' v dt = int phi'' q dt,
+
+for phi that vanishes at both ends (from q with its slope): the weak form (Messenger & Bortz 2021, "Weak SINDy"). Or phi
+is 1/T, and y the increment (v(t1) - v(t0)) / T. Either is a linear functional of the acceleration, and so of the
+unknown forces, that holds exactly; no filter comes before. White noise of the signal makes independent noise of y, with
+the norm of the weights as its standard deviation in units of the signal's.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import beta
+from typing_extensions import override
+
+from forcegp.data.dataset import Dataset
+from forcegp.data.farthest_points import farthest_point_sampling
+from forcegp.data.filtering import episodes_in_order, require_no_turns
+from forcegp.errors import DatasetError, InvalidInput
+
+EXACT_DEGREE = 5
+"""Weights are exact for polynomials of time up to this degree, however uneven the steps."""
+
+FEWEST_ROWS = EXACT_DEGREE + 3
+LONGEST_STEP = 2.5
+"""Steps of time longer than this multiple of the median are gaps, and no window spans one."""
+
+SMALLEST_SHARE = 1e-6
+"""Of the largest weight: rows at the ends of a window keep some, so that every node is the mean of its rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """N windows of n nodes, in place of rows with accelerations.
+
+    Rows k n to (k + 1) n - 1 of `nodes` are the states (q, v, u) of window k; their `a` is y of the window, the same in
+    all of them, and `noise_std` the noise that the sensors give it. `weights` c (N, n), of sum 1: y = sum_i c_i a_i.
+    """
+
+    nodes: Dataset
+    weights: Float[np.ndarray, "N n"]
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def observed(self) -> Float[np.ndarray, "N nv"]:
+        """y of every window, a weighted mean of the acceleration [units of a]."""
+        return self.nodes.a[:: self.weights.shape[1]]
+
+
+class WindowObservation(ABC):
+    """What is observed of every window; a frozen value whose fields are its settings.
+
+    `seconds` is the length of a window, `nodes` the states that stand for its rows (n): each is the weighted mean of
+    the rows around it, so that what is linear along a window enters without error, and noise of the states is averaged.
+    `signal` is what y is computed from.
+    """
+
+    # Constructors are the check, with messages for people; run-time checks of annotations must not come before.
+    __no_type_check__: ClassVar[bool] = True
+
+    name: ClassVar[str]
+    seconds: float
+    nodes: int
+    signal: Literal["q", "v"]
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.seconds, int | float) and 0.0 < self.seconds < float("inf")):
+            raise InvalidInput(f"{type(self).__name__} seconds is {self.seconds!r}; it must be positive and finite.")
+        if isinstance(self.nodes, bool) or not isinstance(self.nodes, int) or self.nodes < 1:
+            raise InvalidInput(f"{type(self).__name__} nodes is {self.nodes!r}; it must be a whole number from 1.")
+
+    @abstractmethod
+    def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        """w with y = sum_i w_i signal(t_i)."""
+
+    @abstractmethod
+    def acceleration_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        """c with y = sum_i c_i a(t_i), of sum 1."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Name and settings as plain JSON values."""
+        return {"name": self.name, **asdict(self)}  # type: ignore[call-overload]  # every observation is a dataclass
+
+    def windows(self, dataset: Dataset, points: int | None = None) -> Windows:
+        """The `points` windows whose mean states (q, v, u) lie farthest apart; all of them for None.
+
+        Windows follow each other without sharing a row, so their noise is independent. Rows must be in order of time,
+        at the rate of the sensors and unfiltered: noise of filtered signals is not white.
+        Raises DatasetError for rows in another order, positions that jump by a turn and logs without a window;
+        InvalidInput for more points than windows, windows of too few rows and more nodes than rows.
+        """
+        rows = _window_rows(dataset, self)
+        if points is not None and not 2 <= points <= len(rows):
+            raise InvalidInput(
+                f"points={points} is not between 2 and the {len(rows)} windows of {self.seconds:g} s in the dataset; "
+                "give fewer points or shorter windows."
+            )
+        time = dataset.time[rows]
+        weights, c = self.signal_weights(time), self.acceleration_weights(time)
+        if points is not None and points < len(rows):
+            states = [np.einsum("km,kmj->kj", c, getattr(dataset, name)[rows]) for name in ("q", "v", "u")]
+            chosen = farthest_point_sampling(np.hstack(states), points)
+            rows, weights, c = rows[chosen], weights[chosen], c[chosen]
+        observed = np.einsum("km,kmj->kj", weights, getattr(dataset, self.signal)[rows])
+        noise = white_noise(dataset, self.signal) * np.linalg.norm(weights, axis=1)[:, None]
+        parts = np.array_split(np.arange(rows.shape[1]), self.nodes)
+        positive = np.maximum(c, SMALLEST_SHARE * c.max(axis=1, keepdims=True))
+
+        def at_nodes(values: np.ndarray) -> np.ndarray:
+            means = [np.einsum("km,kmj->kj", _shares(positive[:, part]), values[:, part]) for part in parts]
+            return np.stack(means, axis=1).reshape(-1, values.shape[-1])
+
+        repeat = {name: np.repeat(values, self.nodes, axis=0) for name, values in (("a", observed), ("noise", noise))}
+        nodes = replace(
+            dataset,
+            **{name: at_nodes(getattr(dataset, name)[rows]) for name in ("q", "v", "u")},
+            a=repeat["a"],
+            time=at_nodes(dataset.time[rows][..., None])[:, 0],
+            episode=np.repeat(dataset.episode[rows[:, 0]], self.nodes),
+            noise_std=repeat["noise"] if (noise > 0).all() else None,
+            truth={},
+            metadata={**dataset.metadata, "windows": self.to_dict()},
+            time_ordered=False,
+        )
+        return Windows(nodes, np.stack([c[:, part].sum(axis=1) for part in parts], axis=1))
+
+
+@dataclass(frozen=True)
+class WeakForm(WindowObservation):
+    """phi = (1 - s^2)^order on s from -1 to 1, scaled to integral 1; `signal` is "q" (with phi'') or "v" (with phi').
+
+    Order 2 on q is the second derivative of the parabola that fits a window best, and order 1 on v the slope of the
+    straight line: among all unbiased ones these have the least noise (Savitzky & Golay 1964). Higher orders look at the
+    middle of a window only, and need longer ones.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+    name: ClassVar[str] = "weak-form"
+    seconds: float = 0.1
+    nodes: int = 10
+    signal: Literal["q", "v"] = "q"
+    order: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.signal not in ("q", "v"):
+            raise InvalidInput(f"WeakForm signal is {self.signal!r}; allowed: 'q' (positions) or 'v' (velocities).")
+        least = 2 if self.signal == "q" else 1
+        if isinstance(self.order, bool) or not isinstance(self.order, int) or not least <= self.order <= 16:
+            raise InvalidInput(
+                f"WeakForm order is {self.order!r}; on {self.signal} it must be a whole number from {least} to 16."
+            )
+
+    @override
+    def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        s, half, step = _scaled(time)
+        p, rest = self.order, 1.0 - s**2
+        size = 1.0 / beta(0.5, p + 1)
+        powers, moments = np.arange(EXACT_DEGREE + 1), np.zeros(EXACT_DEGREE + 1)
+        if self.signal == "v":
+            slope = -2.0 * p * s * rest ** (p - 1)
+            moments[1:] = powers[1:] * self._moments(EXACT_DEGREE)
+            return _exact(-size * slope * step, s, moments) / half
+        bend = -2.0 * p * rest ** (p - 1) + 4.0 * p * (p - 1) * s**2 * np.maximum(rest, 0.0) ** max(p - 2, 0)
+        moments[2:] = powers[2:] * powers[1:-1] * self._moments(EXACT_DEGREE - 1)
+        return _exact(size * bend * step, s, moments) / half**2
+
+    @override
+    def acceleration_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        s, _, step = _scaled(time)
+        phi = (1.0 - s**2) ** self.order / beta(0.5, self.order + 1)
+        return _exact(phi * step, s, self._moments(EXACT_DEGREE + 1))
+
+    def _moments(self, count: int) -> Float[np.ndarray, " count"]:
+        """int phi s^k ds, k = 0, 1, ...."""
+        k = np.arange(count)
+        return np.where(k % 2 == 0, beta(0.5 * (k + 1), self.order + 1) / beta(0.5, self.order + 1), 0.0)
+
+
+@dataclass(frozen=True)
+class VelocityIncrements(WindowObservation):
+    """phi = 1/T: the change of the velocity over a window, by its length."""
+
+    __no_type_check__: ClassVar[bool] = True
+    name: ClassVar[str] = "increments"
+    seconds: float = 0.1
+    nodes: int = 10
+    signal: Literal["q", "v"] = field(default="v", init=False)
+
+    @override
+    def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        weights = np.zeros_like(time)
+        weights[:, -1] = 1.0 / (time[:, -1] - time[:, 0])
+        weights[:, 0] = -weights[:, -1]
+        return weights
+
+    @override
+    def acceleration_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        s, _, step = _scaled(time)
+        k = np.arange(EXACT_DEGREE + 1)
+        return _exact(0.5 * step, s, np.where(k % 2 == 0, 1.0 / (k + 1), 0.0))
+
+
+OBSERVATIONS: Mapping[str, type[WindowObservation]] = {kind.name: kind for kind in (WeakForm, VelocityIncrements)}
+
+
+def white_noise(dataset: Dataset, signal: Literal["q", "v"]) -> Float[np.ndarray, " nv"]:
+    """Standard deviation of the white noise of a signal, from its third differences within episodes [its units].
+
+    Third differences of white noise have 20 times its variance, those of a motion at the rate of a sensor next to none.
+    """
+    thirds = [np.diff(getattr(rows, signal), 3, axis=0) for _, rows, _ in episodes_in_order(dataset) if len(rows) > 3]
+    return np.sqrt(np.square(np.concatenate(thirds)).mean(axis=0) / 20.0)
+
+
+def _window_rows(dataset: Dataset, how: WindowObservation) -> Int[np.ndarray, "N m"]:
+    """Row numbers of all windows: one after the other through every episode, none over a gap."""
+    steps = np.diff(dataset.time)[np.diff(dataset.episode) == 0]
+    median = float(np.median(steps)) if steps.size else 0.0
+    length = round(how.seconds / median) + 1 if median > 0.0 else 0
+    if 0 < length < FEWEST_ROWS:
+        raise InvalidInput(
+            f"a window of {how.seconds:g} s has {length} rows at steps of {median:.4g} s; at least {FEWEST_ROWS} are "
+            f"needed: give {(FEWEST_ROWS - 1) * median:.3g} s or more, or the log at the rate of its sensors."
+        )
+    if how.nodes > length > 0:
+        raise InvalidInput(f"{how.nodes} nodes for windows of {length} rows; give at most {length}.")
+    found = []
+    for number, rows, label in episodes_in_order(dataset):
+        require_no_turns(rows, label)
+        at = np.flatnonzero(dataset.episode == number)
+        blocks = at[: len(at) // length * length].reshape(-1, length) if length else at[:0].reshape(0, 1)
+        gaps = np.diff(dataset.time[blocks], axis=1) > LONGEST_STEP * median
+        found.append(blocks[~gaps.any(axis=1)])
+    every = np.concatenate(found)
+    if not len(every):
+        raise DatasetError(
+            f"no episode has {how.seconds:g} s without a gap (a step of more than {LONGEST_STEP:g} times the median, "
+            f"{median:.4g} s); give shorter windows, or a log without gaps."
+        )
+    return every
+
+
+def _scaled(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times of every window as s from -1 to 1, half its length [s], and the weights of the trapezoidal rule in s."""
+    half = 0.5 * (time[:, -1:] - time[:, :1])
+    s = (time - time[:, :1]) / half - 1.0
+    steps = np.diff(s, axis=1)
+    zero = np.zeros_like(half)
+    return s, half, 0.5 * (np.hstack([steps, zero]) + np.hstack([zero, steps]))
+
+
+def _exact(weights: np.ndarray, s: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """The nearest weights with sum_i w_i s_i^k = moments_k for all k: what the trapezoidal rule only approximates."""
+    powers = s[..., None] ** np.arange(len(moments))
+    missing = moments - np.einsum("km,kmj->kj", weights, powers)
+    gram = np.einsum("kmi,kmj->kij", powers, powers)
+    return weights + np.einsum("kmj,kj->km", powers, np.linalg.solve(gram, missing[..., None])[..., 0])
+
+
+def _shares(weights: np.ndarray) -> np.ndarray:
+    return weights / weights.sum(axis=1, keepdims=True)

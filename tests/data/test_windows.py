@@ -1,0 +1,153 @@
+"""Windows of a log: exact functionals of its acceleration, with independent noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forcegp.data import REVOLUTE_UNITS, Dataset, VelocityIncrements, WeakForm
+from forcegp.data.windows import white_noise
+from forcegp.errors import DatasetError, InvalidInput
+
+HOWS = {
+    "weak form on q": WeakForm(0.1),
+    "weak form on v": WeakForm(0.1, signal="v", order=1),
+    "narrow weak form on q": WeakForm(0.1, order=4),
+    "increments": VelocityIncrements(0.1),
+}
+
+
+def log(q, v, a, time, episode=None) -> Dataset:
+    columns = [np.stack([x, 2.0 * x], axis=1) for x in (q, v, np.sin(q), a)]
+    q, v, u, a = columns
+    names, units = ("first", "second"), dict(REVOLUTE_UNITS)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, joint_names=names, units=units, episode=episode)
+
+
+def sine(time, episode=None, frequency=9.0) -> Dataset:
+    w = frequency
+    return log(np.sin(w * time), w * np.cos(w * time), -(w**2) * np.sin(w * time), time, episode)
+
+
+def uneven(rows: int, seed: int, step: float = 0.002) -> np.ndarray:
+    return np.cumsum(step * np.random.default_rng(seed).uniform(0.5, 1.5, rows))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(list(HOWS.values())), st.integers(0, 5), st.integers(0, 10_000))
+def test_polynomials_are_exact_on_uneven_steps(how, degree, seed):
+    """q to the fifth degree, and acceleration_weights on the polynomial that is its second derivative."""
+    time = uneven(170, seed)
+    how = replace(how, nodes=20)
+    coefficients = np.random.default_rng(seed + 1).normal(size=degree + 1)
+    motion = np.polynomial.Polynomial(coefficients, domain=[0.0, time[-1]])
+    dataset = log(motion(time), motion.deriv(1)(time), motion.deriv(2)(time), time)
+    windows = how.windows(dataset)
+    rows = round(0.1 / np.median(np.diff(time))) + 1
+    inside = time[: len(windows) * rows].reshape(len(windows), -1)
+    c = how.acceleration_weights(inside)
+    expected = np.einsum("km,km->k", c, motion.deriv(2)(inside))
+    scale = 1.0 + np.abs(dataset.a).max()
+    np.testing.assert_allclose(windows.observed[:, 0] / scale, expected / scale, atol=1e-8)
+    np.testing.assert_allclose(windows.weights.sum(axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("how", HOWS.values(), ids=HOWS)
+def test_the_observed_is_the_weighted_mean_of_the_acceleration(how):
+    """Against an adaptive quadrature of phi times the true acceleration."""
+    from scipy.integrate import quad
+
+    dataset = sine(0.002 * np.arange(300))
+    windows = how.windows(dataset)
+    rows = round(0.1 / 0.002) + 1
+    for k in range(len(windows)):
+        begin, end = dataset.time[k * rows], dataset.time[(k + 1) * rows - 1]
+
+        def phi(t, begin=begin, end=end):
+            s = (2.0 * t - begin - end) / (end - begin)
+            return 1.0 if isinstance(how, VelocityIncrements) else (1.0 - s**2) ** how.order
+
+        size = quad(phi, begin, end)[0]
+        expected = quad(lambda t, phi=phi: -(9.0**2) * np.sin(9.0 * t) * phi(t), begin, end)[0] / size
+        assert windows.observed[k, 0] == pytest.approx(expected, abs=1e-4)
+        at_nodes = windows.weights[k] @ (-(9.0**2) * windows.nodes.q[k * 10 : (k + 1) * 10, 0])
+        assert at_nodes == pytest.approx(expected, abs=1e-3)  # the acceleration is linear in q
+
+
+def test_order_two_on_positions_is_the_parabola_of_least_squares():
+    time = 0.002 * np.arange(51)
+    weights = WeakForm(0.1).signal_weights(time[None])[0]
+    parabola = np.linalg.pinv(np.vander(time - time.mean(), 3))[0] * 2.0
+    # exactness to the fifth degree costs a little noise beyond the second
+    assert np.linalg.norm(parabola) <= np.linalg.norm(weights) < 1.05 * np.linalg.norm(parabola)
+    np.testing.assert_allclose(weights[1:-1], parabola[1:-1], atol=0.12 * np.abs(parabola).max())
+
+
+@pytest.mark.parametrize("how", HOWS.values(), ids=HOWS)
+def test_noise_of_windows_is_independent_and_of_the_stated_size(how):
+    time = 0.002 * np.arange(51 * 3000)
+    generator, std = np.random.default_rng(0), 1e-3
+    noise = std * generator.normal(size=(2, len(time)))
+    dataset = log(noise[0], noise[1], 0.0 * time, time)
+    np.testing.assert_allclose(white_noise(dataset, how.signal), [std, 2.0 * std], rtol=0.02)
+    windows = how.windows(dataset)
+    y, stated = windows.observed, windows.nodes.noise_std[:: how.nodes]
+    np.testing.assert_allclose(y.std(axis=0) / stated[0], 1.0, rtol=0.05)
+    follow = np.corrcoef(y[:-1, 0], y[1:, 0])[0, 1]
+    assert abs(follow) < 5.0 / np.sqrt(len(y))
+
+
+def test_windows_lie_far_apart_and_inside_one_episode_without_gaps():
+    time = 0.002 * np.arange(600)
+    time[250:] += 0.5
+    episode = np.repeat([0, 1], [400, 200])
+    dataset = sine(time, episode)
+    how = WeakForm(0.1, nodes=5)
+    every, few = how.windows(dataset), how.windows(dataset, 4)
+    assert len(every) == 7 - 1 + 3  # one of the first episode spans the gap
+    assert len(few) == 4
+    assert set(few.nodes.time) <= set(every.nodes.time)
+    at = few.nodes.time.reshape(4, 5)
+    assert (np.diff(at, axis=1) > 0).all()
+    assert (np.ptp(at, axis=1) < 0.1).all()
+    assert not few.nodes.time_ordered
+    assert few.nodes.metadata["windows"]["name"] == "weak-form"
+    spread = few.nodes.q[:, 0].reshape(4, 5).mean(axis=1)
+    assert np.ptp(spread) > 1.2  # of the range from -1 to 1
+
+
+def test_one_node_for_every_row_keeps_the_rows():
+    dataset = sine(0.002 * np.arange(102))
+    windows = WeakForm(0.1, nodes=51).windows(dataset)
+    np.testing.assert_allclose(windows.nodes.q, dataset.q, atol=1e-12)
+    np.testing.assert_allclose(windows.nodes.u, dataset.u, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: WeakForm(0.0), "seconds is 0.0; it must be positive"),
+        (lambda: WeakForm(0.1, nodes=0), "nodes is 0; it must be a whole number from 1"),
+        (lambda: WeakForm(order=1), "order is 1; on q it must be a whole number from 2"),
+        (lambda: WeakForm(signal="a"), "signal is 'a'; allowed: 'q'"),
+        (lambda: WeakForm(0.01).windows(sine(0.002 * np.arange(100))), "has 6 rows at steps of 0.002 s; at least 8"),
+        (lambda: WeakForm(0.02).windows(sine(0.002 * np.arange(100)), 99), "points=99 is not between 2 and the 9"),
+        (lambda: WeakForm(0.1, nodes=60).windows(sine(0.002 * np.arange(100))), "60 nodes for windows of 51 rows"),
+    ],
+)
+def test_arguments_out_of_range_say_what_is_allowed(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make()
+
+
+def test_logs_that_cannot_be_cut_into_windows_are_refused():
+    with pytest.raises(DatasetError, match=r"no episode has 5 s without a gap"):
+        WeakForm(5.0).windows(sine(0.002 * np.arange(100)))
+    with pytest.raises(DatasetError, match=r"not in order of time"):
+        WeakForm(0.1).windows(sine(0.002 * np.arange(100)).rows([3, 2, 1]))
+    time = 0.002 * np.arange(100)
+    wrapped = sine(time)
+    with pytest.raises(DatasetError, match="the angle wraps"):
+        WeakForm(0.1).windows(replace(wrapped, q=np.where(time[:, None] > 0.1, wrapped.q - 2 * np.pi, wrapped.q)))
