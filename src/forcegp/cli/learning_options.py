@@ -12,18 +12,17 @@ from tyro.conf import Positional, UseAppendAction, arg
 from forcegp.cli.backend_choice import BackendOptions
 from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
-from forcegp.errors import InvalidInput
+from forcegp.cli.robot_choice import RobotOptions
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset
     from forcegp.mechanics import MechanicalSystem
-    from forcegp.robots import Robot
 
 KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningOptions(BackendOptions):
+class LearningOptions(BackendOptions, RobotOptions):
     """What every command asks that learns from a dataset."""
 
     data: Annotated[Positional[Path], arg(metavar="DATA")]
@@ -48,8 +47,6 @@ class LearningOptions(BackendOptions):
     """Adam steps before them."""
     hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
     """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
-    robot: Annotated[Path | None, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
-    """Use this robot instead of the dataset's."""
     contact: Annotated[
         UseAppendAction[tuple[str, ...]],
         arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: the dataset's)"),
@@ -71,23 +68,8 @@ class LearningOptions(BackendOptions):
 
     def _system(self, dataset: Dataset) -> MechanicalSystem:
         """What is known: the dataset's own system, with what the options replace."""
-        from forcegp.mechanics import MechanicalSystem
-        from forcegp.robots import Robot
-
         contacts = parse_contacts(self.contact)
-        system = dataset.system
-        if self.robot is not None:
-            robot = Robot.from_urdf(self.robot) if system is None else _robot_like(system.robot, self.robot)
-            if robot.joint_names != tuple(dataset.joint_names):
-                raise InvalidInput(
-                    f"{self.robot} has joints {', '.join(robot.joint_names)}; {self.data} has "
-                    f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
-                )
-            system = MechanicalSystem(robot) if system is None else system.with_robot(robot)
-        if system is None:
-            raise InvalidInput(
-                f"{self.data} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
-            )
+        system = self.chosen_system(dataset, self.data)
         if self.contact:
             system = system.with_contacts(contacts)
         if self.known_force:
@@ -107,15 +89,6 @@ class LearningOptions(BackendOptions):
         }
         data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
         return {"options": options, "data": data}
-
-
-def _robot_like(recorded: Robot, urdf: Path) -> Robot:
-    """The robot of that URDF; what no URDF holds is as recorded: gravity, armature, locked joints."""
-    from forcegp.robots import Robot
-
-    robot = Robot.from_urdf(urdf, gravity=recorded.gravity.tolist(), locked=recorded.locked)
-    # Robots with other joints are refused by their names, which says more than the length of the armature.
-    return robot if robot.joint_names != recorded.joint_names else robot.with_armature(recorded.armature.tolist())
 
 
 def _with_known_forces(system: MechanicalSystem, names: tuple[str, ...]) -> MechanicalSystem:

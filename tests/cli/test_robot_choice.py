@@ -1,0 +1,121 @@
+"""The options that choose a robot: as objects, and through the real executable."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.models.arm import URDF, arm_data, arm_system
+from tests.robots.test_nearest_inertia import BROKEN
+
+from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.robot_choice import SYSTEM_FILE
+from forcegp.data import Dataset
+from forcegp.errors import DataWarning, ForceGPError, NonPhysicalInertia
+from forcegp.mechanics import CoulombJointFriction
+from forcegp.robots import Robot
+
+
+def options(*words: str):
+    return parse_arguments(["fit", "log.h5", "--out", "run", *words])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """arm.urdf, broken.urdf, recorded.h5 with its robot and bare.h5 without, system.json with friction."""
+    folder = tmp_path_factory.mktemp("robots")
+    (folder / "arm.urdf").write_text(URDF)
+    (folder / "broken.urdf").write_text(BROKEN)
+    data = arm_data(20, 0, arm_system(0))
+    data.save(folder / "recorded.h5")
+    replace(data, system=None, truth={}).save(folder / "bare.h5")
+    system = arm_system(0)
+    known = (*system.known_forces, CoulombJointFriction([0.1, 0.2, 0.3]))
+    (folder / SYSTEM_FILE).write_text(replace(system, known_forces=known).to_json())
+    return folder
+
+
+def test_every_option_reaches_the_robot(folder):
+    chosen = options(
+        *("--robot", str(folder / "arm.urdf"), "--armature", "pan=0.5", "--gravity", "0,1,-9"),
+        *("--lock", "bend=0.3"),
+    ).chosen_robot()
+    assert chosen.joint_names == ("pan", "lift")
+    assert chosen.locked == {"bend": 0.3}
+    assert chosen.armature.tolist() == [0.5, 0.0]
+    assert chosen.gravity.tolist() == [0.0, 1.0, -9.0]
+
+
+def test_what_no_urdf_holds_stays_as_recorded(folder):
+    recorded = Robot.from_urdf_text(URDF, gravity=(0.0, 0.0, -1.6), armature=[0.1, 0.2, 0.3])
+    words = "--robot", str(folder / "arm.urdf")
+    same = options(*words).chosen_robot(recorded)
+    assert same.gravity.tolist() == [0.0, 0.0, -1.6]
+    assert same.armature.tolist() == [0.1, 0.2, 0.3]
+    for given in (words, ()):  # also without another URDF
+        other = options(*given, "--armature", "lift=0.9", "--gravity", "0,0,-9.81").chosen_robot(recorded)
+        assert other.gravity.tolist() == [0.0, 0.0, -9.81]
+        assert other.armature.tolist() == [0.1, 0.9, 0.3]
+    assert options().chosen_robot(recorded) is recorded
+    assert options().chosen_robot() is None
+
+
+def test_impossible_inertias_are_refused_or_repaired(folder):
+    words = "--robot", str(folder / "broken.urdf")
+    with pytest.raises(NonPhysicalInertia, match="--inertias nearest"):
+        options(*words).chosen_robot()
+    with pytest.warns(DataWarning, match="'arm'"):
+        assert options(*words, "--inertias", "nearest").chosen_robot().nv == 1
+
+
+def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_data(folder):
+    data = arm_data(5, 1)
+    for given in (folder, folder / SYSTEM_FILE):
+        system = options("--identified", str(given)).chosen_system(data, folder / "log.h5")
+        np.testing.assert_array_equal(system.known_forces[-1].coefficients, [0.1, 0.2, 0.3])
+        assert system.contacts == data.system.contacts
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--armature pan=0.5", "--armature needs --robot"),
+        ("--lock pan=0", "--lock needs --robot"),
+        ("--robot arm.urdf --gravity 0,0", "holds 2 numbers"),
+        ("--robot arm.urdf --gravity 0,0,down", "'down' is not a finite number"),
+        ("--robot arm.urdf --lock pan", "is not JOINT=RAD"),
+        ("--robot arm.urdf --lock pan=nan", "'nan' is not a finite number"),
+        ("--robot arm.urdf --armature pan=1 --armature pan=2", "names pan twice"),
+        ("--robot arm.urdf --armature elbow=1", "elbow"),
+        ("--robot arm.urdf --lock elbow=1", "elbow"),
+        ("--robot arm.urdf --identified .", "leave --robot out"),
+        ("--robot arm.urdf --lock bend=0", "has joints pan, lift; bare.h5 has pan, lift, bend"),
+        ("--identified nowhere", "give a folder that `forcegp identify` wrote"),
+    ],
+)
+def test_mistakes_are_told(folder, monkeypatch, words, said):
+    monkeypatch.chdir(folder)
+    data = Dataset.load("bare.h5")
+    with pytest.raises(ForceGPError, match=re.escape(said)):
+        options(*words.split()).chosen_system(data, Path("bare.h5"))
+
+
+def test_a_mistake_is_one_line_and_nothing_is_written(forcegp, folder):
+    run = forcegp("fit", "bare.h5", "--out", "run", "--robot", "arm.urdf", "--lock", "bend=0", folder=folder)
+    assert (run.returncode, run.stdout, run.stderr.count("\n")) == (2, "", 1)
+    assert "has joints pan, lift; bare.h5 has pan, lift, bend" in run.stderr
+    assert not (folder / "run").exists()
+
+
+def test_a_fit_starts_from_an_identified_system(forcegp, folder):
+    run = forcegp(
+        *("fit", "bare.h5", "--identified", ".", "--points", 8, "--iterations", 2, "--restarts", 1, "--noise", 0.05),
+        *("--prior", "joint-friction", "--out", "fitted"),
+        folder=folder,
+    )
+    assert run.returncode == 0, run.stderr
+    from forcegp.models import load_posterior
+
+    forces = load_posterior(folder / "fitted").system.known_forces
+    np.testing.assert_array_equal(forces[-1].coefficients, [0.1, 0.2, 0.3])
