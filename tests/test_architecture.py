@@ -40,6 +40,7 @@ ROOMS = {
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
 ROOMS["evaluation"] = set(ROOMS) - {"simulation"}
+ROOMS["validation"] = set(ROOMS) - {"simulation"}
 ROOMS["experiments"] = set(ROOMS)
 ROOMS["cli"] = set(ROOMS)
 

@@ -1,0 +1,205 @@
+"""The models of a comparison, by name: each is told the same training rows and makes a posterior of them.
+
+A name is an entry of `CANDIDATES`, or an expression of priors as in `forcegp fit --prior` with the system that its mean
+takes: `joint-friction` (as given), `joint + joint-friction@identified`. Add your own:
+
+    CANDIDATES["mine"] = Candidate("what it is", "black box", fit_mine)
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, get_args
+
+from forcegp.data import Dataset
+from forcegp.errors import FitError, InvalidInput
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Posterior, StructuredGP
+from forcegp.priors import NoForces, named_prior
+from forcegp.validation.identified_systems import IDENTIFICATIONS, learned_noise
+
+Kind = Literal["given", "identified", "black box", "force prior"]
+"""Parametric physics as given or identified, a model without physics, and Gaussian processes on unknown forces."""
+
+MEAN = "@"
+"""Between a prior and the system that the mean takes, in the name of a model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """What a model is told.
+
+    Fields
+    ------
+    rows: the training rows, the same for every model of a seed.
+    given: the system as it was given.
+    identified: the systems identified from the same rows, by the name of the identification; a text says why there is
+        none.
+    seed: of the search and of random weights.
+    restarts, iterations: of the search for hyper-parameters; None leaves them to the model.
+    force_noise: where a learned noise of the joint forces begins [Nm or N]; None is none.
+    """
+
+    rows: Dataset
+    given: MechanicalSystem
+    identified: dict[str, MechanicalSystem | str]
+    seed: int = 0
+    restarts: int | None = None
+    iterations: int | None = None
+    force_noise: float | None = None
+
+    def system(self, mean: str) -> MechanicalSystem:
+        """The system of this name: given, or an identification. Raises FitError where that has failed."""
+        if mean == "given":
+            return self.given
+        found = self.identified[mean]
+        if isinstance(found, str):
+            raise FitError(f"the {mean} identification of its mean failed: {found}")
+        return found
+
+    @property
+    def search(self) -> dict[str, object]:
+        """Arguments for the `fit` of a Gaussian process."""
+        options = {} if self.iterations is None else {"options": OptimizerOptions(iterations=self.iterations)}
+        return {"seed": self.seed, "restarts": self.restarts, **options}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One model of a comparison.
+
+    Fields
+    ------
+    summary: what it is, for the page.
+    kind: which questions it answers.
+    fit: makes the posterior.
+    identification: the one that it builds on, a key of `IDENTIFICATIONS`; None for none.
+    cost: CPU time relative to others, for the remaining time alone.
+    """
+
+    summary: str
+    kind: Kind
+    fit: Callable[[Training], Posterior]
+    identification: str | None = None
+    cost: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise InvalidInput(f"kind is {self.kind!r}; allowed: {', '.join(get_args(Kind))}.")
+        if self.identification is not None and self.identification not in IDENTIFICATIONS:
+            raise InvalidInput(
+                f"no identification is called {self.identification!r}; there are {', '.join(IDENTIFICATIONS)}."
+            )
+
+
+def _fit_system(mean: str, training: Training) -> Posterior:
+    model = StructuredGP(
+        training.system(mean), NoForces(), "analytical", learned_noise(training.rows, training.force_noise)
+    )
+    return model.fit(training.rows, seed=training.seed, restarts=1)  # its starts would all be the same
+
+
+def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
+    system = training.system(mean)
+    noise = learned_noise(training.rows, training.force_noise)
+    return StructuredGP(system, named_prior(prior, system), "analytical", noise).fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
+
+
+def _fit_independent(training: Training) -> Posterior:
+    model = IndependentGP(training.given, noise=learned_noise(training.rows))
+    return model.fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
+
+
+def _fit_network(kind: type[NeuralNetwork] | type[NetworkEnsemble], training: Training) -> Posterior:
+    return kind(training.given).fit(training.rows, seed=training.seed)
+
+
+CANDIDATES: dict[str, Candidate] = {
+    "analytical": Candidate(
+        "the system as given (URDF and known forces), noise learned", "given", partial(_fit_system, "given")
+    ),
+    **{
+        f"identified-{name}": Candidate(
+            f"the system identified by {name}, noise learned",
+            "identified",
+            partial(_fit_system, name),
+            name,
+        )
+        for name in IDENTIFICATIONS
+    },
+    "independent-gp": Candidate(
+        "one Gaussian process per joint on (q, v, u), without physics", "black box", _fit_independent, cost=5.0
+    ),
+    "neural-network": Candidate(
+        "one small network on (q, v, u), without physics", "black box", partial(_fit_network, NeuralNetwork), cost=5.0
+    ),
+    "ensemble": Candidate(
+        "an ensemble of five networks on (q, v, u), without physics",
+        "black box",
+        partial(_fit_network, NetworkEnsemble),
+        cost=20.0,
+    ),
+}
+"""Models by name; Gaussian processes on forces need no entry, see `candidate`."""
+
+BEST_IDENTIFICATION = list(IDENTIFICATIONS)[-1]
+"""What `@identified` and the mass matrix of force errors take."""
+
+DEFAULT_MODELS = (
+    "analytical",
+    *(f"identified-{name}" for name in IDENTIFICATIONS),
+    "independent-gp",
+    "ensemble",
+    "joint",
+    "joint-friction",
+    "joint + joint-friction",
+    "joint@identified",
+    "joint-friction@identified",
+    "joint + joint-friction@identified",
+)
+
+
+def candidate(name: str, system: MechanicalSystem) -> Candidate:
+    """The model of this name, or Gaussian processes with the priors of this expression on forces.
+
+    Raises InvalidInput for names that are neither, and for priors that do not fit the system.
+    """
+    if name in CANDIDATES:
+        return CANDIDATES[name]
+    expression, at, mean = (part.strip() for part in name.partition(MEAN))
+    mean = mean if at else "given"
+    identification = BEST_IDENTIFICATION if mean == "identified" else None if mean == "given" else mean
+    if identification is not None and identification not in IDENTIFICATIONS:
+        allowed = ", ".join(("given", "identified", *IDENTIFICATIONS))
+        raise InvalidInput(f"model {name!r} takes its mean from {mean!r}; give PRIOR{MEAN}MEAN with one of {allowed}.")
+    try:
+        named_prior(expression, system)
+    except InvalidInput as error:
+        close = difflib.get_close_matches(name, CANDIDATES, n=1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        raise InvalidInput(
+            f"no model is called {name!r}; {hint}there are {', '.join(CANDIDATES)}, and PRIOR{MEAN}MEAN with the mean "
+            f"given or identified ({error})"
+        ) from None
+    takes = "as given" if identification is None else f"identified by {identification}"
+    return Candidate(
+        f"Gaussian processes on unknown forces ({expression}), mean of the system {takes}",
+        "force prior",
+        partial(_fit_forces, expression, "given" if identification is None else identification),
+        identification,
+        cost=10.0,
+    )
+
+
+def candidates(names: Sequence[str], system: MechanicalSystem) -> dict[str, Candidate]:
+    """The models of these names. Raises InvalidInput for none, for a name that comes twice, and as `candidate`."""
+    if not names:
+        raise InvalidInput("no model is named; name one or more.")
+    repeated = sorted({name for name in names if list(names).count(name) > 1})
+    if repeated:
+        raise InvalidInput(f"models {repeated} are named twice; name each once.")
+    return {name: candidate(name, system) for name in names}

@@ -1,0 +1,241 @@
+"""One comparison: what is compared on what, and the pieces of work that it consists of."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from threadpoolctl import threadpool_limits
+
+from forcegp import __version__
+from forcegp.data import Dataset
+from forcegp.errors import FitError, ForceGPError, InvalidInput
+from forcegp.evaluation.machine import machine
+from forcegp.integration import integrator_named
+from forcegp.mechanics import MechanicalSystem
+from forcegp.validation.candidates import BEST_IDENTIFICATION, Candidate, Training
+from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions, motion_scores
+from forcegp.validation.identified_systems import IDENTIFICATIONS
+from forcegp.validation.kept_cells import KeptCells
+from forcegp.validation.scores import acceleration_scores, mass_matrices
+from forcegp.validation.splits import Split
+from forcegp.validation.training_subsets import training_subset
+
+IDENTIFICATION, MODEL = "identification", "model"
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What is compared, apart from the models and the number of seeds, which may grow later.
+
+    Fields
+    ------
+    rows: the prepared rows that models are trained and scored on.
+    recording: the same time at the full rate, for predictions of motions; may be `rows`.
+    system: the robot as given.
+    splits: what is held out; with several of them everything is done for each.
+    points: training rows of every model.
+    horizons, starts, integrator: of the predicted motions.
+    restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
+    force_noise: where a learned noise of the joint forces begins; None is none.
+
+    Raises InvalidInput for parts that do not fit, and DatasetError for splits whose sides overlap.
+    """
+
+    rows: Dataset
+    recording: Dataset
+    system: MechanicalSystem
+    splits: tuple[Split, ...]
+    points: int = 100
+    horizons: tuple[float, ...] = HORIZONS
+    starts: int = STARTS
+    integrator: str = "rk4"
+    restarts: int | None = None
+    iterations: int | None = None
+    force_noise: float | None = None
+
+    def __post_init__(self) -> None:
+        names = tuple(self.system.robot.joint_names)
+        for what, dataset in (("rows", self.rows), ("recording", self.recording)):
+            if tuple(dataset.joint_names) != names:
+                raise InvalidInput(
+                    f"the {what} have joints {', '.join(dataset.joint_names)}; the robot {', '.join(names)}"
+                )
+        for name in ("restarts", "iterations"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InvalidInput(f"{name} is {value}; it must be at least 1.")
+        integrator_named(self.integrator, self.system)
+        if len({split.name for split in self.splits}) < len(self.splits) or not self.splits:
+            raise InvalidInput("give one split or more, each of its own name.")
+        for split in self.splits:  # refused now, not after an hour
+            train, _ = split.apply(self.rows)
+            training_subset(train, self.points, 0)
+            self.motions(split)
+
+    def motions(self, split: Split) -> HeldOutMotions:
+        """The motions to predict in what this split holds out."""
+        return held_out_motions(self.recording, split.test_rows(self.recording), self.horizons, self.starts)
+
+    def configuration(self) -> dict[str, Any]:
+        """Everything that decides the numbers, as plain JSON values."""
+        options = ("points", "starts", "integrator", "restarts", "iterations", "force_noise")
+        return {
+            "forcegp": __version__,
+            "rows_sha256": fingerprint(self.rows),
+            "recording_sha256": fingerprint(self.recording),
+            "system_sha256": hashlib.sha256(self.system.to_json().encode()).hexdigest(),
+            "splits": [split.to_dict() for split in self.splits],
+            "horizons": list(self.horizons),
+            **{name: getattr(self, name) for name in options},
+        }
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One piece of work: an identification, or a model, on one split with one seed."""
+
+    kind: str
+    name: str
+    candidate: Candidate | None
+    split: int
+    seed: int
+
+    @property
+    def cost(self) -> float:
+        """CPU time relative to others, for the remaining time alone."""
+        return 2.0 if self.candidate is None else self.candidate.cost
+
+    def file_name(self, comparison: Comparison) -> str:
+        """Without ending; every character is one that all file systems take."""
+        plain = re.sub(r"[^\w.+@-]+", "_", self.name.replace(" ", ""))
+        if plain != self.name.replace(" ", ""):  # names that differ in other characters only
+            plain += f"-{hashlib.sha256(self.name.encode()).hexdigest()[:6]}"
+        kind = "" if self.kind == MODEL else f"{self.kind}-"
+        return f"{comparison.splits[self.split].name}-seed{self.seed}-{kind}{plain}"
+
+
+def cells_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Cell], list[Cell]]:
+    """Identifications, which come first, and models."""
+    wanted = {each.identification for each in models.values() if each.identification is not None}
+    places = [(split, seed) for seed in range(seeds) for split in range(len(comparison.splits))]
+    first = [
+        Cell(IDENTIFICATION, name, None, *place)
+        for place in places
+        for name in IDENTIFICATIONS
+        if name in wanted or (name == BEST_IDENTIFICATION and place[1] == 0)
+    ]
+    return first, [Cell(MODEL, name, each, *place) for place in places for name, each in models.items()]
+
+
+def compute(comparison: Comparison, kept: KeptCells, cell: Cell) -> None:
+    """Compute one cell and keep it; what goes wrong is kept as well, for it is a result."""
+    start = time.monotonic()
+    result: dict[str, Any] | None = None
+    error: str | None = None
+    with warnings.catch_warnings(record=True) as caught, threadpool_limits(1):
+        warnings.simplefilter("always")
+        try:
+            work = _identify if cell.kind == IDENTIFICATION else _score
+            result = work(comparison, kept, cell)
+        except ForceGPError as problem:
+            error = str(problem)
+        except Exception as problem:  # a model of somebody else may fail in any way; its row will say how
+            error = f"{type(problem).__name__}: {problem}"
+    kept.write(
+        cell.file_name(comparison),
+        {
+            "kind": cell.kind,
+            "name": cell.name,
+            "split": comparison.splits[cell.split].name,
+            "seed": cell.seed,
+            "machine": machine(),
+            "wall_seconds": time.monotonic() - start,
+            "warnings": sorted({" ".join(str(warning.message).split()) for warning in caught}),
+            "result": result,
+            "error": error,
+        },
+    )
+
+
+def _training_rows(comparison: Comparison, cell: Cell) -> tuple[Dataset, Dataset]:
+    train, test = comparison.splits[cell.split].apply(comparison.rows)
+    return training_subset(train, comparison.points, cell.seed), test
+
+
+def _identify(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any]:
+    rows, _ = _training_rows(comparison, cell)
+    start = time.process_time()
+    system = IDENTIFICATIONS[cell.name](comparison.system, rows)
+    return {"cpu_seconds": time.process_time() - start, "system": system.to_dict()}
+
+
+def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any]:
+    assert cell.candidate is not None, "a cell of a model has its candidate"
+    rows, test = _training_rows(comparison, cell)
+    name = cell.candidate.identification
+    identified: dict[str, MechanicalSystem | str] = {}
+    before = 0.0
+    if name is not None:
+        identified[name], before = identified_system(comparison, kept, name, cell.split, cell.seed)
+    training = Training(
+        rows,
+        comparison.system,
+        identified,
+        cell.seed,
+        comparison.restarts,
+        comparison.iterations,
+        comparison.force_noise,
+    )
+    start = time.process_time()
+    posterior = cell.candidate.fit(training)
+    seconds = before + time.process_time() - start
+    mass, whose = reference_mass(comparison, kept, cell.split, test)
+    scores = acceleration_scores(posterior, test, mass)
+    scores["motions"] = motion_scores(
+        posterior, comparison.motions(comparison.splits[cell.split]), comparison.integrator
+    )
+    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": len(rows), "test_rows": len(test), **scores}
+
+
+def identified_system(
+    comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int
+) -> tuple[MechanicalSystem | str, float]:
+    """The system of a finished identification, or why there is none, and the CPU seconds that it took."""
+    stored = kept.read(Cell(IDENTIFICATION, name, None, split, seed).file_name(comparison))
+    if stored is None:
+        raise FitError(f"the identification {name!r} with seed {seed} was not done")
+    if stored["result"] is None:
+        return str(stored["error"]), 0.0
+    return MechanicalSystem.from_dict(stored["result"]["system"]), stored["result"]["cpu_seconds"]
+
+
+def reference_mass(
+    comparison: Comparison, kept: KeptCells, split: int, test: Dataset
+) -> tuple[Float[np.ndarray, "rows nv nv"], str]:
+    """The mass matrices that turn errors of every model into forces, and whose they are, as part of a sentence.
+
+    One and the same for all models and seeds of a split: of the system identified with the first seed, because a URDF
+    seldom knows rotor inertias; of the system as given where that identification failed.
+    """
+    system, _ = identified_system(comparison, kept, BEST_IDENTIFICATION, split, 0)
+    if isinstance(system, str):
+        told = f"the system as given, because its identification failed ({system})"
+        return mass_matrices(comparison.system, test), told
+    return mass_matrices(system, test), f"the system identified by {BEST_IDENTIFICATION} from the rows of seed 0"
+
+
+def fingerprint(dataset: Dataset) -> str:
+    """SHA-256 of the joints, times and numbers of a Dataset."""
+    digest = hashlib.sha256("\n".join(dataset.joint_names).encode())
+    for name in ("q", "v", "u", "a", "time", "episode", "noise_std"):
+        values = getattr(dataset, name)
+        digest.update(name.encode() if values is None else np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,244 @@
+"""The page of a comparison: every number on it comes from the document of results."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from forcegp.evaluation.spreads import markdown_table, number, shown
+from forcegp.validation.figures import listed_units
+
+ALT_TEXTS = {
+    "errors": "Errors of accelerations and in force space, by joint and model",
+    "calibration": "Calibration of the intervals",
+    "motions": "Errors of predicted motions against their length",
+}
+
+
+def page(document: Mapping[str, Any]) -> str:
+    """Markdown: what was done, the verdicts, tables with the best marked, and what failed."""
+    models = document["models"]
+    finished = {name: model for name, model in models.items() if model["runs"]}
+    source = document["source"]
+    parts = [f"# Validation{' of ' + source['title'] if source.get('title') else ''}", *_done(document)]
+    parts += ["## Verdicts", _verdicts(document["verdicts"])]
+    if finished:
+        parts += ["## All joints", _overall(finished, document)]
+        parts += [f"![{ALT_TEXTS[name]}]({name}.png)" for name in document["figures"]]
+        parts += ["## By joint", *_by_joint(finished, document)]
+        parts += ["## Predicted motions", _motions(finished, document)]
+    parts += ["## Models", _models(models)]
+    parts += _failures(models, document)
+    parts += _warnings(models)
+    made = f"forcegp {document['configuration']['forcegp']}; {document['machine']}."
+    parts += ["## Where", f"{made} All numbers, with what decides them: `results.json`."]
+    return "\n\n".join(parts) + "\n"
+
+
+def _done(document: Mapping[str, Any]) -> list[str]:
+    source, seeds = document["source"], len(document["seeds"])
+    lines = [f"* Data: {line}" for line in source.get("data", [])]
+    lines += [f"* Preparation: {line}" for line in source.get("preparation", ["none stated"])]
+    for split in document["splits"]:
+        sides = (
+            f"{split['training_rows']} rows to learn from, {split['test_rows']} held out, {split['motions']} motions"
+        )
+        lines.append(f"* Split: {split['words']} ({sides}).")
+        lines += [f"* {note[0].upper()}{note[1:]}" for note in split["notes"]]
+    lines.append(
+        f"* Every model learns from the same {document['points']} rows: those that lie farthest apart among two thirds "
+        f"of the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. Tables tell the median "
+        "over runs (seeds and splits) and the range from the best to the worst."
+    )
+    lines.append(
+        "* Noise: learned by every model from the same start, what the data state or else a tenth of the scatter of "
+        "each joint's acceleration among the training rows; networks estimate their own. Intervals and densities are "
+        "those of measurements."
+    )
+    whose = "; ".join(document["mass_matrix"]) or "none, since no model finished"
+    lines.append(
+        f"* Force-space error: M (predicted − measured acceleration) with one M for all models: of {whose}. Where M is "
+        "small, a small force is a large acceleration, so an error of acceleration alone can mislead."
+    )
+    return ["\n".join(lines)]
+
+
+def _verdicts(found: Sequence[Mapping[str, Any]]) -> str:
+    if not found:
+        return "There are no two finished models to compare for any question."
+    lines = []
+    for item in found:
+        lines.append(f"* {item['question']}")
+        lines += [f"  * {answer['sentence']}" for answer in item["answers"]]
+    lines.append(
+        "\nOf each kind the model with the lowest median is taken, which favours kinds with many models a little. "
+        "Pairs share their training rows and held-out rows; intervals are Student's over runs, which say nothing about "
+        "other recordings."
+    )
+    return "\n".join(lines)
+
+
+def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+    force = listed_units(document["units"]["u"])
+    header = [
+        "model",
+        "nRMSE",
+        f"force error [{force}], rms",
+        "mean abs",
+        "NLPD [nats]",
+        "in 95 %",
+        "in 50 %",
+        "fit [CPU s]",
+    ]
+    low = _by(models, lambda model, score: None if model[score] is None else model[score]["median"])
+    rows = []
+    for name, model in models.items():
+        cells = [_marked(model[s], 3, low("least", s)) for s in ("nrmse", "force_rms", "force_mae", "nlpd")]
+        cells += [_percent(model[s], low("nearest", s)) for s in ("coverage_95", "coverage_50")]
+        rows.append([_named(name, model), *cells, shown(model["cpu_seconds"], 1)])
+    return markdown_table(header, rows)
+
+
+def _by(models: Mapping[str, Any], value: Callable[[Any, str], float | None]) -> Callable[[str, str], float | None]:
+    """The best median of a score: the least, or the nearest to the level of the interval."""
+
+    def best(how: str, score: str) -> float | None:
+        found = [number for model in models.values() if (number := value(model, score)) is not None]
+        if how == "least":
+            return min(found, default=None)
+        level = int(score.rpartition("_")[2]) / 100.0
+        return min(found, key=lambda number: abs(number - level), default=None)
+
+    return best
+
+
+def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:
+    force = listed_units(document["units"]["u"])
+    tables = (
+        ("nrmse_per_joint", "Normalised error of the acceleration (RMSE / standard deviation of the target)", 3),
+        ("force_rms_per_joint", f"Force-space error, rms [{force}]", 3),
+        ("force_mae_per_joint", f"Force-space error, mean absolute [{force}]", 3),
+        ("nlpd_per_joint", "Negative log predictive density [nats]", 2),
+    )
+    parts = []
+    for score, title, digits in tables:
+        parts.append(f"{title}:\n\n{_joint_table(models, document, score, digits)}")
+    for level in (95, 50):
+        score = f"coverage_{level}_per_joint"
+        rows = [[_named(name, model), *(_percent(value) for value in model[score])] for name, model in models.items()]
+        table = markdown_table(["model", *document["joint_names"]], rows)
+        parts.append(f"Held-out rows inside the {level} % interval:\n\n{table}")
+    return parts
+
+
+def _joint_table(models: Mapping[str, Any], document: Mapping[str, Any], score: str, digits: int) -> str:
+    best = [_least(model[score][joint] for model in models.values()) for joint in range(len(document["joint_names"]))]
+    rows = [
+        [_named(name, model), *(_marked(value, digits, least) for value, least in zip(model[score], best, strict=True))]
+        for name, model in models.items()
+    ]
+    return markdown_table(["model", *document["joint_names"]], rows)
+
+
+def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+    moving = {name: model for name, model in models.items() if model["motions"] is not None}
+    if not moving:
+        return "None could be predicted: " + " ".join(note for split in document["splits"] for note in split["notes"])
+    first = next(iter(moving.values()))["motions"]
+    places = range(len(first["horizons"]))
+    fewest = [min(model["motions"]["diverged"][k] for model in moving.values()) for k in places]
+    best = [
+        _least(m["motions"]["rms"][k] for m in moving.values() if m["motions"]["diverged"][k] == fewest[k])
+        for k in places
+    ]
+    rows = []
+    for name, model in moving.items():
+        motions, cells = model["motions"], []
+        for k in places:
+            lost = motions["diverged"][k]
+            cell = _marked(motions["rms"][k], 4, best[k] if lost == fewest[k] else None)
+            cells.append(f"{cell}, {lost} of {motions['motions']} diverged" if lost else cell)
+        rows.append([_named(name, model), *cells])
+    unit = listed_units(document["units"]["q"])
+    table = markdown_table(["model", *(f"after {h:g} s" for h in first["horizons"])], rows)
+    last = first["horizons"][-1]
+    each = _motion_joints(moving, document, len(first["horizons"]) - 1)
+    return (
+        f"RMS error of q over motions and joints [{unit}]; the mean of each model integrated by {first['integrator']} "
+        f"in steps of {first['dt']:.4g} s from recorded states under recorded forces. Errors are those of motions that "
+        f"had not diverged.\n\n{table}\n\nBy joint after {last:g} s:\n\n{each}"
+    )
+
+
+def _motion_joints(models: Mapping[str, Any], document: Mapping[str, Any], place: int) -> str:
+    flat = {name: {**model, "at": model["motions"]["rms_per_joint"][place]} for name, model in models.items()}
+    return _joint_table(flat, document, "at", 4)
+
+
+def _models(models: Mapping[str, Any]) -> str:
+    rows = [[name, model["kind"], model["summary"], str(model["runs"])] for name, model in models.items()]
+    return markdown_table(["model", "kind", "what it is", "finished runs"], rows)
+
+
+def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for name, model in models.items():
+        for reason, runs in _grouped(
+            (f["error"], f"{f['split']}, seed {f['seed']}") for f in model["failures"]
+        ).items():
+            lines.append(
+                f"* **{name}** failed in {len(runs)} of {len(runs) and _runs(model)} runs ({'; '.join(runs)}): {reason}"
+            )
+    for cell in document["identifications"]:
+        if cell["error"] is not None:
+            lines.append(
+                f"* the {cell['name']} identification failed ({cell['split']}, seed {cell['seed']}): {cell['error']}"
+            )
+    return ["## Failures", "\n".join(lines)] if lines else []
+
+
+def _runs(model: Mapping[str, Any]) -> int:
+    return model["runs"] + len(model["failures"])
+
+
+def _warnings(models: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for name, model in models.items():
+        kinds = _grouped((re.sub(r"\d[\d.e+-]*", "#", text), text) for text in model["warnings"])
+        lines += [f"* {name} ({len(texts)}): {texts[0]}" for texts in kinds.values()]
+    return ["## Warnings", "\n".join(lines)] if lines else []
+
+
+def _grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
+
+
+def _named(name: str, model: Mapping[str, Any]) -> str:
+    return f"{name} ({model['runs']} of {_runs(model)} runs)" if model["failures"] else name
+
+
+def _least(values: Iterable[Mapping[str, Any] | None]) -> float | None:
+    return min((value["median"] for value in values if value is not None), default=None)
+
+
+def _marked(value: Mapping[str, Any] | None, digits: int, best: float | None) -> str:
+    """With the median in bold where it is the best."""
+    text = shown(value, digits)
+    if value is None or best is None or value["median"] != best:
+        return text
+    median = number(value["median"], digits)
+    return f"**{median}**{text.removeprefix(median)}"
+
+
+def _percent(value: Mapping[str, Any] | None, best: float | None = None) -> str:
+    if value is None:
+        return "–"
+    in_percent = {
+        name: [100.0 * each for each in number] if isinstance(number, list) else 100.0 * number
+        for name, number in value.items()
+    }
+    return _marked(in_percent, 1, None if best is None else 100.0 * best) + " %"

@@ -1,0 +1,92 @@
+"""Scores of predicted accelerations on held-out rows, per joint: plain JSON values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.data import Dataset
+from forcegp.evaluation import metrics
+from forcegp.evaluation.predicted_rows import predict_rows
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import Posterior
+
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+"""Of the central intervals whose coverage is told."""
+
+ROWS_PER_BLOCK = 4096
+
+
+def mass_matrices(system: MechanicalSystem, dataset: Dataset) -> Float[np.ndarray, "_ nv nv"]:
+    """M of every row [kg m^2, kg m or kg], rotors and armature included."""
+    blocks = []
+    with torch.no_grad():
+        for start in range(0, len(dataset), ROWS_PER_BLOCK):
+            q = torch.tensor(dataset.q[start : start + ROWS_PER_BLOCK])
+            blocks.append(system.mass_matrix(system.robot.kinematics(q)).cpu().numpy())
+    return np.concatenate(blocks)
+
+
+def normalized_error(
+    predicted: Float[np.ndarray, "rows nv"], target: Float[np.ndarray, "rows nv"]
+) -> Float[np.ndarray, " nv"]:
+    """Root mean square error over the standard deviation of the target, per joint; NaN where the target is constant.
+
+    1 is what predicting the mean of the held-out rows would give.
+    """
+    spread = target.std(axis=0)
+    error = metrics.root_mean_square_error(predicted, target)
+    return np.where(spread > 0.0, error / np.where(spread > 0.0, spread, 1.0), np.nan)
+
+
+def force_errors(
+    predicted: Float[np.ndarray, "rows nv"],
+    target: Float[np.ndarray, "rows nv"],
+    mass: Float[np.ndarray, "rows nv nv"],
+) -> Float[np.ndarray, "rows nv"]:
+    """M (predicted - target): the joint forces [Nm or N] that the errors of the acceleration amount to."""
+    return (mass @ (predicted - target)[..., None])[..., 0]
+
+
+def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndarray, "rows nv nv"]) -> dict[str, Any]:
+    """All scores of the held-out rows; `mass` is the same for every model (`mass_matrices`).
+
+    Intervals and densities are those of a measurement: with the noise of the model, or of the Dataset where that is
+    larger. What is not a number (a constant target) is None.
+    """
+    predicted = predict_rows(posterior, test)
+    a, variance = test.a, predicted.measurement_variance
+    forces = force_errors(predicted.mean, a, mass)
+    covered = [metrics.interval_coverage(predicted.mean, variance, a, level) for level in LEVELS]
+    return {
+        "rmse": plain(metrics.root_mean_square_error(predicted.mean, a)),
+        "mae": plain(metrics.mean_absolute_error(predicted.mean, a)),
+        "nrmse": plain(normalized_error(predicted.mean, a)),
+        "force_rms": plain(np.sqrt(np.square(forces).mean(axis=0))),
+        "force_mae": plain(np.abs(forces).mean(axis=0)),
+        "nlpd": float(predicted.negative_log_density.mean()),
+        "nlpd_per_joint": plain(metrics.marginal_negative_log_density(predicted.mean, variance, a)),
+        "levels": list(LEVELS),
+        "coverage": [plain(each) for each in covered],
+        "noise_std": plain(posterior.noise_std.detach().cpu().numpy()),
+    }
+
+
+def over_joints(score: str, values: Sequence[float | None]) -> float | None:
+    """One number for all joints: the mean, for scores of forces the root of the mean of squares.
+
+    Joints of which nothing is known (one that never moves has no normalised error) do not count; None where none is.
+    """
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    return float(np.sqrt(np.square(known).mean())) if score.startswith("force") else float(np.mean(known))
+
+
+def plain(values: Float[np.ndarray, " k"]) -> list[float | None]:
+    """As JSON numbers, None for what is not finite."""
+    return [float(value) if np.isfinite(value) else None for value in values]

@@ -1,0 +1,161 @@
+"""Which model is better? Paired over runs, in which both saw the same training rows and predicted the same others.
+
+With the difference d of one run (of logarithms for errors, so that it is a ratio; of nats for densities), n runs say
+that one model is better if the 95 % interval of the mean of d excludes 0: mean -+ t(0.975, n - 1) s / sqrt(n)
+(Student's paired test). Runs differ by their training rows; that recordings differ as well, only several splits show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from forcegp.validation.scores import over_joints
+
+CERTAINTY = 0.95
+
+SCORES: Mapping[str, str] = {
+    "nrmse": "normalised error of the acceleration",
+    "force_rms": "force-space error",
+    "nlpd": "negative log predictive density",
+    "motion": "error of predicted motions",
+}
+"""What is compared, by the name of the score; `motion` is at the longest horizon."""
+
+QUESTIONS: Sequence[tuple[str, tuple[str, ...], tuple[str, ...]]] = (
+    ("Is the identified model better than the system as given?", ("identified",), ("given",)),
+    ("Does a Gaussian process on forces beat the identified model?", ("force prior",), ("identified",)),
+    ("Does a model without physics beat the identified model?", ("black box",), ("identified",)),
+    ("Does a Gaussian process on forces beat models without physics?", ("force prior",), ("black box",)),
+)
+"""Question, kinds of the challenger and of the baseline; of both the one with the best median is taken."""
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Challenger against baseline in one score.
+
+    `change` is the mean ratio - 1 of errors (-0.2: a fifth less), or the mean difference in nats; the interval is of
+    the same kind, None for one run. `wins` of `runs` were better.
+    """
+
+    score: str
+    challenger: str
+    baseline: str
+    runs: int
+    wins: int
+    change: float
+    interval: tuple[float, float] | None
+
+    @property
+    def verdict(self) -> str:
+        """`better`, `worse` or `undecided`."""
+        if self.interval is None or self.interval[0] <= 0.0 <= self.interval[1]:
+            return "undecided"
+        return "better" if self.interval[1] < 0.0 else "worse"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict with its numbers."""
+        in_nats = self.score == "nlpd"
+
+        def told(value: float) -> str:
+            return f"{value:+.3g} nats" if in_nats else f"{100.0 * value:+.3g} %"
+
+        said = {"better": "**Yes**", "worse": "**No**", "undecided": "**Undecided**"}[self.verdict]
+        spread = "one run, so no interval"
+        if self.interval is not None:
+            spread = f"95 % interval {told(self.interval[0])} to {told(self.interval[1])}"
+        return (
+            f"{said} by the {SCORES[self.score]}: {self.challenger} against {self.baseline} {told(self.change)} "
+            f"({spread}; better in {self.wins} of {self.runs} runs)."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {**asdict(self), "verdict": self.verdict, "sentence": self.sentence}
+
+
+def paired(score: str, challenger: str, baseline: str, one: Sequence[float], other: Sequence[float]) -> Paired | None:
+    """Compare the scores of two models run by run, the lower the better; None without runs, or with an error of 0."""
+    a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    in_nats = score == "nlpd"
+    if not a.size or (not in_nats and bool((np.minimum(a, b) <= 0.0).any())):
+        return None
+    difference = a - b if in_nats else np.log(a) - np.log(b)
+    mean, interval = float(difference.mean()), None
+    if len(a) > 1:
+        half = student.ppf(0.5 + 0.5 * CERTAINTY, len(a) - 1) * float(difference.std(ddof=1)) / math.sqrt(len(a))
+        interval = (_shown(mean - half, in_nats), _shown(mean + half, in_nats))
+    wins = int((difference < 0.0).sum())
+    return Paired(score, challenger, baseline, len(a), wins, _shown(mean, in_nats), interval)
+
+
+def _shown(value: float, in_nats: bool) -> float:
+    return value if in_nats else math.expm1(value)
+
+
+def verdicts(summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """The answers to all questions for which there are models of both kinds, as plain JSON values."""
+    out = []
+    for question, challengers, baselines in QUESTIONS:
+        answers = []
+        for score in SCORES:
+            names = [best_of(summary, cells, kinds, score) for kinds in (challengers, baselines)]
+            if names[0] is None or names[1] is None:
+                continue
+            answer = compared(score, names[0], names[1], cells)
+            if answer is not None:
+                answers.append(answer.to_dict())
+        if answers:
+            out.append({"question": question, "answers": answers})
+    return out
+
+
+def best_of(
+    summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]], kinds: Sequence[str], score: str
+) -> str | None:
+    """The model of these kinds with the lowest median, among those that failed least and diverged least."""
+    found = []
+    for name, model in summary.items():
+        values = list(runs_of(score, cells[name]).values())
+        if model["kind"] in kinds and values:
+            missing = len(cells[name]) - len(values)
+            found.append((missing, _diverged(model) if score == "motion" else 0, float(np.median(values)), name))
+    return min(found)[-1] if found else None
+
+
+def compared(
+    score: str, challenger: str, baseline: str, cells: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> Paired | None:
+    """`paired` over the runs that both models finished."""
+    one, other = runs_of(score, cells[challenger]), runs_of(score, cells[baseline])
+    shared = [run for run in one if run in other]
+    return paired(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
+
+
+def runs_of(score: str, cells: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], float]:
+    """One number per run, by split and seed: over all joints, at the longest horizon where it is of motions."""
+    out = {}
+    for cell in cells:
+        result = cell["result"]
+        if result is None:
+            continue
+        if score == "motion":
+            value = None if result["motions"] is None else result["motions"]["rms"][-1]
+        elif score == "nlpd":
+            value = result["nlpd"]
+        else:
+            value = over_joints(score, result[score])
+        if value is not None:
+            out[cell["split"], cell["seed"]] = float(value)
+    return out
+
+
+def _diverged(model: Mapping[str, Any]) -> int:
+    return 0 if model.get("motions") is None else model["motions"]["diverged"][-1]
