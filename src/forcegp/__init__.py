@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from forcegp.data import Dataset
+    from forcegp.data import Dataset, VelocityIncrements, WeakForm
     from forcegp.evaluation import Evaluation, PriorComparison, compare_priors, evaluate
     from forcegp.inference import Exact, Inducing, Iterative, Stochastic
     from forcegp.mechanics import (
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         CoulombJointFriction,
         Cylinder,
         ImplicitSurface,
+        LoadJointFriction,
         MechanicalSystem,
         Plane,
         RigidBodyBias,
@@ -69,11 +70,14 @@ __all__ = [
     "ViscousJointFriction",
     "CoulombJointFriction",
     "StribeckJointFriction",
+    "LoadJointFriction",
     "ConstantJointForce",
     "Armature",
     "RotorInertia",
     # what was measured
     "Dataset",
+    "WeakForm",
+    "VelocityIncrements",
     "KukaSurfaceConfig",
     "simulate_kuka_surface",
     # what is unknown, and the model that learns it
@@ -112,8 +116,8 @@ _ROOMS = {
     "robots": {"Robot"},
     "mechanics": {"MechanicalSystem", "Contact", "Plane", "Sphere", "Cylinder", "ImplicitSurface", "Baumgarte"}
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"}
-    | {"StribeckJointFriction", "ConstantJointForce", "RotorInertia"},
-    "data": {"Dataset"},
+    | {"StribeckJointFriction", "LoadJointFriction", "ConstantJointForce", "RotorInertia"},
+    "data": {"Dataset", "VelocityIncrements", "WeakForm"},
     "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}
     | {"JointAccelerations", "NoForces"},
     "inference": {"Exact", "Iterative", "Inducing", "Stochastic"},

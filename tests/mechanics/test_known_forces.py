@@ -18,6 +18,7 @@ from forcegp.mechanics import (
     ConstantJointForce,
     CoulombJointFriction,
     KnownForce,
+    LoadJointFriction,
     MechanicalSystem,
     RigidBodyBias,
     RotorInertia,
@@ -44,6 +45,10 @@ FORMULAS = {
     "Stribeck": (
         lambda: StribeckJointFriction(NUMBERS, 3.0, [0.1, 0.2, 0.3, 0.4], 0.02),
         lambda q, v, u: -(TENSOR + (3.0 - TENSOR) * (-((v / TENTHS) ** 2)).exp()) * (v / 0.02).tanh(),
+    ),
+    "load": (
+        lambda: LoadJointFriction(NUMBERS, 0.02),
+        lambda q, v, u: -TENSOR * u.abs() * (v / 0.02).tanh(),
     ),
     "constant": (lambda: ConstantJointForce(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
     "armature": (lambda: Armature(NUMBERS), lambda q, v, u: torch.zeros_like(u)),

@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from forcegp.models import Identification
 
 KIND = "forcegp identify"
-COEFFICIENT_NAMES = ("viscous-joint-friction.", "coulomb-joint-friction.", "armature.", "rotor-inertia.")
+COEFFICIENT_NAMES = (
+    "viscous-joint-friction.",
+    "coulomb-joint-friction.",
+    "load-joint-friction.",
+    "armature.",
+    "rotor-inertia.",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,12 +42,13 @@ def with_learned_forces(system: MechanicalSystem, learn: Sequence[Learned]) -> t
     """The system with every learned force in its list, from the URDF's coefficients, and the names that were added."""
     from dataclasses import replace
 
-    from forcegp.mechanics import Armature, CoulombJointFriction, RotorInertia, ViscousJointFriction
+    from forcegp.mechanics import Armature, CoulombJointFriction, LoadJointFriction, RotorInertia, ViscousJointFriction
     from forcegp.models.physical_parameters import Coefficients
 
     make = {
         "viscous-joint-friction": (ViscousJointFriction, lambda: ViscousJointFriction.from_robot(system.robot)),
         "coulomb-joint-friction": (CoulombJointFriction, lambda: CoulombJointFriction.from_robot(system.robot)),
+        "load-joint-friction": (LoadJointFriction, lambda: LoadJointFriction(0.0, 0.1)),
         "armature": (Armature, lambda: Armature(0.0)),
         "rotor-inertia": (RotorInertia, lambda: RotorInertia(0.0)),
     }

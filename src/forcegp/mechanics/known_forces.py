@@ -144,6 +144,26 @@ class StribeckJointFriction(KnownForce):
 
 
 @dataclass(frozen=True, eq=False)
+class LoadJointFriction(KnownForce):
+    """-mu |u| tanh(v / w): the part of a gear's dry friction that grows with the torque that it transmits.
+
+    mu without unit, `velocity_scale` w in rad/s or m/s; `CoulombJointFriction` is the part without load. Source: Hamon,
+    Gautier & Garrec, "Dynamic identification of robots with a dry friction model depending on load and velocity",
+    IROS 2010, where the load is the output torque; here it is that of the actuator.
+    """
+
+    coefficients: PerJoint
+    velocity_scale: PerJoint = 0.01
+    per_joint: ClassVar[tuple[str, ...]] = ("coefficients", "velocity_scale")
+    positive: ClassVar[tuple[str, ...]] = ("velocity_scale",)
+    learned: ClassVar[str | None] = "coefficients"
+
+    @override
+    def force(self, state: State) -> Tensor:
+        return -self.coefficients * state.u.abs() * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]  # tensors once they are bound
+
+
+@dataclass(frozen=True, eq=False)
 class ConstantJointForce(KnownForce):
     """A constant of either sign in Nm or N: the offset of a torque sensor, or friction that differs by direction."""
 
@@ -219,6 +239,7 @@ KNOWN_FORCES: dict[str, type[KnownForce]] = {
     "viscous-joint-friction": ViscousJointFriction,
     "coulomb-joint-friction": CoulombJointFriction,
     "stribeck-joint-friction": StribeckJointFriction,
+    "load-joint-friction": LoadJointFriction,
     "constant-joint-force": ConstantJointForce,
     "armature": Armature,
     "rotor-inertia": RotorInertia,

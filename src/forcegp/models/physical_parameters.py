@@ -40,6 +40,7 @@ MOMENTS = {"xx": (0, 0), "xy": (0, 1), "xz": (0, 2), "yy": (1, 1), "yz": (1, 2),
 COEFFICIENT_UNITS = {
     "viscous-joint-friction": ("Nms/rad", "Ns/m"),
     "coulomb-joint-friction": ("Nm", "N"),
+    "load-joint-friction": ("1", "1"),
     "armature": ("kg m^2", "kg"),
     "rotor-inertia": ("kg m^2", "kg"),
 }
@@ -52,8 +53,7 @@ class Coefficients:
 
     Parameters
     ----------
-    force: 'viscous-joint-friction', 'coulomb-joint-friction', 'armature' or 'rotor-inertia', which the system must list
-        once.
+    force: one of `COEFFICIENT_UNITS`, for instance 'viscous-joint-friction', which the system must list once.
     joints: names of the joints whose coefficient is learned; None means all, the others keep theirs.
     start: start value in the force's unit; None takes the system's own, which must be positive.
     """
