@@ -52,6 +52,15 @@ def zero_phase_low_pass(
     return sosfiltfilt(sections, values, axis=0, padlen=padding)
 
 
+def low_pass_gain(
+    frequency: Float[np.ndarray, " frequencies"], sample_rate: float, cutoff: float, order: int = 4
+) -> Float[np.ndarray, " frequencies"]:
+    """Gain of `zero_phase_low_pass` at these frequencies [Hz]: of amplitudes, not of power."""
+    with np.errstate(over="ignore"):  # infinite at half the sample rate, where nothing passes
+        warped = np.tan(np.pi * frequency / sample_rate) / np.tan(np.pi * cutoff / sample_rate)
+        return 1.0 / (1.0 + np.abs(warped) ** (2 * order))
+
+
 def differentiate(values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"]) -> np.ndarray:
     """Central differences, second order also at both ends and for unequal steps (three-point Lagrange formulas).
 

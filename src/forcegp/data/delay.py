@@ -1,0 +1,239 @@
+"""How much later than the motion a torque was logged: the shift of u at which inverse dynamics fits it best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+from forcegp.data.dataset import Dataset
+from forcegp.data.filtering import episodes_in_order
+from forcegp.errors import DatasetError, InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.robots import Robot
+
+LARGEST_DELAY = 0.05  # s
+STEPS = 100
+"""Shifts that are tried to either side."""
+
+BLOCKS = 8
+TINY = 1e-12
+MOST_ROWS = 20_000
+SIGNIFICANT = 3.0
+"""Standard deviations by which a delay must differ from zero to be used."""
+
+WORTH = 0.9
+"""Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Delay:
+    """Delay of the logged torque behind the motion [s], with standard deviations [s]; NaN where the log shows none.
+
+    `common` is the one delay that suits all joints best: what a bus or a filter does to all of them alike. `seconds`
+    (nv,) is that of each joint alone; where friction makes up most of a torque it can be a property of the friction.
+    `residual` (2, nv) is the share of the torque's variance that inverse dynamics leaves unexplained, without a shift
+    and at the joint's own best one; `remains` what the common delay leaves of what was unexplained, as the geometric
+    mean over the joints.
+    """
+
+    __no_type_check__: ClassVar[bool] = True  # nothing but arrays that this module makes
+
+    common: float
+    common_std: float
+    seconds: Float[np.ndarray, " nv"]
+    std: Float[np.ndarray, " nv"]
+    residual: Float[np.ndarray, "2 nv"]
+    remains: float
+
+    @property
+    def significant(self) -> float:
+        """The common delay if it is more than three standard deviations from zero and explains a tenth, else 0.
+
+        A log whose torque is mostly friction shows delays that explain nothing: they are properties of the friction.
+        """
+        sure = abs(self.common) > SIGNIFICANT * self.common_std and self.remains < WORTH  # NaN is neither
+        return self.common if sure else 0.0
+
+    @property
+    def told(self) -> str:
+        """The common delay and what became of it, for people."""
+        if not np.isfinite(self.common):
+            return "the torques show no common delay"
+        size = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms"
+        if self.significant:
+            return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
+        if abs(self.common) <= SIGNIFICANT * self.common_std:
+            return f"{size}, less than three standard deviations: none is assumed"
+        return f"{size}, but it explains less than a tenth of what inverse dynamics does not: none is assumed"
+
+
+def estimate_delay(dataset: Dataset, robot: Robot | None = None, *, largest: float = LARGEST_DELAY) -> Delay:
+    """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
+
+    For every shift up to `largest` [s] to either side, u is fitted by least squares to what a rigid body with friction
+    in the joint needs: inertial, centrifugal and gravity torques of `robot` (default: that of `dataset.system`), each
+    with a factor of its own, acceleration, velocity and sign of the velocity of the joint, and a constant. So the delay
+    does not rest on the robot's parameters being right. The best shift has the least sum of squares, by a parabola
+    through the three smallest; its standard deviation comes from leaving out each eighth of the log in turn (block
+    jackknife; Kuensch 1989, "The jackknife and the bootstrap for general stationary observations").
+
+    Filter first: q, v, u and a must be those of one filter. Raises InvalidInput without a robot, or with contacts,
+    whose forces are not known; DatasetError for a log shorter than eight times `largest`.
+    """
+    robot = _robot(dataset, robot)
+    parts = _shifted(dataset, largest)
+    features = _features(robot, dataset.rows(parts.rows))
+    nv = dataset.nv
+    profiles = np.full((nv, BLOCKS + 1, len(parts.shifts)), np.nan)  # of all rows, and of all but one block
+    residual = np.full((2, nv), np.nan)
+    for joint in range(nv):
+        shifted = parts.torque(dataset.u[:, joint])  # (shifts, rows)
+        spread = np.square(shifted - shifted.mean(axis=1, keepdims=True)).sum(axis=1)
+        if not spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():
+            continue  # a torque that does not change has no delay
+        profiles[joint] = _profiles(_orthonormal(features[joint]), shifted)
+        residual[:, joint] = profiles[joint, 0, STEPS] / spread[STEPS], profiles[joint, 0].min() / spread[STEPS]
+    seconds = np.array([[_lowest(profile, parts.shifts) for profile in own] for own in profiles])
+    # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
+    told = profiles[np.isfinite(residual[0])]
+    likelihoods = np.log(told + TINY * told.max(initial=0.0)).sum(axis=0)
+    common = np.array([_lowest(profile, parts.shifts) for profile in likelihoods])
+    likelihood = likelihoods[0]
+    return Delay(
+        common=float(common[0]),
+        common_std=float(_jackknife(common[None, 1:])[0]),
+        seconds=seconds[:, 0],
+        std=_jackknife(seconds[:, 1:]),
+        residual=residual,
+        remains=float(np.exp((likelihood.min() - likelihood[STEPS]) / max(len(told), 1))),
+    )
+
+
+def _profiles(basis: Float[np.ndarray, "rows columns"], shifted: Float[np.ndarray, "shifts rows"]) -> np.ndarray:
+    """Least sum of squares of every shift: (1 + blocks, shifts), of all rows and of all but each block."""
+    blocks = np.array_split(np.arange(shifted.shape[1]), BLOCKS)
+    normal = np.stack([basis[rows].T @ basis[rows] for rows in blocks])
+    right = np.stack([basis[rows].T @ shifted[:, rows].T for rows in blocks])
+    square = np.stack([np.square(shifted[:, rows]).sum(axis=1) for rows in blocks])
+    sums = [part.sum(axis=0) for part in (normal, right, square)]
+    without = [
+        _unexplained(sums[0] - n, sums[1] - r, sums[2] - s) for n, r, s in zip(normal, right, square, strict=True)
+    ]
+    return np.stack([_unexplained(*sums), *without])
+
+
+def _jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
+    """Standard deviation of an estimate from its values without each block; NaN where one of them is."""
+    return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
+
+
+def delayed(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"], seconds: float) -> np.ndarray:
+    """`values` at `time + seconds`, by a cubic spline; the values at the ends hold beyond them."""
+    if seconds == 0.0:
+        return values
+    return CubicSpline(time, values)(np.clip(time + seconds, time[0], time[-1]))
+
+
+@dataclass(frozen=True)
+class _Shifts:
+    """The rows that are compared, and how to shift a torque against them."""
+
+    rows: np.ndarray
+    shifts: np.ndarray
+    episodes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # rows of the episode, their times, times to compare at
+
+    def torque(self, u: np.ndarray) -> np.ndarray:
+        """(shifts, rows) torque at the rows' times plus each shift."""
+        columns = []
+        for rows, time, at in self.episodes:
+            columns.append(CubicSpline(time, u[rows])(at + self.shifts[:, None]))
+        return np.concatenate(columns, axis=1)
+
+
+def _shifted(dataset: Dataset, largest: float) -> _Shifts:
+    if not 0.0 < largest < np.inf:
+        raise InvalidInput(f"the largest delay is {largest} s; it must be positive and finite.")
+    thin = max(1, -(-len(dataset) // MOST_ROWS))
+    rows, episodes = [], []
+    for number, part, _ in episodes_in_order(dataset):
+        own = np.flatnonzero(dataset.episode == number)
+        inner = (part.time >= part.time[0] + largest) & (part.time <= part.time[-1] - largest)
+        chosen = own[inner][::thin]
+        if len(chosen):
+            rows.append(chosen)
+            episodes.append((own, part.time, dataset.time[chosen]))
+    count = sum(len(chosen) for chosen in rows)
+    if count < 10 * BLOCKS:
+        raise DatasetError(
+            f"{count} rows lie more than {largest} s from the ends of their episodes; a delay needs at least "
+            f"{10 * BLOCKS}. Record longer, or give the delay in s."
+        )
+    return _Shifts(np.concatenate(rows), np.linspace(-largest, largest, 2 * STEPS + 1), episodes)
+
+
+def _features(robot: Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows 7"]:
+    """What the torque of each joint may be made of, except for its parameters."""
+    import torch  # half a second, which only delays should cost
+
+    q, v, a = (torch.tensor(getattr(dataset, name), device=robot.device) for name in ("q", "v", "a"))
+    with torch.no_grad():
+        gravity = robot.gravity_forces(q)
+        bias = robot.bias_forces(q, v)
+        inertial = robot.inverse_dynamics(q, v, a) - bias
+        parts = [part.cpu().numpy() for part in (inertial, bias - gravity, gravity)]
+    slow = 0.1 * np.sqrt(np.square(dataset.v).mean(axis=0)) + 1e-12
+    columns = [*parts, dataset.a, dataset.v, np.tanh(dataset.v / slow), np.ones_like(dataset.v)]
+    return np.stack(columns, axis=-1).transpose(1, 0, 2)
+
+
+def _orthonormal(features: Float[np.ndarray, "rows columns"]) -> np.ndarray:
+    """Orthonormal columns that span the same space."""
+    size = np.linalg.norm(features, axis=0)
+    used = features[:, size > 1e-9 * size.max()]
+    left, values, _ = np.linalg.svd(used / np.linalg.norm(used, axis=0), full_matrices=False)
+    return left[:, values > 1e-6 * values[0]]
+
+
+def _unexplained(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> Float[np.ndarray, " shifts"]:
+    """Least sum of squares of every shift, from normal equations."""
+    solution = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+    return np.maximum(square - (right * solution).sum(axis=0), 0.0)
+
+
+def _lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shifts"]) -> float:
+    """Place of the least value, by a parabola; NaN at either end."""
+    at = int(np.argmin(values))
+    if at in (0, len(values) - 1):
+        return float("nan")
+    left, middle, right = values[at - 1 : at + 2]
+    curvature = left - 2.0 * middle + right
+    offset = 0.5 * (left - right) / curvature if curvature > 0.0 else 0.0
+    return float(shifts[at] + offset * (shifts[1] - shifts[0]))
+
+
+def _robot(dataset: Dataset, robot: Robot | None) -> Robot:
+    system = dataset.system
+    if robot is None and system is None:
+        raise InvalidInput(
+            "a delay is found by comparing torques with inverse dynamics, which needs the robot: give its URDF, or the "
+            "delay in s."
+        )
+    if system is not None and system.contacts:
+        raise InvalidInput(
+            "the forces of contacts are not known, so a delay cannot be found in this log. Give the delay in s, or use "
+            "a log without contact."
+        )
+    if robot is None:
+        assert system is not None
+        robot = system.robot
+    if robot.joint_names != tuple(dataset.joint_names):
+        raise InvalidInput(
+            f"{robot.name} has joints {', '.join(robot.joint_names)}; the dataset has "
+            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
+        )
+    return robot

@@ -1,0 +1,260 @@
+"""From a raw log to rows that can be learned from, and what that costs: filter, align, differentiate, thin out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
+from warnings import warn
+
+import numpy as np
+from jaxtyping import Float
+
+from forcegp.data.dataset import Dataset
+from forcegp.data.delay import delayed, estimate_delay
+from forcegp.data.filtering import (
+    Signal,
+    differentiated,
+    episodes_in_order,
+    low_pass,
+    low_pass_gain,
+    uniform_step,
+)
+from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
+from forcegp.errors import DatasetError, DataWarning, InvalidInput
+
+FORGOTTEN = 1e-12
+"""What may be left of a row's influence beyond the halo."""
+
+SPLINE_ROWS = 24
+"""Rows after which a cubic spline has forgotten a value, to `FORGOTTEN`: it falls by 2 - sqrt(3) per row."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """What to do with a raw log, the same for every episode. The default changes nothing.
+
+    cutoff: zero-phase Butterworth low-pass of that many Hz on q and u (with `differentiate="v"` on v as well), after
+        which v and a are computed anew; "auto" reads it from the spectrum (`motion_spectrum`), None leaves q, v, a
+        and u as they are.
+    order: of the filter; it runs forwards and backwards.
+    delay: how much later than it acts u was logged [s], one number or one per joint: `u(t) := u_logged(t + delay)`;
+        "auto" estimates one for all joints (`estimate_delay`), and uses it where it is sure and explains something.
+    every: keep every so many rows.
+    trim: seconds to drop at both ends of each episode, where a filter knows one side only.
+    differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
+
+    Raises InvalidInput for values that are not allowed.
+    """
+
+    __no_type_check__: ClassVar[bool] = True  # the constructor is the check, with messages for people
+
+    cutoff: float | Literal["auto"] | None = None
+    order: int = 4
+    delay: float | tuple[float, ...] | Literal["auto"] = 0.0
+    every: int = 1
+    trim: float = 0.0
+    differentiate: Literal["q", "v"] = "q"
+
+    def __post_init__(self) -> None:
+        if self.cutoff not in (None, "auto") and not _positive(self.cutoff):
+            raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
+        if isinstance(self.order, bool) or not isinstance(self.order, int) or not 1 <= self.order <= 12:
+            raise InvalidInput(f"order is {self.order!r}; it must be an integer from 1 to 12.")
+        if isinstance(self.delay, Sequence | np.ndarray) and not isinstance(self.delay, str):
+            object.__setattr__(self, "delay", tuple(self.delay))
+        each = self.delay if isinstance(self.delay, tuple) else (self.delay,)
+        if self.delay != "auto" and not (each and all(_finite(value) for value in each)):
+            raise InvalidInput(f"delay is {self.delay!r}; give seconds, one number per joint, or 'auto'.")
+        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
+            raise InvalidInput(f"every is {self.every!r}; it must be an integer of at least 1.")
+        if not _finite(self.trim) or self.trim < 0:
+            raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
+        if self.differentiate not in ("q", "v"):
+            raise InvalidInput(f"differentiate is {self.differentiate!r}; allowed: 'q' or 'v'.")
+
+    @property
+    def halo(self) -> float:
+        """Seconds on either side of a row that influence it, to one part in 10^12.
+
+        A log that is prepared piece by piece needs so much before and after each piece, and 24 rows more for splines
+        and differences. Raises InvalidInput while cut-off or delay are "auto": `resolved` finds them first.
+        """
+        if self.cutoff == "auto" or self.delay == "auto":
+            raise InvalidInput("the halo of an automatic cut-off or delay is not known; find them first: resolved().")
+        shifts = self.delay if isinstance(self.delay, tuple) else (self.delay,)
+        reach = max(abs(float(shift)) for shift in shifts)
+        if self.cutoff is not None:
+            slowest = 2.0 * np.pi * float(self.cutoff) * np.sin(0.5 * np.pi / self.order)  # slowest Butterworth pole
+            reach += -np.log(FORGOTTEN) / slowest
+        return float(reach)
+
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether the rows stay as they are."""
+        return self == Preparation(order=self.order, differentiate=self.differentiate)
+
+    def resolved(self, dataset: Dataset) -> Preparation:
+        """The same with numbers in place of "auto". Raises as `motion_spectrum` and `estimate_delay`."""
+        return _resolve(self, dataset)[0]
+
+    def apply(self, dataset: Dataset) -> Prepared:
+        """The prepared Dataset and its price.
+
+        `truth` and `noise_std` are dropped as `low_pass` and `differentiated` drop them. Raises DatasetError for rows
+        that are out of order, sampled unevenly or too few, and InvalidInput for a cut-off above half the sample rate.
+        """
+        chosen, reasons = _resolve(self, dataset)
+        filtered = _filtered(chosen, dataset)
+        kept = _kept(chosen, dataset)
+        prepared = filtered.rows(kept)
+        report = _report(chosen, reasons, dataset, filtered, prepared)
+        metadata = {**dataset.metadata, "preparation": report}
+        if "preparation" in dataset.metadata:
+            metadata["preparation"] = {**report, "earlier": dataset.metadata["preparation"]}
+        prepared = replace(prepared, metadata=metadata)
+        return Prepared(dataset=prepared, report=metadata["preparation"], preparation=chosen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prepared:
+    """A prepared Dataset, the preparation with numbers in place of "auto", and its price as plain JSON.
+
+    `report`: the settings; "why" for what was chosen; "rows" and "sample_rate" [Hz] before and after; per joint
+    "acceleration_noise" before and after the filter [rad/s^2 or m/s^2] (None where the log shows no noise floor) and
+    "power_removed", the share of the variance of q, v, a and u that the filter took.
+    """
+
+    dataset: Dataset
+    report: dict[str, Any]
+    preparation: Preparation
+
+
+def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[str, Any]]:
+    reasons: dict[str, Any] = {}
+    if isinstance(given.delay, tuple) and len(given.delay) != dataset.nv:
+        raise InvalidInput(f"delay has {len(given.delay)} numbers; the dataset has {dataset.nv} joints.")
+    chosen = given
+    if given.cutoff == "auto":
+        spectrum = motion_spectrum(dataset, given.differentiate)
+        each = spectrum.cutoff
+        known = np.isfinite(each)
+        cutoff = float(f"{each[known].max():.3g}") if known.any() else None
+        chosen = replace(given, cutoff=cutoff)
+        reasons["cutoff"] = _why(cutoff, spectrum, dataset)
+        reasons["cutoff_per_joint"] = _plain(each)
+    if given.delay == "auto":
+        found = estimate_delay(_filtered(replace(chosen, delay=0.0), dataset))
+        chosen = replace(chosen, delay=found.significant)
+        reasons["delay"] = found.told
+        reasons["delay_common"], reasons["delay_common_std"] = _plain(np.array([found.common, found.common_std]))
+        reasons["delay_per_joint"], reasons["delay_per_joint_std"] = _plain(found.seconds), _plain(found.std)
+    return chosen, reasons
+
+
+def _why(cutoff: float | None, spectrum: MotionSpectrum, dataset: Dataset) -> str:
+    if cutoff is None:
+        return f"the spectrum of {spectrum.source} shows no noise worth a filter; nothing is filtered"
+    joint = dataset.joint_names[int(np.nanargmax(spectrum.cutoff))]
+    return (
+        f"up to {cutoff:g} Hz the motion of joint {joint!r} is stronger than the noise of {spectrum.source}; "
+        "no other joint moves faster"
+    )
+
+
+def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
+    """Filtered, differentiated and shifted, with all its rows."""
+    assert chosen.delay != "auto"
+    assert chosen.cutoff != "auto"
+    if chosen.cutoff is not None:
+        signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
+        dataset = low_pass(dataset, float(chosen.cutoff), order=chosen.order, signals=signals)
+        dataset = differentiated(dataset, chosen.differentiate)
+    shifts = chosen.delay if isinstance(chosen.delay, tuple) else (chosen.delay,) * dataset.nv
+    if not any(shifts):
+        return dataset
+    u = dataset.u.copy()
+    for number, rows, _ in episodes_in_order(dataset):
+        for joint, shift in enumerate(shifts):
+            u[dataset.episode == number, joint] = delayed(rows.u[:, joint], rows.time, float(shift))
+    return replace(dataset, u=u, truth={})
+
+
+def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
+    """Row numbers that stay: not trimmed, with a torque at their shifted time, every so many."""
+    shifts = chosen.delay if isinstance(chosen.delay, tuple) else (chosen.delay,)
+    early, late = max(0.0, -min(map(float, shifts))), max(0.0, *map(float, shifts))
+    if chosen.changes_nothing:
+        return np.arange(len(dataset))
+    kept = []
+    for number, rows, label in episodes_in_order(dataset):
+        step = uniform_step(rows.time, label) if len(rows) > 1 else 0.0
+        slack = 1e-6 * step  # times are sums of steps
+        first, last = rows.time[0] + max(chosen.trim, early) - slack, rows.time[-1] - max(chosen.trim, late) + slack
+        own = np.flatnonzero(dataset.episode == number)[(rows.time >= first) & (rows.time <= last)][:: chosen.every]
+        if not len(own):
+            raise DatasetError(
+                f"{label} lasts {rows.time[-1] - rows.time[0]:.6g} s; nothing is left of it after "
+                f"{chosen.trim:g} s are trimmed at both ends. Trim less, or leave the episode out."
+            )
+        kept.append(own)
+        if chosen.cutoff is not None and 0.5 / (chosen.every * step) < float(chosen.cutoff):
+            warn(
+                f"every {chosen.every}. row is {1.0 / (chosen.every * step):.4g} Hz, of which only half can carry "
+                f"motion; the filter passes {chosen.cutoff:g} Hz. Rows stay true, but spectra, derivatives and filters "
+                "of them do not: keep more rows or filter lower.",
+                DataWarning,
+                stacklevel=3,
+            )
+    return np.sort(np.concatenate(kept))
+
+
+def _report(
+    chosen: Preparation, reasons: dict[str, Any], raw: Dataset, filtered: Dataset, prepared: Dataset
+) -> dict[str, Any]:
+    assert chosen.delay != "auto"
+    per_joint = list(chosen.delay) if isinstance(chosen.delay, tuple) else [chosen.delay] * raw.nv
+    report: dict[str, Any] = {
+        "cutoff": chosen.cutoff,
+        "order": chosen.order,
+        "delay": [float(value) for value in per_joint],
+        "every": chosen.every,
+        "trim": chosen.trim,
+        "differentiate": chosen.differentiate if chosen.cutoff is not None else None,
+        "why": reasons,
+        "rows": [len(raw), len(prepared)],
+    }
+    if chosen.changes_nothing:
+        return report
+    rate = 1.0 / float(np.median([uniform_step(rows.time) for _, rows, _ in episodes_in_order(raw) if len(rows) > 1]))
+    report["sample_rate"] = [rate, rate / chosen.every]
+    if chosen.cutoff is None:
+        return report
+    before = after = np.full(raw.nv, np.nan)
+    if max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) >= FEWEST_ROWS:
+        spectrum = motion_spectrum(raw, chosen.differentiate)
+        before = spectrum.acceleration_noise()
+        after = spectrum.acceleration_noise(lambda f: low_pass_gain(f, rate, float(chosen.cutoff or 0.0), chosen.order))
+    report["acceleration_noise"] = {"before": _plain(before), "after": _plain(after)}
+    unshifted = _filtered(replace(chosen, delay=0.0), raw) if any(per_joint) else filtered
+    report["power_removed"] = {name: _power_removed(raw, unshifted, name) for name in ("q", "v", "a", "u")}
+    return report
+
+
+def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | None]:
+    """Share of the variance of each column that is gone: the variance of the difference over that before."""
+    old, new = getattr(before, name), getattr(after, name)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return _plain(np.minimum(np.var(old - new, axis=0) / np.var(old, axis=0), 1.0))
+
+
+def _plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _positive(value: object) -> bool:
+    return _finite(value) and value > 0  # type: ignore[operator]  # a number, after the first check

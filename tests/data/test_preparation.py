@@ -1,0 +1,256 @@
+"""Cut-off from the spectrum, delay from inverse dynamics, and the price of a preparation, against known truth."""
+
+import inspect
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.data.samples import assert_equal, dataset
+from tests.models.arm import arm_system
+
+from forcegp.data import (
+    REVOLUTE_UNITS,
+    Dataset,
+    Preparation,
+    differentiated,
+    estimate_delay,
+    low_pass,
+    motion_spectrum,
+)
+from forcegp.errors import DatasetError, DataWarning, InvalidInput
+
+RATE = 500.0
+SIGMA = 1e-4
+
+
+def swings(time: np.ndarray, seed: int, nv: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums of five sines up to 2 Hz with exact derivatives."""
+    generator = np.random.default_rng(seed)
+    omega = 2 * np.pi * generator.uniform(0.1, 2.0, (5, 1, nv))
+    phase, size = generator.uniform(0, 2 * np.pi, (5, 1, nv)), generator.uniform(0.1, 0.3, (5, 1, nv))
+    angle = omega * time[:, None] + phase
+    q, v, a = (size * np.sin(angle), size * omega * np.cos(angle), -size * omega**2 * np.sin(angle))
+    return q.sum(0), v.sum(0), a.sum(0)
+
+
+def noisy(seconds: float = 12.0, seed: int = 0, sigma: float = SIGMA, rate: float = RATE) -> tuple[Dataset, np.ndarray]:
+    """Positions with white noise, raw differences of them, and the exact acceleration."""
+    time = np.arange(round(seconds * rate)) / rate
+    q, _, a = swings(time, seed)
+    measured = q + sigma * np.random.default_rng(seed + 100).normal(size=q.shape)
+    raw = Dataset(q=measured, v=0 * q, u=q, a=0 * q, time=time, joint_names=("one", "two"), units=REVOLUTE_UNITS)
+    return differentiated(raw, "q"), a
+
+
+def arm_log(delay: float = 0.0, seconds: float = 8.0, seed: int = 1, noise: float = 0.02) -> Dataset:
+    """The three-joint arm in free motion with the torques of inverse dynamics and friction, logged `delay` s late."""
+    system = arm_system(contacts=0)
+    time = np.arange(round(seconds * 200)) / 200
+    q, v, a = swings(time, seed, 3)
+    late = swings(time - delay, seed, 3)
+    u = system.robot.inverse_dynamics(*(torch.tensor(x) for x in late)).numpy()
+    u += 0.8 * np.tanh(late[1] / 0.1) + 0.3 * late[1] + noise * np.random.default_rng(seed).normal(size=u.shape)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, system=system)
+
+
+# ---------------------------------------------------------------- spectrum
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_floor_and_acceleration_noise_are_those_of_white_noise(seed):
+    data, _ = noisy(seed=seed)
+    spectrum = motion_spectrum(data)
+    np.testing.assert_allclose(spectrum.floor, 2 * SIGMA**2 / RATE, rtol=0.25)  # one-sided density of white noise
+    # (q[k+2] - 2 q[k] + q[k-2]) / (2 h)^2 of independent errors
+    np.testing.assert_allclose(spectrum.acceleration_noise(), np.sqrt(6) / 4 * SIGMA * RATE**2, rtol=0.05)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
+    data, exact = noisy(seed=seed, sigma=1e-3)
+    inner = slice(500, -500)
+
+    def error(prepared: Dataset) -> float:
+        return float((np.square(prepared.a - exact)[inner].mean(0) / exact[inner].var(0)).max())
+
+    chosen = Preparation(cutoff="auto").apply(data)
+    best = min(error(Preparation(cutoff=float(hertz)).apply(data).dataset) for hertz in (2, 3, 4, 5, 7, 10, 15, 20, 30))
+    assert error(chosen.dataset) < 4 * best
+    assert error(chosen.dataset) < 1e-4 * error(data)
+
+
+def test_no_noise_no_filter():
+    data, _ = noisy(sigma=0.0)
+    assert np.isnan(motion_spectrum(data).cutoff).all()
+    prepared = Preparation(cutoff="auto").apply(data)
+    assert prepared.preparation.cutoff is None
+    assert "no noise worth a filter" in prepared.report["why"]["cutoff"]
+    np.testing.assert_array_equal(prepared.dataset.a, data.a)
+
+
+def test_a_joint_at_rest_has_no_cutoff_and_hinders_nobody():
+    data, _ = noisy()
+    still = replace(data, q=np.stack([data.q[:, 0], np.zeros(len(data))], 1))
+    assert np.isfinite(motion_spectrum(still).cutoff).tolist() == [True, False]
+    assert Preparation(cutoff="auto").apply(still).preparation.cutoff is not None
+
+
+def test_a_peak_above_the_motion_is_no_motion():
+    data, _ = noisy()
+    hum = replace(data, q=data.q + 3e-5 * np.sin(2 * np.pi * 100 * data.time[:, None]))
+    np.testing.assert_allclose(motion_spectrum(hum).cutoff, motion_spectrum(data).cutoff, rtol=0.3)
+
+
+def test_too_short_a_log_is_refused():
+    with pytest.raises(DatasetError, match="the longest episode has 40 rows; a spectrum needs 64"):
+        motion_spectrum(noisy()[0].rows(slice(0, 40)))
+
+
+# ---------------------------------------------------------------- delay
+
+
+@pytest.mark.parametrize("delay", [-0.015, 0.004, 0.02])
+def test_a_delay_is_found_to_a_fraction_of_a_sample(delay):
+    found = estimate_delay(arm_log(delay))
+    assert found.common == pytest.approx(delay, abs=4e-4)
+    assert found.significant == found.common
+    np.testing.assert_allclose(found.seconds, delay, atol=2e-3)
+    assert abs(found.common - delay) < 5 * found.common_std
+    prepared = Preparation(cutoff=20.0, delay="auto", trim=0.2).apply(arm_log(delay))
+    assert prepared.report["delay"] == pytest.approx([delay] * 3, abs=4e-4)
+    np.testing.assert_allclose(prepared.dataset.u, _at(prepared.dataset, low_pass(arm_log(0.0), 20.0)).u, atol=0.2)
+
+
+def _at(prepared: Dataset, whole: Dataset) -> Dataset:
+    return whole.rows(np.isin(whole.time, prepared.time))
+
+
+def test_without_a_delay_none_is_assumed():
+    for seed in range(4):
+        assert estimate_delay(arm_log(0.0, seed=seed)).significant == 0.0
+
+
+def test_a_torque_that_never_changes_tells_nothing():
+    data = arm_log()
+    u = data.u.copy()
+    u[:, 1] = 0.0
+    found = estimate_delay(replace(data, u=u))
+    assert np.isnan(found.seconds).tolist() == [False, True, False]
+    nothing = estimate_delay(replace(data, u=np.zeros_like(u)))
+    assert np.isnan(nothing.common)
+    assert nothing.significant == 0.0
+    assert nothing.told == "the torques show no common delay"
+
+
+def test_what_a_delay_needs_is_said():
+    with pytest.raises(InvalidInput, match="needs the robot: give its URDF"):
+        estimate_delay(noisy()[0])
+    with pytest.raises(InvalidInput, match="forces of contacts are not known"):
+        estimate_delay(replace(arm_log(), system=arm_system()))
+    with pytest.raises(DatasetError, match=r"rows lie more than 0.05 s from the ends.*at least 80"):
+        estimate_delay(arm_log().rows(slice(0, 60)))
+    with pytest.raises(InvalidInput, match="has joints pan, lift, bend; the dataset has one, two"):
+        estimate_delay(noisy()[0], arm_system().robot)
+
+
+# ---------------------------------------------------------------- preparation
+
+
+def test_the_default_changes_nothing():
+    data = dataset(80, truth={"a": np.zeros((80, 2))}, noise_std=np.ones(2))
+    prepared = Preparation().apply(data)
+    assert_equal(replace(prepared.dataset, metadata=data.metadata), data)
+    assert prepared.report["rows"] == [80, 80]
+
+
+def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
+    data, _ = noisy(4.0)
+    prepared = Preparation(cutoff=12.0, order=2, every=5, trim=0.1).apply(data)
+    expected = differentiated(low_pass(data, 12.0, order=2, signals=("q", "u")), "q").rows(slice(50, -50, 5))
+    for name in ("q", "v", "a", "u", "time"):
+        np.testing.assert_array_equal(getattr(prepared.dataset, name), getattr(expected, name)[: len(prepared.dataset)])
+    assert len(prepared.dataset) == len(expected) == prepared.report["rows"][1]
+    assert prepared.report["sample_rate"] == pytest.approx([500.0, 100.0])
+    assert json.loads(json.dumps(prepared.report)) == prepared.report
+    assert prepared.dataset.metadata["preparation"]["cutoff"] == 12.0
+    again = Preparation(every=2).apply(prepared.dataset)
+    assert again.report["earlier"]["cutoff"] == 12.0
+
+
+def test_velocities_can_be_the_source():
+    data, _ = noisy(4.0)
+    prepared = Preparation(cutoff=12.0, differentiate="v").apply(data)
+    np.testing.assert_array_equal(prepared.dataset.v, low_pass(data, 12.0).v)
+    assert np.square(prepared.dataset.a).mean() > 1.0
+
+
+def test_the_price_is_the_noise_that_is_left():
+    data, exact = noisy(20.0, sigma=1e-3)
+    prepared = Preparation(cutoff=15.0, trim=0.5).apply(data)
+    price = prepared.report["acceleration_noise"]
+    left = np.std(prepared.dataset.a - exact[250:-250], axis=0)  # at 15 Hz the filter takes nothing of the motion
+    np.testing.assert_allclose(price["after"], left, rtol=0.15)
+    np.testing.assert_allclose(price["before"], np.std(data.a - exact, axis=0), rtol=0.05)
+    removed = np.var(data.a - Preparation(cutoff=15.0).apply(data).dataset.a, axis=0) / np.var(data.a, axis=0)
+    np.testing.assert_allclose(prepared.report["power_removed"]["a"], removed)
+
+
+@pytest.mark.parametrize(("cutoff", "delay", "seed"), [(6.0, 0.013, 0), (20.0, -0.0037, 1), (80.0, 0.0, 2)])
+def test_pieces_with_their_halo_are_the_whole(cutoff, delay, seed):
+    data, _ = noisy(4.0, seed)
+    preparation = Preparation(cutoff=cutoff, delay=delay)
+    whole = preparation.apply(data).dataset
+    reach = round(preparation.halo * RATE) + 24
+    first, last = 900, 1100
+    piece = preparation.apply(data.rows(slice(max(0, first - reach), last + reach))).dataset
+    inner = (piece.time >= data.time[first]) & (piece.time < data.time[last])
+    same = (whole.time >= data.time[first]) & (whole.time < data.time[last])
+    for name, scale in (("q", 1.0), ("v", RATE), ("a", RATE**2), ("u", 1.0)):
+        difference = np.abs(getattr(piece, name)[inner] - getattr(whole, name)[same]).max()
+        assert difference < 1e-10 * scale
+
+
+def test_a_delayed_torque_keeps_no_rows_without_one():
+    data, _ = noisy(4.0)
+    late = Preparation(delay=(0.1, -0.05)).apply(data).dataset
+    assert late.time[0] == pytest.approx(0.05)
+    assert late.time[-1] == pytest.approx(data.time[-1] - 0.1)
+    np.testing.assert_allclose(late.u[:, 0], data.u[75:, 0][: len(late)], atol=1e-9)
+    np.testing.assert_allclose(late.u[:, 1], data.u[: len(late), 1], atol=1e-9)
+
+
+def test_rows_that_no_longer_carry_the_motion_are_warned_of():
+    data, _ = noisy(4.0)
+    with pytest.warns(DataWarning, match=r"every 50. row is 10 Hz.*the filter passes 12 Hz"):
+        Preparation(cutoff=12.0, every=50).apply(data)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"cutoff": -1.0}, "cutoff is -1.0; give a frequency > 0 in Hz"),
+        ({"cutoff": "automatic"}, "cutoff is 'automatic'"),
+        ({"order": 0}, "order is 0"),
+        ({"delay": "soon"}, "delay is 'soon'; give seconds"),
+        ({"delay": (0.1, np.nan)}, "delay is"),
+        ({"every": 0}, "every is 0; it must be an integer of at least 1"),
+        ({"trim": -1.0}, "trim is -1.0"),
+        ({"differentiate": "u"}, "allowed: 'q' or 'v'"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong, message):
+    with pytest.raises(InvalidInput, match=message):
+        inspect.unwrap(Preparation)(**wrong)
+
+
+def test_what_cannot_be_prepared_is_named():
+    data, _ = noisy(4.0)
+    with pytest.raises(InvalidInput, match="delay has 3 numbers; the dataset has 2 joints"):
+        Preparation(delay=(0.0, 0.0, 0.1)).apply(data)
+    with pytest.raises(DatasetError, match=r"episode 0 lasts 3.998 s; nothing is left of it after 2.5 s are trimmed"):
+        Preparation(trim=2.5).apply(data)
+    with pytest.raises(InvalidInput, match="automatic cut-off or delay is not known"):
+        _ = Preparation(cutoff="auto").halo
+    assert Preparation(cutoff="auto").resolved(data).halo > 0.1
