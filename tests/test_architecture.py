@@ -22,6 +22,7 @@ ROOMS = {
     "robots": {"errors", "native_code"},
     "mechanics": {"errors", "robots"},
     "data": {"errors", "robots", "mechanics"},
+    "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
     "priors": {"errors", "robots", "mechanics"},
     "inference": {"errors", "native_code"},
@@ -50,6 +51,8 @@ IMPORTED_WHERE_USED = {
     "matplotlib": set(),
     "joblib": set(),
     "ray": set(),
+    "pyarrow": set(),
+    "rosbags": set(),
     "tyro": {"cli"},
     "rich": {"cli"},
 }

@@ -16,6 +16,7 @@ from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
+from forcegp.cli.import_log import Import
 from forcegp.cli.reproduce import Reproduce
 from forcegp.cli.rollout import Rollout
 from forcegp.cli.simulate import Simulate
@@ -37,6 +38,7 @@ Every command has --help, --json and --debug. forcegp --version tells the versio
 COMMANDS: dict[str, tuple[type[Command], str]] = {
     "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
     "simulate": (Simulate, "make a dataset with ground truth"),
+    "import": (Import, "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot"),
     "fit": (Fit, "learn the unknown forces from a dataset"),
     "compare": (Compare, "which kind of unknown force the data support"),
     "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),

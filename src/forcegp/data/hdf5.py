@@ -21,6 +21,7 @@ from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
 FORMAT = "forcegp-dataset"
 VERSION = 1
 
+COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _TEXT = h5py.string_dtype("utf-8")
 _LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that claims more holds no such data
 
@@ -30,14 +31,23 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
 
     Raises InvalidInput if the folder does not exist or `path` is a folder.
     """
+    with file_written_whole(path) as temporary, h5py.File(temporary, "x") as file:
+        _write(fields, file)
+
+
+@contextlib.contextmanager
+def file_written_whole(path: Path) -> Iterator[Path]:
+    """A path beside `path` to write a file at: it takes the place of `path` at the end, and vanishes on failure.
+
+    Raises InvalidInput if the folder does not exist or `path` is a folder.
+    """
     if not path.parent.is_dir():
         raise InvalidInput(f"cannot write {path}: the folder {path.parent} does not exist; create it first.")
     if path.is_dir():
         raise InvalidInput(f"cannot write {path}: it is a folder; give a file name.")
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
     try:
-        with h5py.File(temporary, "x") as file:
-            _write(fields, file)
+        yield temporary
         temporary.replace(path)
     except BaseException:  # also KeyboardInterrupt: nothing half-written may stay
         temporary.unlink(missing_ok=True)
@@ -65,27 +75,31 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _write(fields: Mapping[str, Any], file: h5py.File) -> None:
-    file.attrs["format"] = FORMAT
-    file.attrs["format_version"] = VERSION
-    file.attrs["written_by"] = f"forcegp {__version__}"
-    file.attrs["time_ordered"] = fields["time_ordered"]
     for name in ("q", "v", "u", "a", "time", "episode"):
         _put(file, name, fields[name])
-    for name, unit in fields["units"].items():
-        file[name].attrs.create("units", unit, dtype=_TEXT)
-    file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
     if fields["noise_std"] is not None:
         _put(file, "noise_std", fields["noise_std"])
     for name, values in fields["truth"].items():
         _put(file, f"truth/{name}", values)
+    describe(fields, file)
+
+
+def describe(fields: Mapping[str, Any], file: h5py.File) -> None:
+    """Write what is no array of numbers; those whose units are stated must be in the file."""
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = VERSION
+    file.attrs["written_by"] = f"forcegp {__version__}"
+    file.attrs["time_ordered"] = fields["time_ordered"]
+    for name, unit in fields["units"].items():
+        file[name].attrs.create("units", unit, dtype=_TEXT)
+    file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
     file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
     if fields["system"] is not None:
         file.create_dataset("system", data=fields["system"].to_json(), dtype=_TEXT)
 
 
 def _put(file: h5py.File, name: str, values: np.ndarray) -> None:
-    compression = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size else {}
-    file.create_dataset(name, data=values, **compression)
+    file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
 
 
 def _check_header(path: Path, file: h5py.File) -> None:

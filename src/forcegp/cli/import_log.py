@@ -1,0 +1,219 @@
+"""`forcegp import`: logs of any format become one dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.command import Debug, Json
+from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import require_free_file
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.mechanics import MechanicalSystem
+    from forcegp.recordings import ColumnMapping
+
+Columns = Annotated[str | None, arg(metavar="COLUMNS", constructor=str, help_behavior_hint="(default: by the names)")]
+Text = Annotated[str | None, arg(metavar="TEXT", constructor=str, help_behavior_hint="(default: none)")]
+Seconds = Annotated[float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: all)")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import(RobotOptions):
+    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
+
+    Say which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or in
+    a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
+    pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered: forcegp prepare does that.
+
+    For instance:
+      forcegp import run.csv --time t --q pos{1..2} --u tau{1..2} --robot arm.urdf --out log.h5
+      forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
+      forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
+    """
+
+    logs: Positional[Annotated[tuple[Path, ...], arg(metavar="LOG...")]]
+    """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
+    out: Annotated[Path, arg(metavar="FILE.h5")]
+    """The dataset to write (HDF5)."""
+    mapping: Annotated[
+        Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: beside)")
+    ] = None
+    """What the columns mean; flags replace what it says. Default: log.yaml or forcegp.yaml beside the log."""
+    write_mapping: Annotated[
+        Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: no)")
+    ] = None
+    """Write what flags and --mapping said together."""
+    time: Columns = None
+    """Time stamps."""
+    step: Seconds = None
+    """Seconds between two rows, for a log without time stamps."""
+    q: Columns = None
+    """Positions, one per joint."""
+    v: Columns = None
+    """Velocities. Default: as named after the joints, else central differences of q."""
+    u: Columns = None
+    """Forces or torques of the actuators; a constant such as 0 is for all joints."""
+    a: Columns = None
+    """Accelerations. Default: central differences of v."""
+    joints: Text = None
+    """Names of the joints in the order of the columns. Default: those of --robot."""
+    unit: Text = None
+    """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm."""
+    sign: Text = None
+    """1 or -1 per joint, for all signals (--sign=1,-1) or for one (u=-1)."""
+    scale: Text = None
+    """A factor, for instance u=0.1 for all joints or u=0.1,0.2."""
+    offset: Text = None
+    """What is added at last, in SI: q=0,1.5708."""
+    episode: Text = None
+    """A column that numbers the episodes."""
+    episodes: Text = None
+    """A pattern for arrays or groups of one file, each of which is an episode: piece*, data/demo_*."""
+    headerless: Text = None
+    """Text without names of columns: how many numbers make a row, for all files or for each: 1,7,7."""
+    delimiter: Annotated[
+        str | None,
+        arg(metavar="comma|tab|semicolon|blanks|LETTER", constructor=str, help_behavior_hint="(default: told)"),
+    ] = None
+    """What separates the columns of a text."""
+    side_by_side: bool = False
+    """The files are one recording, with a signal in each; columns are called FILE:column."""
+    gap: Annotated[
+        float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: 10 median steps)")
+    ] = None
+    """A longer pause begins another episode."""
+    resample: Literal["auto", "no"] = "auto"
+    """auto: rows at uneven times are given even ones by a cubic spline. no: every stamp is kept."""
+    rate: Annotated[float | None, arg(metavar="HZ", constructor=float, help_behavior_hint="(default: the median)")] = (
+        None
+    )
+    """Of the even times."""
+    start: Seconds = None
+    """Leave out what comes earlier, in seconds from the first row of each episode."""
+    end: Seconds = None
+    """Leave out what comes later."""
+    unwrap: bool = False
+    """Continue angles that jump by a turn."""
+    beyond_limits: bool = False
+    """Accept positions beyond the limits of the URDF."""
+    max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
+    """Refuse a log with more rows."""
+    overwrite: bool = False
+    """Replace the files if they exist."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Read, check and write."""
+        if not self.logs:
+            raise InvalidInput("give at least one log.")
+        require_free_file(self.out, overwrite=self.overwrite)
+        if self.write_mapping is not None:
+            require_free_file(self.write_mapping, overwrite=self.overwrite)
+        from forcegp.data.whole_files import write_text
+        from forcegp.recordings import ImportOptions, import_recordings, mapping_text
+
+        mapping = self._mapping(terminal)
+        options = ImportOptions(
+            gap=self.gap,
+            resample=self.resample,
+            rate=self.rate,
+            start=self.start,
+            end=self.end,
+            unwrap=self.unwrap,
+            beyond_limits=self.beyond_limits,
+            most_rows=self.max_rows,
+        )
+        with terminal.progress("importing") as report:
+            done = import_recordings(
+                self.logs, self.out, mapping, system=self._system(), options=options, report=report
+            )
+        if self.write_mapping is not None:
+            write_text(self.write_mapping, mapping_text(mapping))
+        _tell(terminal, self.out, done)
+        return {"out": str(self.out), **done}
+
+    def _system(self) -> MechanicalSystem | None:
+        """The robot of the options, with the known forces of --identified if that was given."""
+        found = self._identified_system()
+        if found is not None:
+            return found
+        robot = self.chosen_robot()
+        if robot is None:
+            return None
+        from forcegp.mechanics import MechanicalSystem
+
+        return MechanicalSystem(robot)
+
+    def _mapping(self, terminal: Terminal) -> ColumnMapping:
+        """That of the file, changed by the flags."""
+        from forcegp.recordings import ColumnMapping, read_mapping
+        from forcegp.recordings.mapping_file import beside
+
+        path = self.mapping
+        if path is None:
+            found = {beside(log) for log in self.logs} - {None}
+            if len(found) > 1:
+                raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); say --mapping.")
+            path = next(iter(found), None)
+            if path is not None:
+                terminal.note(f"the columns are mapped by {path}")
+        stored = ColumnMapping() if path is None else read_mapping(path)
+        return stored.changed_by(self._flags())
+
+    def _flags(self) -> ColumnMapping:
+        from forcegp.recordings.delimited_text import DELIMITERS
+        from forcegp.recordings.mapping_file import by_quantity, factors_of, mapping_of
+
+        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes")
+        given: dict[str, Any] = {name: getattr(self, name) for name in names}
+        given["side_by_side"] = self.side_by_side
+        if self.delimiter is not None:
+            given["delimiter"] = DELIMITERS.get(self.delimiter, self.delimiter)
+        if self.headerless is not None:
+            words = self.headerless.split(",")
+            if not all(word.strip().isdigit() for word in words):
+                raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
+            given["headerless"] = [int(word) for word in words]
+        if self.unit is not None:
+            given["unit"] = by_quantity("unit", self.unit)
+        for name in ("sign", "scale", "offset"):
+            text = getattr(self, name)
+            if text is not None:
+                given[name] = factors_of(name, text)
+        return mapping_of(given)
+
+
+def _list(paths: set[Path | None]) -> str:
+    return ", ".join(sorted(str(path) for path in paths))
+
+
+def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
+    """What was guessed, repaired and left out, and what came out."""
+    for found in done["guessed"]:
+        terminal.note(f"found by name: {found}")
+    for recording in done["recordings"]:
+        told = list(recording["notes"])
+        if recording["repeated_stamps_dropped"]:
+            told.append(f"{recording['repeated_stamps_dropped']} rows with a repeated time stamp dropped")
+        if recording["gaps"]:
+            told.append(f"{len(recording['gaps'])} gaps of up to {max(recording['gaps']):.4g} s begin new episodes")
+        if recording["rows_in_stretches_too_short"]:
+            told.append(f"{recording['rows_in_stretches_too_short']} rows in stretches of fewer than 5 left out")
+        if told:
+            terminal.note(f"{recording['name']}: {'; '.join(told)}")
+    if done["resampled_to_step"] is not None:
+        worst = max(recording["largest_deviation_of_a_step"] for recording in done["recordings"])
+        terminal.note(
+            f"resampled to {1 / done['resampled_to_step']:.6g} Hz: steps deviate by up to {worst:.0%} from their median"
+        )
+    how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
+    seconds = sum(recording["rows"] * recording["median_step"] for recording in done["recordings"])
+    terminal.say(f"{out}: {done['rows']} rows in {len(done['episodes'])} episodes ({seconds:.4g} s); {how}")

@@ -1,0 +1,129 @@
+"""Files that hold arrays by name: which of them are columns, and how several become one table."""
+
+from __future__ import annotations
+
+import fnmatch
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from typing_extensions import override
+
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, as_column, element_names
+
+SEPARATOR = "/"
+
+
+class ArrayFile(Source):
+    """Arrays (rows,) and (rows, k) by name; the latter are the columns `name[0] ... name[k-1]`.
+
+    With `within`, only what is under that name counts, and names begin after it: a file with one array or one group per
+    episode is read as one table per episode. An array by itself is then `[0] ... [k-1]`.
+    Subclasses say which arrays there are (`shapes`) and give them in pieces (`blocks`).
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    def __init__(self, path: Path, *, within: str | None = None) -> None:
+        super().__init__(path)
+        self.within = within
+
+    @abstractmethod
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Every array of numbers by its full name; raises FileFormatError for a file that cannot be read."""
+
+    @abstractmethod
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        """The array of that full name in pieces of exactly `rows` rows, but for the last."""
+
+    def episodes(self, pattern: str) -> list[str]:
+        """Names of arrays or groups that a pattern such as `piece*` or `data/demo_*` matches, in the order of numbers.
+
+        Raises InvalidInput if there is none.
+        """
+        depth = pattern.count(SEPARATOR) + 1
+        names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.shapes())
+        found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+        if not found:
+            raise InvalidInput(f"no array or group of {self.path} matches {pattern!r}; it has {_some(list(names))}.")
+        return sorted(found, key=_by_numbers)
+
+    @cached_property
+    def _places(self) -> dict[str, tuple[str, int | None]]:
+        """Column -> (full name of its array, column in it)."""
+        places: dict[str, tuple[str, int | None]] = {}
+        for full, shape in self.shapes().items():
+            name = self._name_within(full)
+            if name is None or not shape or shape == (1,) or shape == (1, 1) or 0 in shape:
+                continue
+            if len(shape) == 1 or (len(shape) == 2 and shape[1] == 1 and name):
+                places[name or "[0]"] = (full, None if len(shape) == 1 else 0)
+            elif len(shape) == 2 and shape[1] <= LONGEST_VECTOR:
+                places |= {element: (full, index) for index, element in enumerate(element_names(name, shape[1]))}
+        if not places:
+            inside = f" under {self.within!r}" if self.within else ""
+            raise FileFormatError(
+                f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}; "
+                f"it has {_some(list(self.shapes()))}."
+            )
+        return places
+
+    def _name_within(self, full: str) -> str | None:
+        if self.within is None:
+            return full
+        if full == self.within:
+            return ""
+        return full.removeprefix(self.within + SEPARATOR) if full.startswith(self.within + SEPARATOR) else None
+
+    @override
+    def columns(self) -> tuple[str, ...]:
+        return tuple(self._places)
+
+    @override
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
+        self.require(names)
+        arrays = list(dict.fromkeys(self._places[name][0] for name in names))
+        shapes = self.shapes()
+        lengths = {shapes[array][0] for array in arrays}
+        if len(lengths) > 1:
+            told = ", ".join(f"{array} {shapes[array][0]}" for array in arrays)
+            raise FileFormatError(f"{self.path}: its arrays have different numbers of rows ({told}); map those of one.")
+        for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
+            tables = dict(zip(arrays, pieces, strict=True))
+            columns: Columns = {}
+            for name in names:
+                array, index = self._places[name]
+                columns[name] = as_column(tables[array] if index is None else tables[array][:, index])
+            yield columns
+
+
+def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
+    """Whether an array holds numbers; text is left out. Raises FileFormatError for Python objects, which are code."""
+    if dtype.hasobject:
+        raise FileFormatError(
+            f"{path}: {name!r} holds Python objects, which are never read because reading them runs code; "
+            "save it as an array of numbers."
+        )
+    return dtype.kind in "fiu"
+
+
+def _by_numbers(name: str) -> list[tuple[int, int, str]]:
+    """So that demo_10 comes after demo_9."""
+    parts, digits = [], ""
+    for letter in name + "\0":
+        if letter.isdigit():
+            digits += letter
+            continue
+        if digits:
+            parts.append((0, int(digits), ""))
+            digits = ""
+        parts.append((1, 0, letter))
+    return parts
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "") or "none"

@@ -1,0 +1,224 @@
+"""CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow in pieces."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from typing_extensions import override
+
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.recordings.source import Columns, Source, reading, require_distinct
+from forcegp.recordings.text_lines import CleanLines, opened
+
+BLOCK = 2**23
+"""Bytes that pyarrow parses at a time; no line may be longer."""
+
+BLANKS = "blanks"
+DELIMITERS = {"comma": ",", "tab": "\t", "semicolon": ";", "blanks": BLANKS}
+"""By the names that people may use for them."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
+_LONG_INTEGER = re.compile(r"\d{16,19}")
+_CONVERSION = re.compile(
+    r"In CSV column #(\d+): (?:Row #(\d+): )?CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
+)
+_RAGGED = re.compile(r"(?:Row #(\d+): )?Expected (\d+) columns, got (\d+)")
+
+
+class DelimitedText(Source):
+    """A table as text. The first line that is not a comment (#) names the columns, unless `headerless` says how many.
+
+    Parameters
+    ----------
+    path: .csv, .tsv, .txt or .dat, also with .gz.
+    headerless: number of columns of a file without a header; they are called c1, c2, ... Where every line holds one
+        number, so many lines make a row.
+    delimiter: ",", ";", tab, another single letter, or "blanks" for any run of them. Default: told from the
+        first lines.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    def __init__(self, path: Path, *, headerless: int | None = None, delimiter: str | None = None) -> None:
+        super().__init__(path)
+        if headerless is not None and headerless < 1:
+            raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
+        with reading(path, "text"), opened(path) as stream:
+            self._look(stream, headerless, delimiter)
+        self._long_integers = {
+            name for name, text in zip(self._columns, self._first, strict=False) if _LONG_INTEGER.fullmatch(text)
+        }
+
+    def _look(self, stream, headerless: int | None, delimiter: str | None) -> None:
+        """Find header, delimiter, number of lines before the first row, and whether there are comments."""
+        lines, comments, skipped = [], [], 0
+        first = stream.peek(1)
+        for raw in stream.peek(len(first)).splitlines(keepends=True):
+            text = raw.decode("utf-8", "replace").lstrip("\ufeff").strip("\r\n")
+            if text.lstrip().startswith("#"):
+                comments.append(text.lstrip()[1:].strip())
+            elif text.strip():
+                lines.append(text)
+            if not lines:
+                skipped += 1
+            if len(lines) == 2:
+                break
+        if not lines:
+            raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
+        self._comments = bool(comments)
+        self._delimiter = delimiter or _told(lines, self.path)
+        self._lines_before = skipped
+        fields = self._fields(lines[0])
+        self._lines_per_row = 1
+        if headerless is not None:
+            self._without_header(fields, headerless)
+        elif all(_NUMBER.fullmatch(field) for field in fields):
+            named = self._fields(comments[-1]) if comments else []
+            if len(named) != len(fields):
+                raise FileFormatError(
+                    f"{self.path} begins with numbers, not with names of columns; add --headerless {len(fields)}, "
+                    "or how many numbers make a row where every line holds one."
+                )
+            self._columns, self._first = named, fields
+        else:
+            self._columns = [name or f"column{index + 1}" for index, name in enumerate(fields)]
+            self._first = self._fields(lines[1]) if len(lines) > 1 else []
+            self._lines_before += 1
+            if not self._first:
+                raise FileFormatError(f"{self.path} has a header but no rows.")
+        require_distinct(self.path, self._columns)
+
+    def _without_header(self, fields: list[str], width: int) -> None:
+        if not all(_NUMBER.fullmatch(field) for field in fields):
+            raise FileFormatError(f"{self.path} begins with {fields[0]!r}, which is no number; leave --headerless out.")
+        if len(fields) not in (1, width):
+            raise FileFormatError(
+                f"{self.path} has {len(fields)} numbers on its first line; --headerless says {width} in a row. "
+                "Either so many stand on every line, or one."
+            )
+        self._columns = [f"c{index + 1}" for index in range(width)]
+        self._lines_per_row = width // len(fields)
+        self._first = fields if len(fields) == width else []
+
+    def _fields(self, line: str) -> list[str]:
+        if self._delimiter == BLANKS:
+            return line.split()
+        row = next(csv.reader([line], delimiter=self._delimiter), [])
+        return [field.strip() for field in row]
+
+    @override
+    def columns(self) -> tuple[str, ...]:
+        return tuple(self._columns)
+
+    @override
+    def place(self, row: int) -> str:
+        if self._comments:
+            return super().place(row)
+        return f"row {row} (line {self._lines_before + row * self._lines_per_row + 1})"
+
+    @override
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
+        self.require(names)
+        try:
+            yield from self._read(names, rows, threads=True)
+        except FileFormatError as error:
+            if isinstance(error.__cause__, ValueError):  # pyarrow counts rows on one thread only
+                for _ in self._read(names, rows, threads=False):
+                    pass
+            raise
+
+    def _read(self, names: Sequence[str], rows: int, *, threads: bool) -> Iterator[Columns]:
+        import pyarrow as pa
+        from pyarrow import csv as arrow_csv
+
+        stacked = self._lines_per_row > 1
+        stored = ["c1"] if stacked else self._columns
+        kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}
+        wanted = stored if stacked else list(names)
+        stream = opened(self.path)
+        with stream, reading(self.path, "text"):
+            for _ in range(self._lines_before):
+                stream.readline()
+            blanks = self._delimiter == BLANKS
+            source = CleanLines(stream, blanks=blanks) if blanks or self._comments else stream
+            try:
+                batches = arrow_csv.open_csv(
+                    source,
+                    read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
+                    parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
+                    convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
+                )
+                columns = ({name: _numbers(batch.column(name)) for name in wanted} for batch in batches)
+                yield from _pieces(self._stacked(columns, names) if stacked else columns, rows)
+            except pa.ArrowInvalid as error:
+                raise self._told_by_pyarrow(error) from error
+
+    def _stacked(self, batches: Iterator[Columns], names: Sequence[str]) -> Iterator[Columns]:
+        """Rows from a file with one number per line."""
+        width, rest, count = self._lines_per_row, np.empty(0), 0
+        for batch in batches:
+            values = np.concatenate([rest, batch["c1"]])
+            count += len(batch["c1"])
+            whole = len(values) - len(values) % width
+            table, rest = values[:whole].reshape(-1, width), values[whole:]
+            yield {name: np.ascontiguousarray(table[:, self._columns.index(name)]) for name in names}
+        if rest.size:
+            raise FileFormatError(
+                f"{self.path} has {count} numbers, which is no multiple of {width}; another --headerless may be right, "
+                "or the file is truncated."
+            )
+
+    def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
+        text = str(error)
+        converted, ragged = _CONVERSION.search(text), _RAGGED.search(text)
+        if converted:
+            column, row, value = converted.groups()
+            name = "c1" if self._lines_per_row > 1 else self._columns[int(column)]
+            where = f" at {self._line(int(row))}" if row else ""
+            return FileFormatError(
+                f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. Repair or remove that row."
+            )
+        if ragged:
+            row, expected, found = ragged.groups()
+            where = f"{self._line(int(row))} has" if row else "one row has"
+            return FileFormatError(
+                f"{self.path}: {where} {found} fields instead of {expected}. Repair or remove it "
+                "(the end of a log is often cut)."
+            )
+        return FileFormatError(f"{self.path} cannot be read as text: {text}")
+
+    def _line(self, number: int) -> str:
+        """Where a line stands that pyarrow counts from 1."""
+        row = (number - 1) // self._lines_per_row
+        return self.place(row)
+
+
+def _numbers(column) -> np.ndarray:
+    if column.null_count:  # an empty field is a missing value; where and what is said by who uses it
+        return column.to_numpy(zero_copy_only=False).astype(np.float64)
+    return column.to_numpy(zero_copy_only=True)
+
+
+def _pieces(batches: Iterator[Columns], rows: int) -> Iterator[Columns]:
+    for batch in batches:
+        length = len(next(iter(batch.values())))
+        for start in range(0, length, rows):
+            yield {name: values[start : start + rows] for name, values in batch.items()}
+
+
+def _told(lines: Sequence[str], path: Path) -> str:
+    """The delimiter that stands equally often in the header and in the first row."""
+    for letter in ("\t", ",", ";"):
+        counts = {line.count(letter) for line in lines}
+        if letter in lines[0] and (len(counts) == 1 or letter == ","):
+            return letter
+    if all(len(line.split()) == len(lines[0].split()) for line in lines) and len(lines[0].split()) > 1:
+        return BLANKS
+    if any(letter in lines[0] for letter in ";|") or len(lines[0].split()) > 1:
+        raise FileFormatError(f"{path}: cannot tell what separates its columns; add --delimiter.")
+    return ","

@@ -1,0 +1,92 @@
+"""Which reader reads which file: `open_source`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.recordings.array_file import ArrayFile
+from forcegp.recordings.delimited_text import DelimitedText
+from forcegp.recordings.hdf5_arrays import HDF5Arrays
+from forcegp.recordings.lerobot import INFO, LeRobotFolder
+from forcegp.recordings.matlab import matlab_file
+from forcegp.recordings.numpy_archive import NumpyArchive
+from forcegp.recordings.parquet import ParquetFile
+from forcegp.recordings.ros_bag import RosBag
+from forcegp.recordings.source import Source
+
+TEXT = (".csv", ".tsv", ".txt", ".dat")
+ARRAYS: dict[str, Callable[..., ArrayFile]] = {
+    ".npz": NumpyArchive,
+    ".mat": matlab_file,
+    ".h5": HDF5Arrays,
+    ".hdf5": HDF5Arrays,
+}
+TABLES: dict[str, Callable[[Path], Source]] = {
+    ".parquet": ParquetFile,
+    ".pq": ParquetFile,
+    ".bag": RosBag,
+    ".mcap": RosBag,
+    ".db3": RosBag,
+}
+"""A new format is a subclass of `Source`, and an entry here (or in `ARRAYS`) with its extension."""
+
+READABLE = ", ".join([*(f"{name}[.gz]" for name in TEXT), *TABLES, *ARRAYS]) + ", folders of ROS 2 bags and of LeRobot"
+PICKLES = {".pkl", ".pickle", ".npy", ".pt", ".pth", ".joblib"}
+
+
+def open_source(
+    path: Path, *, headerless: int | None = None, delimiter: str | None = None, within: str | None = None
+) -> Source:
+    """The reader for a log, chosen by its extension or, for a folder, by what is in it.
+
+    Parameters: `headerless` and `delimiter` as for `DelimitedText`, `within` as for `ArrayFile`.
+    Raises FileFormatError for what cannot be read, InvalidInput for parameters that mean nothing to the format.
+    """
+    kind = _kind(path)
+    if kind not in TEXT and (headerless or delimiter):
+        raise InvalidInput(f"--headerless and --delimiter mean nothing to {path}; they are for text files.")
+    if kind not in ARRAYS and within is not None:
+        raise InvalidInput(f"--episodes means nothing to {path}; it is for {', '.join(ARRAYS)} files.")
+    if kind in TEXT:
+        return DelimitedText(path, headerless=headerless, delimiter=delimiter)
+    if kind in ARRAYS:
+        if kind != ".npz" and h5py.is_hdf5(path):
+            _require_foreign(path)
+        return ARRAYS[kind](path, within=within)
+    return LeRobotFolder(path) if kind == "lerobot" else RosBag(path) if kind == "ros2" else TABLES[kind](path)
+
+
+def _kind(path: Path) -> str:
+    """The extension without .gz, "lerobot" or "ros2"."""
+    if path.is_dir():
+        if (path / INFO).is_file():
+            return "lerobot"
+        if (path / "metadata.yaml").is_file():
+            return "ros2"
+        raise FileFormatError(
+            f"{path} is a folder, but neither a ROS 2 bag (metadata.yaml) nor a LeRobot dataset (meta/info.json); "
+            "give the files in it."
+        )
+    if not path.is_file():
+        raise FileFormatError(f"{path} does not exist; give the path of a log.")
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    kind = suffixes[-1] if suffixes else ""
+    if kind == ".gz" and suffixes[-2:-1] and suffixes[-2] in TEXT:
+        kind = suffixes[-2]
+    if kind in PICKLES:
+        raise FileFormatError(f"{path} may hold Python objects, and reading those runs code; save arrays as .npz.")
+    if kind not in (*TEXT, *ARRAYS, *TABLES):
+        raise FileFormatError(f"{path}: the extension {kind or 'of no name'!r} is not known. Readable: {READABLE}.")
+    if path.stat().st_size == 0:
+        raise FileFormatError(f"{path} is empty; give a log with rows.")
+    return kind
+
+
+def _require_foreign(path: Path) -> None:
+    with h5py.File(path, "r") as file:
+        if file.attrs.get("format") == "forcegp-dataset":
+            raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")

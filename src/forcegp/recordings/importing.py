@@ -1,0 +1,263 @@
+"""`import_recordings`: from log files to one dataset file, whatever their format and size."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from forcegp.data.dataset_writer import DatasetWriter
+from forcegp.errors import DatasetError, DataWarning, InvalidInput
+from forcegp.recordings.array_file import ArrayFile
+from forcegp.recordings.episode_rows import EpisodeRows
+from forcegp.recordings.formats import open_source
+from forcegp.recordings.mapping import ColumnMapping
+from forcegp.recordings.plausibility import require_plausible_positions, warn_of_implausible_forces
+from forcegp.recordings.reading import RawRecording, read_recording
+from forcegp.recordings.side_by_side import SideBySide
+from forcegp.recordings.signal_plan import SignalPlan, signal_plan
+from forcegp.recordings.source import Source
+from forcegp.recordings.spool import Spool
+from forcegp.recordings.time_stamps import Stamps, read_stamps
+
+if TYPE_CHECKING:
+    from forcegp.mechanics import MechanicalSystem
+
+ROUND_RATE = 1e-3
+"""A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """How stamps become rows.
+
+    Fields
+    ------
+    gap: seconds between two rows that begin another episode; None for ten median steps.
+    resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
+    rate: of the even times in Hz, instead of the median.
+    start, end: seconds from the first row of each episode that are kept.
+    unwrap: continue positions of turning joints that jump by a turn.
+    beyond_limits: accept positions beyond the limits of the URDF.
+    most_rows: of one recording.
+
+    Raises InvalidInput for numbers that make no sense.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    gap: float | None = None
+    resample: Literal["auto", "no"] = "auto"
+    rate: float | None = None
+    start: float | None = None
+    end: float | None = None
+    unwrap: bool = False
+    beyond_limits: bool = False
+    most_rows: int = 100_000_000
+
+    def __post_init__(self) -> None:
+        for name in ("gap", "rate"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < float("inf"):
+                raise InvalidInput(f"{name} is {value}; it must be positive and finite.")
+        if self.rate is not None and self.resample == "no":
+            raise InvalidInput("a rate asks for resampling; leave out --rate or --resample no.")
+        if self.start is not None and self.end is not None and not self.start < self.end:
+            raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
+        if self.most_rows < 1:
+            raise InvalidInput(f"max-rows is {self.most_rows}; it must be at least 1.")
+
+
+def import_recordings(
+    paths: Sequence[Path],
+    out: Path,
+    mapping: ColumnMapping,
+    *,
+    system: MechanicalSystem | None = None,
+    options: ImportOptions | None = None,
+    report: Report = lambda done, total, note: None,
+) -> dict[str, Any]:
+    """Write the dataset that these logs hold and return what was done, which is also `metadata["import"]`.
+
+    Each log is at least one episode; gaps and the episode numbers of a log make more. A log is read once, piece by
+    piece, and set aside in a temporary file beside `out` as float64, so that memory holds the time stamps only.
+
+    Raises FileFormatError, DatasetError and InvalidInput naming file, column, row, time and remedy; then nothing is
+    written. Warns (DataWarning) of what can be used but looks mistaken.
+    """
+    options = options or ImportOptions()
+    robot = None if system is None else system.robot
+    sources = _sources(paths, mapping)
+    plans = [signal_plan(mapping, source, robot) for _, source in sources]
+    plan = plans[0]
+    for (label, _), other in zip(sources, plans, strict=True):
+        if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):
+            raise InvalidInput(
+                f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
+            )
+    steps = 2 * len(sources)
+    with Spool(out.parent, len(plan.signals)) as spool:
+        recordings = []
+        for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
+            report(index, steps, f"reading {label}")
+            recordings.append(_read(source, own, spool, label, mapping, system, options))
+        stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
+        step = _even_step(stamps, options)
+        episodes = _without_jumps([rows for own in stamps for rows in _rows_of(own, plan, step, options)])
+        done = _what_was_done(paths, mapping, plan, recordings, stamps, step, options, sources)
+        with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
+            for number, rows in enumerate(episodes):
+                report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
+                before = writer.rows
+                for piece in rows.pieces(spool):
+                    writer.append(**piece, episode=number)
+                done["episodes"].append(_episode(rows, writer.rows - before))
+            done["rows"] = writer.rows
+            writer.finish({"import": done})
+    return done
+
+
+def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:
+    """Label and table of every recording."""
+    widths = mapping.headerless
+    if len(widths) not in (0, 1, len(paths)):
+        raise InvalidInput(f"headerless has {len(widths)} numbers for {len(paths)} files; give one, or one per file.")
+
+    def opened(index: int, within: str | None = None) -> Source:
+        width = widths[index if len(widths) > 1 else 0] if widths else None
+        return open_source(paths[index], headerless=width, delimiter=mapping.delimiter, within=within)
+
+    if mapping.side_by_side:
+        if mapping.episodes is not None:
+            raise InvalidInput("files side by side are one recording; leave --episodes out.")
+        together = SideBySide([opened(index) for index in range(len(paths))])
+        return [(str(together.path), together)]
+    found: list[tuple[str, Source]] = []
+    for index, path in enumerate(paths):
+        if mapping.episodes is None:
+            found.append((str(path), opened(index)))
+            continue
+        whole = open_source(path, within="")
+        assert isinstance(whole, ArrayFile), "open_source refuses `within` for other formats"
+        found += [(f"{path}: {name}", opened(index, name)) for name in whole.episodes(mapping.episodes)]
+    return found
+
+
+def _read(
+    source: Source,
+    plan: SignalPlan,
+    spool: Spool,
+    label: str,
+    mapping: ColumnMapping,
+    system: MechanicalSystem | None,
+    options: ImportOptions,
+) -> RawRecording:
+    robot = None if system is None else system.robot
+    recording = read_recording(source, plan, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
+    if not options.beyond_limits:
+        require_plausible_positions(recording, plan, robot, stated="q" in mapping.unit)
+    warn_of_implausible_forces(recording, plan, robot)
+    return recording
+
+
+def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
+    """The step of even times that all episodes get, or None if every stamp stays."""
+    median = float(np.median(np.concatenate([own.steps for own in stamps])))
+    if options.rate is not None:
+        if options.rate < 0.9 / median:
+            warnings.warn(
+                f"--rate {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
+                "of that appears as slow motion. Filter first: forcegp prepare --cutoff --every.",
+                DataWarning,
+                stacklevel=3,
+            )
+        return 1.0 / options.rate
+    alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in stamps)
+    if options.resample == "no" or (alike and all(own.even for own in stamps)):
+        return None
+    rate = float(f"{1 / median:.3g}")
+    return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
+
+
+def _rows_of(stamps: Stamps, plan: SignalPlan, step: float | None, options: ImportOptions) -> list[EpisodeRows]:
+    nv = len(plan.joints)
+    return [EpisodeRows(stretch, stamps.kept, plan.logged, nv, step) for stretch in stamps.stretches]
+
+
+def _without_jumps(episodes: list[EpisodeRows]) -> list[EpisodeRows]:
+    """Refuse positions that jump by a turn inside an episode: derivatives would take it for motion."""
+    for rows in episodes:
+        stretch = rows.stretch
+        recording = stretch.recording
+        for row, item in recording.jumps:
+            if stretch.start < row < stretch.end:
+                raise DatasetError(
+                    f"{recording.label}: q of joint {item.joint!r} jumps by more than half a turn at "
+                    f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
+                    "is in degrees. Add --unwrap, or --unit q=deg."
+                )
+    return episodes
+
+
+def _episode(rows: EpisodeRows, count: int) -> dict[str, Any]:
+    recording = rows.stretch.recording
+    begin = recording.time[rows.stretch.start]
+    return {
+        "recording": recording.label,
+        "number": rows.stretch.number,
+        "row": rows.stretch.start,
+        "begin": recording.begin + float(begin),
+        "rows": count,
+    }
+
+
+def _what_was_done(
+    paths: Sequence[Path],
+    mapping: ColumnMapping,
+    plan: SignalPlan,
+    recordings: Sequence[RawRecording],
+    stamps: Sequence[Stamps],
+    step: float | None,
+    options: ImportOptions,
+    sources: Sequence[tuple[str, Source]],
+) -> dict[str, Any]:
+    files = dict.fromkeys(file for _, source in sources for file in source.files())
+    logged = {name: "logged" for name in plan.logged}
+    return {
+        "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
+        "mapping": mapping.plain(),
+        "guessed": list(plan.guessed),
+        "signals": {"v": "central differences of q", "a": "central differences of v"} | logged,
+        "recordings": [
+            {
+                "name": recording.label,
+                "rows": len(recording.time),
+                "median_step": own.step,
+                "largest_deviation_of_a_step": own.worst,
+                "repeated_stamps_dropped": own.repeated,
+                "gaps": list(own.gaps),
+                "rows_in_stretches_too_short": own.dropped_rows,
+                "notes": list(recording.source.notes()),
+            }
+            for recording, own in zip(recordings, stamps, strict=True)
+        ],
+        "resampled_to_step": step,
+        "unwrapped": options.unwrap,
+        "start": options.start,
+        "end": options.end,
+        "episodes": [],
+    }
+
+
+def _digest(path: Path) -> str:
+    if path.is_dir():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

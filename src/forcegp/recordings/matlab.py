@@ -1,0 +1,119 @@
+"""MATLAB files: versions 5 to 7 by scipy, version 7.3 (which is HDF5) by h5py."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import h5py
+import numpy as np
+from typing_extensions import override
+
+from forcegp.errors import FileFormatError
+from forcegp.recordings.array_file import ArrayFile
+from forcegp.recordings.hdf5_arrays import HDF5Arrays
+from forcegp.recordings.size_limits import require_plausible_size
+from forcegp.recordings.source import reading
+
+WHAT = "a MATLAB file"
+NOT_NUMBERS = {"cell", "object", "opaque", "function", "unknown"}
+
+
+class MatlabHDF5(HDF5Arrays):
+    """A MATLAB file of version 7.3: HDF5 whose arrays lie column by column."""
+
+    transposed = True
+
+    @cached_property
+    def _arrays(self) -> dict[str, tuple[int, ...]]:
+        arrays = super()._arrays
+        cells = []
+        with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
+            cells = [name for name, item in file.items() if item.attrs.get("MATLAB_class", b"") == b"cell"]
+        if cells and not arrays:
+            raise _cell(self.path, cells[0])
+        return {name: _as_rows(shape) for name, shape in arrays.items()}
+
+    @override
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        yield from self._row_blocks(name, rows) if self._is_row(name) else super().blocks(name, rows)
+
+    def _is_row(self, name: str) -> bool:
+        with h5py.File(self.path, "r") as file:
+            return _is_row(tuple(reversed(file[name].shape)))  # type: ignore[union-attr]  # one of the arrays
+
+    def _row_blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
+            values = file[name][()].reshape(-1, 1)  # type: ignore[index]  # one of the arrays
+        yield from (values[start : start + rows] for start in range(0, len(values), rows))
+
+
+class MatlabFile(ArrayFile):
+    """A MATLAB file of version 5 to 7: its matrices, and those in structs, called `struct/field`.
+
+    Vectors may lie either way. scipy reads whole variables, so what these hold must fit into memory.
+    Raises FileFormatError for cells, which have no columns.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    @cached_property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        from scipy.io import loadmat, matlab
+
+        errors = (matlab.MatReadError, zlib.error, NotImplementedError, MemoryError, IndexError)
+        with reading(self.path, WHAT, *errors):
+            size = self.path.stat().st_size
+            for name, shape, kind in matlab.whosmat(str(self.path)):
+                require_plausible_size(self.path, repr(name), 8 * math.prod(shape), size)
+                if kind in NOT_NUMBERS:
+                    raise _cell(self.path, name)
+            content = loadmat(str(self.path), struct_as_record=True)
+        found: dict[str, np.ndarray] = {}
+        for name, value in content.items():
+            if not name.startswith("__"):
+                self._collect(name, value, found)
+        return found
+
+    def _collect(self, name: str, value: np.ndarray, found: dict[str, np.ndarray]) -> None:
+        if value.dtype.names and value.size == 1:
+            for field in value.dtype.names:
+                self._collect(f"{name}/{field}", value.ravel()[0][field], found)
+        elif value.dtype.hasobject:
+            raise _cell(self.path, name)
+        elif value.dtype.kind in "fiu":
+            found[name] = value.reshape(-1, 1) if _is_row(value.shape) else value
+
+    @override
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        return {name: values.shape for name, values in self._arrays.items()}
+
+    @override
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        values = self._arrays[name]
+        yield from (values[start : start + rows] for start in range(0, len(values), rows))
+
+
+def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:
+    """The reader for the version of a .mat file."""
+    kind = MatlabHDF5 if path.is_file() and h5py.is_hdf5(path) else MatlabFile
+    return kind(path, within=within)
+
+
+def _is_row(shape: tuple[int, ...]) -> bool:
+    return len(shape) == 2 and shape[0] == 1 and shape[1] > 1
+
+
+def _as_rows(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (shape[1], 1) if _is_row(shape) else shape
+
+
+def _cell(path: Path, name: str) -> FileFormatError:
+    return FileFormatError(
+        f"{path}: {name!r} is a cell, an object or an array of structs, which has no columns; "
+        "save matrices of numbers (cell2mat)."
+    )

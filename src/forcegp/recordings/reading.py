@@ -1,0 +1,190 @@
+"""One recording from a log into the spool: columns evaluated, checked for numbers that are none, and set aside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from forcegp.errors import DatasetError, FileFormatError
+from forcegp.recordings.signal_plan import JointSignal, SignalPlan
+from forcegp.recordings.source import Columns, Source
+from forcegp.recordings.spool import Spool
+
+ROWS_AT_A_TIME = 65536
+TURN = 2.0 * np.pi
+MOST_JUMPS = 1000
+"""That are remembered of one piece: the first one that matters is reported."""
+
+
+@dataclass(frozen=True)
+class RawRecording:
+    """What was read of one table.
+
+    Fields
+    ------
+    label: what people call it, a file or an array in it.
+    first: its first row in the spool.
+    time: (rows,) [s] from its first row on.
+    begin: what the log says at the first row, in s.
+    episodes: (n, 2) episode number of the log and row at which it begins; one row if the log numbers none.
+    lowest, highest: (signals,) of each signal of the plan, in SI.
+    jumps: rows before which a turning joint moves by more than half a turn, with the signal.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    label: str
+    source: Source
+    first: int
+    time: Float[np.ndarray, " rows"]
+    begin: float
+    episodes: Int[np.ndarray, "n 2"]
+    lowest: Float[np.ndarray, " signals"]
+    highest: Float[np.ndarray, " signals"]
+    jumps: tuple[tuple[int, JointSignal], ...]
+
+
+def read_recording(
+    source: Source,
+    plan: SignalPlan,
+    spool: Spool,
+    label: str,
+    *,
+    unwrap: bool,
+    most_rows: int,
+) -> RawRecording:
+    """Read a table once.
+
+    Raises FileFormatError and DatasetError naming the file, the row, the time and the column.
+    """
+    first = spool.rows
+    clock = _Clock(plan, source)
+    turns = _Turns(plan, unwrap)
+    times: list[np.ndarray] = []
+    episodes: list[tuple[int, int]] = []
+    lowest = np.full(len(plan.signals), np.inf)
+    highest = -lowest
+    rows = 0
+    for columns in source.chunks(plan.columns, ROWS_AT_A_TIME) if plan.columns else ():
+        count = len(next(iter(columns.values())))
+        if rows + count > most_rows:
+            raise FileFormatError(f"{label} has more than {most_rows} rows; allow more with --max-rows.")
+        times.append(clock.seconds(columns, rows, count))
+        table = np.empty((count, len(plan.signals)))
+        for index, item in enumerate(plan.signals):
+            table[:, index] = item.value(columns, count)
+        _require_finite(table, columns, plan, source, rows, times[-1])
+        if plan.episode is not None:
+            _note_episodes(columns[plan.episode], episodes, source, rows)
+        turns.follow(table, rows, restarts=[row - rows for _, row in episodes if row >= rows])
+        lowest, highest = np.minimum(lowest, table.min(axis=0)), np.maximum(highest, table.max(axis=0))
+        spool.append(table)
+        rows += count
+    if rows == 0:
+        raise FileFormatError(f"{label} has no rows; give a log with rows.")
+    begins = np.asarray(episodes or [(0, 0)], dtype=np.int64)
+    return RawRecording(
+        label, source, first, np.concatenate(times), clock.begin, begins, lowest, highest, tuple(turns.jumps)
+    )
+
+
+class _Clock:
+    """Seconds since the first row. Whole numbers are subtracted as such: a float64 has no epochs in ns to 1 ns."""
+
+    def __init__(self, plan: SignalPlan, source: Source) -> None:
+        self.plan, self.source = plan, source
+        self.origin: int | float | None = None
+        self.begin = 0.0
+
+    def seconds(self, columns: Columns, rows: int, count: int) -> np.ndarray:
+        plan = self.plan
+        if plan.time is None:
+            assert plan.step is not None
+            return np.arange(rows, rows + count) * plan.step
+        name = next(iter(plan.time.weights))
+        whole = plan.time.is_column and columns[name].dtype == np.int64
+        raw = columns[name] if whole else plan.time.value(columns, count)
+        if not whole and not np.isfinite(raw).all():
+            row = int(np.argmin(np.isfinite(raw)))
+            raise DatasetError(
+                f"{self.source.path}: column {name!r}, the time, is {_told(raw[row])} at "
+                f"{self.source.place(rows + row)}. Repair or remove that row."
+            )
+        if self.origin is None:
+            self.origin = raw[0]
+            self.begin = float(plan.time_unit.in_si(np.asarray([raw[0]], dtype=np.float64))[0])
+        return plan.time_unit.in_si((raw - self.origin).astype(np.float64))
+
+
+class _Turns:
+    """Positions of turning joints: where they step by more than half a turn, continued beyond it if asked for."""
+
+    def __init__(self, plan: SignalPlan, unwrap: bool) -> None:
+        self.plan = plan
+        self.unwrap = unwrap
+        self.columns = [i for i, item in enumerate(plan.signals) if item.signal == "q" and item.unit.si == "rad"]
+        self.last: np.ndarray | None = None
+        self.added = np.zeros(len(self.columns))
+        self.jumps: list[tuple[int, JointSignal]] = []
+
+    def follow(self, table: np.ndarray, rows: int, restarts: list[int]) -> None:
+        """Note jumps, or add whole turns to the positions in place; rows in `restarts` begin another episode."""
+        q = table[:, self.columns]
+        before = q[:1] if self.last is None else self.last[None, :]
+        steps = np.diff(np.concatenate([before, q]), axis=0)
+        steps[restarts] = 0.0
+        self.last = q[-1].copy()
+        jumps = np.abs(steps) > np.pi
+        if not self.unwrap:
+            found = np.argwhere(jumps)[:MOST_JUMPS]
+            self.jumps += [(rows + int(row), self.plan.signals[self.columns[index]]) for row, index in found]
+        elif jumps.any() or self.added.any():
+            added = np.cumsum(-np.round(steps / TURN) * jumps, axis=0) + self.added
+            self.added = added[-1].copy()
+            table[:, self.columns] = q + TURN * added
+
+
+def _require_finite(
+    table: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, rows: int, times: np.ndarray
+) -> None:
+    if np.isfinite(table).all():
+        return
+    row, index = (int(position) for position in np.argwhere(~np.isfinite(table))[0])
+    item: JointSignal = plan.signals[index]
+    wrong = [name for name in item.expression.weights if not np.isfinite(columns[name][row])]
+    name = wrong[0] if wrong else next(iter(item.expression.weights), "")
+    raise DatasetError(
+        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_told(columns[name][row])} at "
+        f"{source.place(rows + row)}, {times[row]:.6g} s from the start; {int((~np.isfinite(table)).sum())} such "
+        "values in this part. Repair or remove these rows, or map another column."
+    )
+
+
+def _told(value: float) -> str:
+    return "missing (empty or NaN)" if np.isnan(value) else f"{value}"
+
+
+def _note_episodes(column: np.ndarray, episodes: list[tuple[int, int]], source: Source, rows: int) -> None:
+    """Append (number, row) for every row at which another episode begins."""
+    numbers = np.asarray(column, dtype=np.float64)
+    if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
+        row = int(np.argmax(~np.isfinite(numbers) | (numbers != np.round(numbers))))
+        raise DatasetError(
+            f"{source.path}: the episode is {numbers[row]} at {source.place(rows + row)}, not a whole number."
+        )
+    starts = np.flatnonzero(np.diff(numbers)) + 1
+    if not episodes or episodes[-1][0] != int(numbers[0]):
+        starts = np.concatenate([[0], starts])
+    seen = {number for number, _ in episodes}
+    for start in starts:
+        number = int(numbers[start])
+        if number in seen:
+            raise DatasetError(
+                f"{source.path}: episode {number} begins again at {source.place(rows + int(start))}; rows of an "
+                "episode must lie together. Sort the log by episode and time."
+            )
+        seen.add(number)
+        episodes.append((number, rows + int(start)))

@@ -1,0 +1,128 @@
+"""`Source`: a log file as a table of named columns of numbers, read in pieces."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from forcegp.errors import FileFormatError, ForceGPError, unknown_name_message
+
+Columns = dict[str, np.ndarray]
+"""Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
+
+LONGEST_VECTOR = 4096
+"""Columns of a table in one array; wider ones are pictures and the like, not signals of joints."""
+
+ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
+
+
+class Source(ABC):
+    """One log: a table whose rows come one after the other in time.
+
+    A subclass reads one format. `columns` names every column of numbers; an array of `k` numbers per row is `k` columns
+    `name[0] ... name[k-1]`. `chunks` gives chosen columns in pieces, so that a file may be larger than the memory.
+    Nothing in a file is executed and no link to another file is followed.
+
+    Raises FileFormatError, with the path and what to do, from the constructor or from any method.
+    """
+
+    row_word: ClassVar[str] = "row"
+    """What one row is called in messages."""
+    suggested_time: ClassVar[str | None] = None
+    """The column that holds the time wherever this format is used, if there is one."""
+    suggested_episode: ClassVar[str | None] = None
+    """The column that numbers the episodes wherever this format is used, if there is one."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
+    def columns(self) -> tuple[str, ...]:
+        """The names of all columns, in the order of the file; not empty, no name twice."""
+
+    @abstractmethod
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
+        """The named columns in pieces of at most `rows` rows, in the order of the file; no piece is empty.
+
+        A value that is missing is NaN. Raises FileFormatError for a value that is no number.
+        """
+
+    @property
+    def vectors(self) -> Mapping[str, tuple[str, ...]]:
+        """Names that stand for several columns: `state` for `state[0], state[1], ...`."""
+        found: dict[str, list[str]] = {}
+        for name in self.columns():
+            element = ELEMENT.match(name)
+            if element:
+                found.setdefault(element["vector"], []).append(name)
+        return {name: tuple(elements) for name, elements in found.items()}
+
+    def time_beside(self, names: Sequence[str]) -> str | None:
+        """The column that is the time of these columns, if the format itself says so."""
+        return self.suggested_time
+
+    def files(self) -> tuple[Path, ...]:
+        """The files that this log consists of."""
+        return (self.path,)
+
+    def notes(self) -> tuple[str, ...]:
+        """What people should know about how the file was read; complete after the last piece."""
+        return ()
+
+    def place(self, row: int) -> str:
+        """Where a row stands, for messages: `row 17`, counted from 0."""
+        return f"{self.row_word} {row}"
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raises FileFormatError for a name that is no column."""
+        known = self.columns()
+        for name in names:
+            if name not in known:
+                raise FileFormatError(unknown_name_message("column", name, str(self.path), known))
+
+
+def require_distinct(path: Path, names: Sequence[str]) -> None:
+    """Refuse column names that repeat or are empty. Raises FileFormatError naming the column."""
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        places = [str(index + 1) for index, name in enumerate(names) if name == repeated[0]]
+        raise FileFormatError(
+            f"{path}: column name {repeated[0]!r} stands over columns {', '.join(places)}; "
+            "rename all but one in the header."
+        )
+
+
+def element_names(name: str, width: int) -> list[str]:
+    """`name[0] ... name[width-1]`."""
+    return [f"{name}[{index}]" for index in range(width)]
+
+
+def as_column(values: np.ndarray) -> np.ndarray:
+    """int64 for integers that fit, else float64."""
+    if values.dtype.kind in "iu" and values.dtype != np.uint64:
+        return np.ascontiguousarray(values, dtype=np.int64)
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+@contextmanager
+def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
+    """Turn what a library meets in a damaged file into a FileFormatError that names the path.
+
+    `what` says what the file should be ("a Parquet file"); `errors` are those of the library beyond the usual ones.
+    """
+    try:
+        yield
+    except ForceGPError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, *errors) as error:
+        told = " ".join(str(error).split()) or type(error).__name__
+        raise FileFormatError(
+            f"{path} cannot be read as {what}: {told.rstrip('.')}. It may be truncated or of another format; "
+            "copy or write it again."
+        ) from error

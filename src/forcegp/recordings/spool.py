@@ -1,0 +1,41 @@
+"""Rows set aside on the disk: read once from a log of any format, then again in any order."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import ClassVar, Self
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Spool:
+    """A table of float64 in a file without a name, which is gone with the process whatever ends it.
+
+    Rows are appended in blocks and read back by number; memory holds only what is read.
+    """
+
+    __no_type_check__: ClassVar[bool] = True
+
+    def __init__(self, folder: Path, width: int) -> None:
+        self.width = width
+        self.rows = 0
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # closed by __exit__
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def append(self, table: Float[np.ndarray, "rows width"]) -> None:
+        """Put rows at the end."""
+        self._file.write(np.ascontiguousarray(table, dtype=np.float64).data)
+        self.rows += len(table)
+
+    def read(self, start: int, end: int) -> Float[np.ndarray, "rows width"]:
+        """Rows start to end, the latter excluded, as an array of its own."""
+        self._file.seek(start * self.width * 8)
+        data = self._file.read((end - start) * self.width * 8)
+        return np.frombuffer(data, np.float64).reshape(-1, self.width)
