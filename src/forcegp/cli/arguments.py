@@ -20,6 +20,7 @@ from forcegp.cli.import_log import Import
 from forcegp.cli.reproduce import Reproduce
 from forcegp.cli.rollout import Rollout
 from forcegp.cli.simulate import Simulate
+from forcegp.cli.validate import Validate
 from forcegp.errors import InvalidInput
 
 DESCRIPTION = """Learn the forces that nobody modelled, inside the rigid-body dynamics that are known.
@@ -43,6 +44,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "compare": (Compare, "which kind of unknown force the data support"),
     "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
+    "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
     "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
 }

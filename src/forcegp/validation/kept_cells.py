@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -23,25 +24,32 @@ class KeptCells:
     folder: Path
 
     @classmethod
-    def open(cls, folder: Path, configuration: Mapping[str, Any]) -> KeptCells:
-        """The folder, made if it does not exist, for cells under this configuration.
+    def open(cls, folder: Path, configuration: Mapping[str, Any], *, overwrite: bool = False) -> KeptCells:
+        """The folder, made if it does not exist, for cells under this configuration; emptied of others to `overwrite`.
 
         Raises InvalidInput for a folder of something else or of another configuration, naming what differs.
         """
         kept, file = cls(folder), folder / CONFIGURATION
-        if file.exists():
-            kept._require_same(_read(file, f"choose another --out, or delete {folder}"), configuration)
-        elif folder.exists() and (not folder.is_dir() or any(not _is_own_start(entry) for entry in folder.iterdir())):
+        own = file.exists()
+        if own:
+            stored = _read(file, f"choose another --out, or delete {folder}")
+            kept._require_own(stored)
+            if not overwrite:
+                kept._require_same(stored["configuration"], configuration)
+                return kept
+            with kept.locked():
+                shutil.rmtree(folder / CELLS, ignore_errors=True)
+        elif folder.exists() and (not folder.is_dir() or not all(map(_is_own_start, folder.iterdir()))):
             raise InvalidInput(f"{folder} exists and was not written by `{KIND}`; choose another --out.")
-        else:
-            (folder / CELLS).mkdir(parents=True, exist_ok=True)
-            write_json(file, {"kind": KIND, "configuration": dict(configuration)})
+        (folder / CELLS).mkdir(parents=True, exist_ok=True)
+        write_json(file, {"kind": KIND, "configuration": dict(configuration)})
         return kept
 
-    def _require_same(self, stored: Mapping[str, Any], configuration: Mapping[str, Any]) -> None:
-        if stored.get("kind") != KIND:
+    def _require_own(self, stored: Mapping[str, Any]) -> None:
+        if stored.get("kind") != KIND or not isinstance(stored.get("configuration"), dict):
             raise InvalidInput(f"{self.folder} was not written by `{KIND}`; choose another --out.")
-        before = stored["configuration"]
+
+    def _require_same(self, before: Mapping[str, Any], configuration: Mapping[str, Any]) -> None:
         wanted = json.loads(json.dumps(configuration))
         differing = sorted(name for name in {*before, *wanted} if before.get(name) != wanted.get(name))
         if differing:

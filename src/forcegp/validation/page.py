@@ -8,6 +8,7 @@ from typing import Any
 
 from forcegp.evaluation.spreads import markdown_table, number, shown
 from forcegp.validation.figures import listed_units
+from forcegp.validation.verdicts import SCORES
 
 ALT_TEXTS = {
     "errors": "Errors of accelerations and in force space, by joint and model",
@@ -23,6 +24,7 @@ def page(document: Mapping[str, Any]) -> str:
     source = document["source"]
     parts = [f"# Validation{' of ' + source['title'] if source.get('title') else ''}", *_done(document)]
     parts += ["## Verdicts", _verdicts(document["verdicts"])]
+    parts += _against_baseline(document["against_baseline"])
     if finished:
         parts += ["## All joints", _overall(finished, document)]
         parts += [f"![{ALT_TEXTS[name]}]({name}.png)" for name in document["figures"]]
@@ -39,7 +41,7 @@ def page(document: Mapping[str, Any]) -> str:
 def _done(document: Mapping[str, Any]) -> list[str]:
     source, seeds = document["source"], len(document["seeds"])
     lines = [f"* Data: {line}" for line in source.get("data", [])]
-    lines += [f"* Preparation: {line}" for line in source.get("preparation", ["none stated"])]
+    lines += [f"* {line}" for line in document["preparation"]]
     for split in document["splits"]:
         sides = (
             f"{split['training_rows']} rows to learn from, {split['test_rows']} held out, {split['motions']} motions"
@@ -77,6 +79,45 @@ def _verdicts(found: Sequence[Mapping[str, Any]]) -> str:
         "other recordings."
     )
     return "\n".join(lines)
+
+
+def _against_baseline(found: Mapping[str, Any] | None) -> list[str]:
+    if found is None or not found["models"]:
+        return []
+    baseline, scores = found["baseline"], tuple(SCORES)
+    rows = []
+    for name, answers in found["models"].items():
+        given = [answers[score] for score in scores]
+        rows.append([name, *(_against(answer) for answer in given)])
+    told = []
+    for verdict, words in (("better", "Better than it by every score"), ("worse", "Worse than it by every score")):
+        names = [
+            name
+            for name, answers in found["models"].items()
+            if all(answer["verdict"] == verdict for answer in answers.values() if answer is not None)
+        ]
+        told.append(f"{words}: {', '.join(names) if names else 'none'}.")
+    never = [
+        name
+        for name, answers in found["models"].items()
+        if not any(answer["verdict"] == "better" for answer in answers.values() if answer is not None)
+    ]
+    told.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
+    header = ["model", *(f"{SCORES[score]}, {'minus' if score == 'nlpd' else 'times'}" for score in scores)]
+    text = f"Against {baseline}, with 95 % intervals; bold where the interval shows the model to be better."
+    return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(told)]
+
+
+def _against(answer: Mapping[str, Any] | None) -> str:
+    if answer is None:
+        return "–"
+    sign = "+" if answer["score"] == "nlpd" else ""
+    value = f"{answer['value']:{sign}.3g}"
+    value = f"**{value}**" if answer["verdict"] == "better" else value
+    if answer["interval"] is None:
+        return value
+    low, high = answer["interval"]
+    return f"{value} ({low:{sign}.3g}–{high:{sign}.3g})" if not sign else f"{value} ({low:+.3g} to {high:+.3g})"
 
 
 def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:

@@ -17,8 +17,9 @@ from forcegp.validation.comparison import Cell, Comparison, cells_of, compute
 from forcegp.validation.figures import figures_of
 from forcegp.validation.kept_cells import KeptCells
 from forcegp.validation.page import page
+from forcegp.validation.preparation_words import preparation_lines
 from forcegp.validation.summary import summary_of
-from forcegp.validation.verdicts import verdicts
+from forcegp.validation.verdicts import against_baseline, verdicts
 
 RESULTS, PAGE = "results.json", "report.md"
 
@@ -52,6 +53,7 @@ def validate(
     jobs: int | None = None,
     backend: Backend | str | None = None,
     source: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Validation:
     """Fit every model for every split and seed, score it on the rows held out, and write one page about all of them.
@@ -64,7 +66,8 @@ def validate(
     models: names as in `validation.candidates`.
     seeds: how many choices of training rows, numbered from 0.
     jobs, backend: how many pieces at once, and where: in this process, or in several of this machine.
-    source: where the data come from and how they were prepared, for the page; plain JSON values.
+    source: where the data come from, for the page: "title", and "data", a list of lines; plain JSON values.
+    overwrite: compute everything anew, also where the folder holds results.
 
     Raises
     ------
@@ -77,7 +80,7 @@ def validate(
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     chosen = candidates(models, comparison.system)
     configuration = comparison.configuration()
-    kept = KeptCells.open(Path(folder), configuration)
+    kept = KeptCells.open(Path(folder), configuration, overwrite=overwrite)
     identifications, fits = cells_of(comparison, chosen, seeds)
     with kept.locked():
         kept.remove_leftovers()
@@ -156,6 +159,7 @@ def _document(
         "machine": machine(),
         "joint_names": list(comparison.rows.joint_names),
         "units": {name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
+        "preparation": preparation_lines(comparison.rows.metadata),
         "splits": [_described(comparison, split) for split in comparison.splits],
         "rows": len(comparison.rows),
         "points": comparison.points,
@@ -165,6 +169,7 @@ def _document(
         ),
         "models": summary,
         "verdicts": verdicts(summary, cells),
+        "against_baseline": against_baseline(summary, cells),
         "cells": {name: [_brief(cell) for cell in each] for name, each in cells.items()},
     }
 

@@ -18,6 +18,8 @@ from scipy.stats import t as student
 from forcegp.validation.scores import over_joints
 
 CERTAINTY = 0.95
+MOST_LOG = 700.0
+"""Of a ratio that is still a finite number."""
 
 SCORES: Mapping[str, str] = {
     "nrmse": "normalised error of the acceleration",
@@ -25,7 +27,7 @@ SCORES: Mapping[str, str] = {
     "nlpd": "negative log predictive density",
     "motion": "error of predicted motions",
 }
-"""What is compared, by the name of the score; `motion` is at the longest horizon."""
+"""What is compared, by the name of the score; `motion` is at the longest horizon. Ratios, but densities differences."""
 
 QUESTIONS: Sequence[tuple[str, tuple[str, ...], tuple[str, ...]]] = (
     ("Is the identified model better than the system as given?", ("identified",), ("given",)),
@@ -40,8 +42,8 @@ QUESTIONS: Sequence[tuple[str, tuple[str, ...], tuple[str, ...]]] = (
 class Paired:
     """Challenger against baseline in one score.
 
-    `change` is the mean ratio - 1 of errors (-0.2: a fifth less), or the mean difference in nats; the interval is of
-    the same kind, None for one run. `wins` of `runs` were better.
+    `value` is the geometric mean of the ratios of errors (0.8: a fifth less), or the mean difference in nats; the
+    interval is of the same kind, None for one run. In `wins` of `runs` the challenger was better.
     """
 
     score: str
@@ -49,36 +51,42 @@ class Paired:
     baseline: str
     runs: int
     wins: int
-    change: float
+    value: float
     interval: tuple[float, float] | None
 
     @property
     def verdict(self) -> str:
         """`better`, `worse` or `undecided`."""
-        if self.interval is None or self.interval[0] <= 0.0 <= self.interval[1]:
+        equal = _equal(self.score)
+        if self.interval is None or self.interval[0] <= equal <= self.interval[1]:
             return "undecided"
-        return "better" if self.interval[1] < 0.0 else "worse"
+        return "better" if self.interval[1] < equal else "worse"
 
     @property
     def sentence(self) -> str:
         """The verdict with its numbers."""
-        in_nats = self.score == "nlpd"
-
-        def told(value: float) -> str:
-            return f"{value:+.3g} nats" if in_nats else f"{100.0 * value:+.3g} %"
-
         said = {"better": "**Yes**", "worse": "**No**", "undecided": "**Undecided**"}[self.verdict]
         spread = "one run, so no interval"
         if self.interval is not None:
-            spread = f"95 % interval {told(self.interval[0])} to {told(self.interval[1])}"
+            spread = f"95 % interval {_told(self.score, self.interval[0])} to {_told(self.score, self.interval[1])}"
+        of = "minus that" if self.score == "nlpd" else "times that"
         return (
-            f"{said} by the {SCORES[self.score]}: {self.challenger} against {self.baseline} {told(self.change)} "
-            f"({spread}; better in {self.wins} of {self.runs} runs)."
+            f"{said} by the {SCORES[self.score]}: that of {self.challenger} is {_told(self.score, self.value)} {of} of "
+            f"{self.baseline} ({spread}; better in {self.wins} of {self.runs} runs)."
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
         return {**asdict(self), "verdict": self.verdict, "sentence": self.sentence}
+
+
+def _equal(score: str) -> float:
+    """The value where both are equal."""
+    return 0.0 if score == "nlpd" else 1.0
+
+
+def _told(score: str, value: float) -> str:
+    return f"{value:+.3g}" if score == "nlpd" else f"{value:.3g}"
 
 
 def paired(score: str, challenger: str, baseline: str, one: Sequence[float], other: Sequence[float]) -> Paired | None:
@@ -88,16 +96,15 @@ def paired(score: str, challenger: str, baseline: str, one: Sequence[float], oth
     if not a.size or (not in_nats and bool((np.minimum(a, b) <= 0.0).any())):
         return None
     difference = a - b if in_nats else np.log(a) - np.log(b)
+
+    def shown(value: float) -> float:
+        return value if in_nats else math.exp(min(value, MOST_LOG))
+
     mean, interval = float(difference.mean()), None
     if len(a) > 1:
         half = student.ppf(0.5 + 0.5 * CERTAINTY, len(a) - 1) * float(difference.std(ddof=1)) / math.sqrt(len(a))
-        interval = (_shown(mean - half, in_nats), _shown(mean + half, in_nats))
-    wins = int((difference < 0.0).sum())
-    return Paired(score, challenger, baseline, len(a), wins, _shown(mean, in_nats), interval)
-
-
-def _shown(value: float, in_nats: bool) -> float:
-    return value if in_nats else math.expm1(value)
+        interval = (shown(mean - half), shown(mean + half))
+    return Paired(score, challenger, baseline, len(a), int((difference < 0.0).sum()), shown(mean), interval)
 
 
 def verdicts(summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
@@ -115,6 +122,30 @@ def verdicts(summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[st
         if answers:
             out.append({"question": question, "answers": answers})
     return out
+
+
+def against_baseline(
+    summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> dict[str, Any] | None:
+    """Every model against the best identified one (without any: the system as given), as plain JSON values.
+
+    None where neither has finished a run.
+    """
+    baseline = best_of(summary, cells, ("identified",), "nrmse") or best_of(summary, cells, ("given",), "nrmse")
+    if baseline is None:
+        return None
+    compare = {
+        name: {score: compared(score, name, baseline, cells) for score in SCORES}
+        for name, model in summary.items()
+        if name != baseline and model["runs"]
+    }
+    return {
+        "baseline": baseline,
+        "models": {
+            name: {score: None if each is None else each.to_dict() for score, each in scores.items()}
+            for name, scores in compare.items()
+        },
+    }
 
 
 def best_of(

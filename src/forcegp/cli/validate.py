@@ -1,0 +1,196 @@
+"""`forcegp validate`: models side by side on rows of a log that none of them has seen."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.backend_choice import BackendOptions
+from forcegp.cli.command import Debug, Json
+from forcegp.cli.preparation_options import PreparationOptions
+from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.terminal import Terminal
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.validation import Comparison
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validate(BackendOptions, PreparationOptions, RobotOptions):
+    """Fit models side by side, score them on rows that are held out, and write one page about them.
+
+    Every model learns from the same rows; what is held out is whole episodes, or blocks of time with a guard around
+    them. A run that was interrupted goes on with the same command; one with more --models or --seeds computes only
+    these. The page is report.md in the folder, the numbers are in results.json; see docs/validation.md.
+
+    For instance:
+      forcegp validate log.h5 --robot arm.urdf --split episodes:3,7 --cutoff 20 --trim 0.1 --every 5 --out results
+      forcegp validate log.h5 --split blocks:5:3,5 --guard 0.25 --models analytical joint-friction@identified --out few
+    """
+
+    interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
+
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """The dataset (HDF5), raw or prepared."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = field()
+    """The folder of results; an unfinished one is gone on with."""
+    split: Annotated[str, arg(metavar="SPLIT")] = "auto"
+    """What is held out. episodes:N,N...: these episodes. leave-one-out: every episode once. fraction:F[:SEED]: a
+    fraction of the episodes. blocks:N:K,K...: of N blocks of time of every episode those of these numbers, from 1.
+    auto: a quarter of the episodes, or with one episode blocks:5:3,5."""
+    guard: Annotated[float, arg(metavar="S")] = 0.25
+    """Seconds of training rows left out beside held-out blocks."""
+    models: Annotated[
+        tuple[str, ...], arg(metavar="NAME", help_behavior_hint="(default: all but single networks)")
+    ] = ()
+    """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
+    PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
+    identified from the same rows."""
+    points: Annotated[int, arg(metavar="N")] = 100
+    """Rows that every model learns from: those that lie farthest apart among two thirds of the training rows."""
+    seeds: Annotated[int, arg(metavar="N")] = 5
+    """So many choices of these rows."""
+    horizon: Annotated[str, arg(metavar="S,S...")] = "0.1,0.2,0.5,1.0"
+    """Lengths of the motions that are predicted from held-out states, in s."""
+    starts: Annotated[int, arg(metavar="N")] = 5
+    """Motions from every held-out stretch of time."""
+    integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
+    """Of these motions: rk4, symplectic-euler or projected."""
+    restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
+    """Starts of every search for hyper-parameters; the best is kept."""
+    iterations: Annotated[int | None, arg(metavar="N", constructor=int, help_behavior_hint="(default: 200)")] = None
+    """Most iterations of each start."""
+    force_noise: Annotated[
+        float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
+    ] = None
+    """Models with physics learn a noise of the joint forces as well, beginning at this standard deviation in Nm."""
+    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: 1)")] = None
+    """Pieces of work at once, each on one core."""
+    overwrite: bool = False
+    """Compute everything anew where the folder holds results."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Compute what is missing, and write the page."""
+        backend = self._backend()
+        horizons = self._horizons()
+        start = time.monotonic()
+        from forcegp.validation import DEFAULT_MODELS, validate
+
+        comparison = self._comparison(terminal, horizons)
+        with terminal.progress(f"validating: {len(comparison.splits)} split(s), {self.seeds} seed(s)") as report:
+            validation = validate(
+                comparison,
+                self.out,
+                models=self.models or DEFAULT_MODELS,
+                seeds=self.seeds,
+                backend=backend,
+                source=self._source(),
+                overwrite=self.overwrite,
+                progress=report,
+            )
+        terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
+        terminal.say(*self._report(validation.document))
+        brief = ("models", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
+        return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
+
+    def _comparison(self, terminal: Terminal, horizons: tuple[float, ...]) -> Comparison:
+        from forcegp.data import Dataset
+        from forcegp.validation import Comparison, split_named
+
+        raw = Dataset.load(self.data)
+        system = self.chosen_system(raw, self.data)
+        raw = replace(raw, system=system)
+        preparation = self._preparation()
+        if preparation.changes_nothing:
+            rows = recording = raw
+        else:
+            preparation = preparation.resolved(raw)
+            rows = preparation.apply(raw).dataset
+            recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw).dataset
+            self._warn_of_memory(terminal, preparation.cutoff, preparation.order)
+        return Comparison(
+            rows,
+            recording,
+            system,
+            split_named(self.split, rows, self.guard),
+            points=self.points,
+            horizons=horizons,
+            starts=self.starts,
+            integrator=self.integrator,
+            restarts=self.restarts,
+            iterations=self.iterations,
+            force_noise=self.force_noise,
+        )
+
+    def _warn_of_memory(self, terminal: Terminal, cutoff: Any, order: int) -> None:
+        """A filter mixes what lies on both sides of a border."""
+        import math
+
+        if cutoff is None or not (self.split.startswith("blocks") or self.split == "auto"):
+            return
+        memory = 1.0 / (2.0 * math.pi * cutoff * math.sin(0.5 * math.pi / order))
+        if self.guard < 2.0 * memory:
+            terminal.warn(
+                f"--guard {self.guard:g} s is shorter than two time constants of the filter ({2.0 * memory:.2g} s), so "
+                "rows on both sides of a border share measurements; give a longer one."
+            )
+
+    def _horizons(self) -> tuple[float, ...]:
+        try:
+            return tuple(float(word) for word in self.horizon.split(","))
+        except ValueError:
+            raise InvalidInput(f"--horizon is {self.horizon!r}; give seconds with commas, as in 0.1,0.5,1.") from None
+
+    def _source(self) -> dict[str, Any]:
+        digest = hashlib.sha256(self.data.read_bytes()).hexdigest()
+        robot = [f"robot from {self.robot}"] if self.robot is not None else []
+        return {"title": str(self.data), "data": [f"{self.data} (SHA-256 {digest[:16]}…)", *robot], "sha256": digest}
+
+    def _report(self, document: Mapping[str, Any]) -> list[Any]:
+        from rich.text import Text
+
+        from forcegp.cli.tables import NONE, columns, number
+
+        def median(value: Mapping[str, Any] | None) -> str:
+            return number(None if value is None else value["median"])
+
+        rows = []
+        for name, model in document["models"].items():
+            if not model["runs"]:
+                rows.append([name, *[NONE] * 5])
+                continue
+            motions = model["motions"]
+            last = None if motions is None or not motions["rms"] else motions["rms"][-1]
+            covered = model["coverage_95"]
+            rows.append(
+                [
+                    name,
+                    *(median(model[score]) for score in ("nrmse", "force_rms", "nlpd")),
+                    NONE if covered is None else f"{100.0 * covered['median']:.1f} %",
+                    median(last),
+                ]
+            )
+        header = ["model", "nRMSE", "force error", "NLPD", "in 95 %", "motion"]
+        title = f"{self.data}: medians over {len(document['seeds'])} seed(s) and {len(document['splits'])} split(s)"
+        failed = [
+            Text(f"{name} failed in {len(model['failures'])} run(s): {model['failures'][0]['error']}")
+            for name, model in document["models"].items()
+            if model["failures"]
+        ]
+        told = [
+            Text(f"{item['question']} {answer['sentence'].replace('**', '')}")
+            for item in document["verdicts"]
+            for answer in item["answers"]
+            if answer["score"] == "force_rms"
+        ]
+        page = Text(f"The page: {self.out / 'report.md'}")
+        return [columns(title, header, rows, long_names=True), *failed, *told, page]
