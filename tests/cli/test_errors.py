@@ -96,8 +96,8 @@ WRONG = [
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
     ("simulate mars --out a.h5", "'mars'"),
     ("demo --out mine --overwrite", "was not written by `forcegp demo`"),
-    ("learn arm.h5", "Available subcommands: demo, simulate, fit, "),
-    ("", "demo, simulate, fit, "),
+    ("learn arm.h5", "Available subcommands: demo, simulate, import, "),
+    ("", "demo, simulate, import, "),
 ]
 
 
