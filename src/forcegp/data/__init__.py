@@ -20,7 +20,7 @@ from forcegp.data.spectrum import MotionSpectrum, motion_spectrum, power_density
 from forcegp.data.splits import require_disjoint, train_test_split
 from forcegp.data.time_blocks import time_blocks
 from forcegp.data.units import REVOLUTE_UNITS, units_for
-from forcegp.data.windows import OBSERVATIONS, VelocityIncrements, WeakForm, WindowObservation, Windows
+from forcegp.data.windows import OBSERVATIONS, VelocityIncrements, WeakForm, WindowObservation, Windows, observation_of
 
 __all__ = [
     "OBSERVATIONS",
@@ -45,6 +45,7 @@ __all__ = [
     "low_pass",
     "low_pass_gain",
     "motion_spectrum",
+    "observation_of",
     "power_density",
     "require_disjoint",
     "resample",

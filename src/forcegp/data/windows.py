@@ -26,7 +26,7 @@ from typing_extensions import override
 from forcegp.data.dataset import Dataset
 from forcegp.data.farthest_points import farthest_point_sampling
 from forcegp.data.filtering import episodes_in_order, require_no_turns
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import DatasetError, InvalidInput, unknown_name_message
 
 EXACT_DEGREE = 5
 """Weights are exact for polynomials of time up to this degree, however uneven the steps."""
@@ -52,6 +52,11 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.weights)
+
+    @property
+    def noise_level(self) -> Float[np.ndarray, " nv"] | None:
+        """The noise of the sensors in y as one number per joint; None where a signal shows none."""
+        return self.nodes.noise_level
 
     @property
     def observed(self) -> Float[np.ndarray, "N nv"]:
@@ -214,6 +219,15 @@ class VelocityIncrements(WindowObservation):
 
 
 OBSERVATIONS: Mapping[str, type[WindowObservation]] = {kind.name: kind for kind in (WeakForm, VelocityIncrements)}
+
+
+def observation_of(given: WindowObservation | str) -> WindowObservation:
+    """The observation of that name with its defaults, or itself. Raises InvalidInput for other names."""
+    if isinstance(given, WindowObservation):
+        return given
+    if given not in OBSERVATIONS:
+        raise InvalidInput(unknown_name_message("observation", str(given), "forcegp", tuple(OBSERVATIONS)))
+    return OBSERVATIONS[given]()
 
 
 def white_noise(dataset: Dataset, signal: Literal["q", "v"]) -> Float[np.ndarray, " nv"]:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forcegp.data import Dataset, farthest_rows
+from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
 from forcegp.errors import InvalidInput
 from forcegp.models.noise import Noise
 
@@ -38,7 +38,27 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
     return dataset if points == len(dataset) else farthest_rows(dataset, points)
 
 
-def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
+def training_windows(
+    joint_names: Sequence[str], dataset: Dataset, points: int | None, observe: WindowObservation | str
+) -> Windows:
+    """The `points` windows of the dataset that lie farthest apart; all of them for None.
+
+    Raises InvalidInput for other joints, names and numbers out of range, DatasetError for logs without windows.
+    """
+    return observation_of(observe).windows(checked_rows(joint_names, dataset), points)
+
+
+def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:
+    """The noise given; for None, learned from where the sensors put it.
+
+    That of the sensors is the least that windows can have: states at nodes are not exact either.
+    """
+    if noise is not None or windows.noise_level is None:
+        return noise
+    return Noise(tuple(float(std) for std in windows.noise_level), learn=True)
+
+
+def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
     """The noise given, else the level that the training rows state. Raises InvalidInput where neither is known."""
     if noise is not None and noise.acceleration is not None:
         return noise
@@ -78,7 +98,7 @@ def first_start(
     return first
 
 
-def described_rows(rows: Dataset, dataset: Dataset) -> dict[str, Any]:
+def described_rows(rows: Dataset | Windows, dataset: Dataset) -> dict[str, Any]:
     """What the settings of a fit tell about its training rows and where they come from, as plain JSON values."""
     return {
         "points": len(rows),

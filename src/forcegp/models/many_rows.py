@@ -26,6 +26,7 @@ from forcegp.inference import (
 )
 from forcegp.inference.conjugate_gradients import Iteration
 from forcegp.inference.engines import MOST_EXACT_ROWS, MOST_ITERATIVE_ROWS
+from forcegp.inference.functionals import require_memory_for_functionals
 from forcegp.inference.memory import require_memory
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
 from forcegp.models.noise import ACCELERATION
@@ -57,7 +58,12 @@ def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) 
 
 
 def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
-    """Raise NotEnoughMemory where the exact likelihood of these rows does not fit into memory."""
+    """Raise NotEnoughMemory where the exact likelihood of these rows or windows does not fit into memory."""
+    weights = likelihood.training.weights
+    if weights is not None:
+        robot = likelihood.system.robot
+        require_memory_for_functionals(weights, robot.nv, len(likelihood.prior.latent_names(robot)))
+        return
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
     remedy = "find hyper-parameters on fewer rows: learning_points=600 (--learning-points 600), or give fewer points"

@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, Windows
 from forcegp.errors import InvalidInput
 from forcegp.inference import (
     Engine,
     Exact,
+    FunctionalPosterior,
     LatentKernels,
     LatentPosterior,
     Terms,
@@ -23,6 +24,7 @@ from forcegp.inference import (
     negative_log_likelihood,
 )
 from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.functionals import functional_negative_log_likelihood, weighted
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.priors import ForcePrior, Scaling
@@ -44,6 +46,10 @@ class TrainingData:
 
     `reference` holds the rows that features are standardised by and that the level of the noise refers to, where they
     are not these rows themselves: then parameters mean the same as for the reference, on which they were fitted.
+
+    With `weights` (see `forcegp.data.Windows`) the rows are the nodes of windows, one window after the other, and what
+    was measured is the weighted sum of the accelerations of each; `a` and `noise_std` of a window are repeated for all
+    of its nodes.
     """
 
     q: Float[Tensor, "N nv"]
@@ -52,21 +58,29 @@ class TrainingData:
     a: Float[Tensor, "N nv"]
     noise_std: Float[Tensor, "N nv"] | None = None
     reference: TrainingData | None = None
+    weights: Float[Tensor, "windows nodes"] | None = None
+
+    def __len__(self) -> int:
+        """How many observations there are: rows, or windows."""
+        return len(self.q if self.weights is None else self.weights)
 
     @classmethod
-    def of(cls, rows: Dataset, device: torch.device) -> TrainingData:
-        """Copies of all rows of a Dataset."""
+    def of(cls, given: Dataset | Windows, device: torch.device) -> TrainingData:
+        """Copies of all rows of a Dataset, or of all windows."""
+        rows = given.nodes if isinstance(given, Windows) else given
+        weights = torch.tensor(given.weights, device=device) if isinstance(given, Windows) else None
         noise = rows.noise_std if rows.noise_std is not None and rows.noise_std.ndim == 2 else None
         noise_std = None if noise is None else torch.tensor(noise, device=device)
         states = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
-        return cls(*states, noise_std=noise_std)
+        return cls(*states, noise_std=noise_std, weights=weights)
 
     def to(self, device: torch.device) -> TrainingData:
         """The same rows on another device."""
         states = (getattr(self, name).to(device) for name in ("q", "v", "u", "a"))
         noise_std = None if self.noise_std is None else self.noise_std.to(device)
         reference = None if self.reference is None else self.reference.to(device)
-        return TrainingData(*states, noise_std=noise_std, reference=reference)
+        weights = None if self.weights is None else self.weights.to(device)
+        return TrainingData(*states, noise_std=noise_std, reference=reference, weights=weights)
 
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:
@@ -172,18 +186,24 @@ class MarginalLikelihood:
         return self._nominal_dynamics.H @ self.prior.mixing(self._nominal_dynamics)
 
     def terms(self, parameters: Mapping[str, Tensor]) -> Terms:
-        """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`."""
+        """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`.
+
+        Of windows, those of all nodes; the residual of a window is repeated for all of its nodes.
+        """
         dynamics = self.dynamics(parameters)
-        offset = dynamics.acceleration_map(known=self.mean == "analytical").offset
+        residual = self.training.a - dynamics.acceleration_map(known=self.mean == "analytical").offset
+        weights = self.training.weights
+        if weights is not None:
+            residual = weighted(weights, residual).repeat_interleave(weights.shape[1], dim=0)
         noise = Noise.covariance(parameters, dynamics.H, self.training.noise_factors)
         if dynamics is self._nominal_dynamics:
-            return Terms(self._nominal_features, self._nominal_mixing, self.training.a - offset, noise)
+            return Terms(self._nominal_features, self._nominal_mixing, residual, noise)
         # shifted and scaled at these parameters, as a posterior does that has them in its system
         given = self.prior.features(dynamics)
         rows = self if self._reference is None else self._reference
         by = given if rows is self else self.prior.features(rows.dynamics(parameters))
         features = Standardization.of(by, self.prior.scalings(self.system.robot))(given)
-        return Terms(features, dynamics.H @ self.prior.mixing(dynamics), self.training.a - offset, noise)
+        return Terms(features, dynamics.H @ self.prior.mixing(dynamics), residual, noise)
 
     def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
         """Kernels with moment-based start values, at the physical parameters among `parameters`.
@@ -220,8 +240,12 @@ class MarginalLikelihood:
                 f"no parameter {unknown!r}; there are {', '.join(sorted(known))}, {INERTIALS}<link> and "
                 f"{COEFFICIENTS}<known force>"
             )
-        features, W, residual, noise = self.terms(parameters)
-        return negative_log_likelihood(W, residual, noise, kernels.matrices(parameters, features))
+        terms = self.terms(parameters)
+        features, W, residual, noise = terms
+        matrices = kernels.matrices(parameters, features)
+        if self.training.weights is not None:
+            return functional_negative_log_likelihood(self.training.weights, terms, matrices)
+        return negative_log_likelihood(W, residual, noise, matrices)
 
     def bound(
         self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
@@ -242,6 +266,8 @@ class MarginalLikelihood:
         """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`."""
         with torch.no_grad():
             terms = self.terms(parameters)
+            if self.training.weights is not None:
+                return FunctionalPosterior.condition(kernels.at(parameters), self.training.weights, terms)
             return (engine or Exact()).condition(kernels.at(parameters), terms, start=start, report=report)
 
 

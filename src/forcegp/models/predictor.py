@@ -213,7 +213,7 @@ def _compressed(
         raise InvalidInput(
             "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
             f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, or 'none', "
-            "or fit with engine='exact'."
+            f"or {latent.remedy}."
         )
     terms = EagerTerms(terms_function(posterior, prepared, True), posterior.system.robot.nv, len(prepared.groups))
 

@@ -36,8 +36,10 @@ UPDATED = 3
 """Format of a model whose rows are standardised by others than those that it is conditioned on: programs that only know
 1 and 2 would standardise by the wrong ones.
 """
+WINDOWED = 4
+"""Format of a model that learned from windows: programs that only know 1 to 3 would take their nodes for rows."""
 STATES = ("q", "v", "u", "a")
-NOISE = "noise_std"
+NOISE, WEIGHTS = "noise_std", "weights"
 SOLUTION = "latent.solution"
 TRAINING, REFERENCE = "training.", "reference."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
@@ -176,6 +178,8 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
 
 
 def _version(posterior: Posterior) -> int:
+    if posterior.training.weights is not None:
+        return WINDOWED
     if posterior.training.reference is not None:
         return UPDATED
     return FORMAT_VERSION if posterior.target is None else TRANSFERRED
@@ -183,12 +187,13 @@ def _version(posterior: Posterior) -> int:
 
 def _row_tensors(prefix: str, rows: TrainingData) -> dict[str, torch.Tensor]:
     """Tensors by their name in the file, which are contiguous copies: rows of one may share memory with another's."""
-    names = STATES if rows.noise_std is None else (*STATES, NOISE)
+    names = [*STATES, *(name for name in (NOISE, WEIGHTS) if getattr(rows, name) is not None)]
     return {f"{prefix}{name}": getattr(rows, name).detach().cpu().clone().contiguous() for name in names}
 
 
 def _rows(prefix: str, tensors: Mapping[str, torch.Tensor]) -> TrainingData:
-    return TrainingData(*(tensors[prefix + name] for name in STATES), noise_std=tensors.get(prefix + NOISE))
+    states = (tensors[prefix + name] for name in STATES)
+    return TrainingData(*states, noise_std=tensors.get(prefix + NOISE), weights=tensors.get(prefix + WEIGHTS))
 
 
 def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
@@ -213,6 +218,10 @@ def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> No
         _check_numbers(file, prefix + name, value)
         if value.shape != shape:
             raise FileFormatError(f"{file} is damaged: {prefix}{name} has shape {tuple(value.shape)}")
+    if rows.weights is not None:
+        _check_numbers(file, prefix + WEIGHTS, rows.weights)
+        if rows.weights.dim() != 2 or rows.weights.numel() != len(rows.q):
+            raise FileFormatError(f"{file} is damaged: {prefix}{WEIGHTS} has shape {tuple(rows.weights.shape)}")
 
 
 def _check_numbers(file: Path, name: str, value: torch.Tensor) -> None:
@@ -234,9 +243,9 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in KINDS:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in (FORMAT_VERSION, TRANSFERRED, UPDATED):
+    if version not in (FORMAT_VERSION, TRANSFERRED, UPDATED, WINDOWED):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} to {UPDATED}; "
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} to {WINDOWED}; "
             f"use the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document

@@ -10,25 +10,26 @@ from typing import Any, ClassVar, get_args
 
 from torch import Tensor
 
-from forcegp.data import Dataset, farthest_rows
-from forcegp.errors import DataWarning, FitError, InvalidInput
+from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows
+from forcegp.errors import DataWarning, InvalidInput
 from forcegp.inference import (
     Engine,
+    Exact,
     LatentKernels,
     OptimizationResult,
     OptimizerOptions,
     ProblemSize,
-    best_of,
     engine_of,
-    minimize_objective,
 )
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.fit_arguments import (
     check_search_numbers,
     described_rows,
     first_start,
+    noise_of_windows,
     resolved_noise,
     training_rows,
+    training_windows,
 )
 from forcegp.models.identification import Identification
 from forcegp.models.load_refinement import fit_with_refined_loads
@@ -44,14 +45,12 @@ from forcegp.models.search import (
     ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
     FitProgress,
-    blas_threads,
     default_options,
     default_restarts,
-    perturbed,
-    run_restarts,
     with_steps_before,
 )
 from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.structured_search import StructuredSearch
 from forcegp.models.surface_distance import check_distance
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior, JointForces, prior_to_dict
@@ -109,6 +108,7 @@ class StructuredGP(Model):
         prior_strength: float = 0.0,
         engine: Engine | str = "auto",
         learning_points: int | None = None,
+        observe: WindowObservation | str | None = None,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
         """Find all kernel and learned noise parameters by marginal likelihood, then condition on the points.
@@ -142,6 +142,10 @@ class StructuredGP(Model):
             memory, and says why in `settings["engine_reason"]`.
         learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
             up to 1500 and 600 beyond, with `learn` all. The posterior is that of all points.
+        observe: what to learn from instead of the column `a`, of a dataset that is raw and at the rate of its sensors:
+            `WeakForm(seconds=0.1)`, `VelocityIncrements(seconds=0.1)` or the name of one. Then points are windows,
+            inference is exact, and the noise is that of a window's weighted mean acceleration; without `noise` it is
+            learned, from where the noise of the sensors puts it (docs/without-accelerations.md).
         progress: called as progress(restart, iteration, nll) where the restarts run in this process. The restart is
             `models.search.ALL_ROWS` while the engine takes in all points.
 
@@ -160,6 +164,14 @@ class StructuredGP(Model):
         chosen = engine_of(engine)
         how: dict[str, Any] = {"seed": seed, "hyperprior": hyperprior, "options": options, "progress": progress}
         how["backend"] = backend_for(backend, jobs)
+        if observe is not None:
+            if not isinstance(chosen or Exact(), Exact) or learning_points is not None:
+                raise InvalidInput(
+                    "engine and learning_points are for rows with accelerations; windows (observe=...) are conditioned "
+                    "on exactly, and all are learned from: leave both out, and give fewer points if it takes too long"
+                )
+            windows = training_windows(self.system.robot.joint_names, dataset, points, observe)
+            return self._fit_windows(windows, dataset, restarts, start, learn, prior_strength, how)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:
             chosen.require_memory(self._size(len(all_rows)), self.system.robot.device)  # now, not after the search
@@ -173,6 +185,25 @@ class StructuredGP(Model):
             first = self._with_refined_loads(first, rows, dataset, how)
         report = None if progress is None else partial(progress, ALL_ROWS)
         return on_all_rows(first, all_rows, chosen, described_rows(all_rows, dataset), hyperprior, report)
+
+    def _fit_windows(
+        self,
+        windows: Windows,
+        dataset: Dataset,
+        restarts: int | None,
+        start: Mapping[str, Tensor] | None,
+        learn: Learned | Sequence[Learned] | None,
+        prior_strength: float,
+        how: Mapping[str, Any],
+    ) -> StructuredPosterior:
+        """`fit` to these windows of the dataset."""
+        model = replace(self, noise=noise_of_windows(self.noise, windows))
+        fitted = model._fit(windows, dataset, restarts, start, learn, prior_strength, **how)
+        if learn is None:
+            fitted = model._with_refined_loads(fitted, windows, dataset, how)
+        reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
+        said = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
+        return fitted.with_settings(**said, engine=Exact().to_dict(), engine_reason=reason)
 
     def _size(self, rows: int) -> ProblemSize:
         """Of the posterior of so many rows, without computing anything; contacts count as independent."""
@@ -197,7 +228,7 @@ class StructuredGP(Model):
         return start
 
     def _with_refined_loads(
-        self, first: StructuredPosterior, rows: Dataset, dataset: Dataset, how: Mapping[str, Any]
+        self, first: StructuredPosterior, rows: Dataset | Windows, dataset: Dataset, how: Mapping[str, Any]
     ) -> StructuredPosterior:
         """`first`, or a fit with the normal force under the friction that was found."""
 
@@ -210,7 +241,7 @@ class StructuredGP(Model):
 
     def _fit(
         self,
-        rows: Dataset,
+        rows: Dataset | Windows,
         dataset: Dataset,
         restarts: int | None,
         start: Mapping[str, Tensor] | None,
@@ -223,7 +254,7 @@ class StructuredGP(Model):
         options: OptimizerOptions | None,
         progress: FitProgress | None,
     ) -> StructuredPosterior:
-        """`fit` to these rows of the dataset with the prior as it is."""
+        """`fit` to these rows or windows of the dataset with the prior as it is."""
         noise = resolved_noise(self.noise, rows)
         restarts = default_restarts(len(rows)) if restarts is None else restarts
         check_search_numbers(restarts, seed)
@@ -253,21 +284,10 @@ class StructuredGP(Model):
         physical = None if begin is None else begin.physical
         objective = FitObjective(likelihood, kernels, noise, fixed, hyperprior, physical, prior_strength)
         kept = options if begin is None else replace(options, keep_iterates=True)
-        search = _Search(objective, moments, first, seed, kept)
-        with blas_threads(training.q.numel()):
-            results = run_restarts(search, restarts, backend, progress)
-        usable = [result for result in results if isinstance(result, OptimizationResult)]
-        if not usable:
-            causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
-            raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
-        result = best_of(usable)
+        search = StructuredSearch(objective, moments, first, seed, kept)
+        result, values = search.best(restarts, backend, progress)
         if begin is not None:  # the steps before the search are its first iterations
             result = with_steps_before(result, objective, [point | learned_noise for point in begin.path[:-1]])
-        result = replace(
-            result,
-            evaluations=sum(search.evaluations for search in usable),
-            cpu_seconds=sum(search.cpu_seconds for search in usable),
-        )
         settings = {
             **described_rows(rows, dataset),
             "restarts": restarts,
@@ -279,7 +299,7 @@ class StructuredGP(Model):
             "noise_from_data": not noise.learn and (self.noise is None or self.noise.acceleration is None),
             "optimizer": {name: getattr(options, name) for name in options.__dataclass_fields__},
             "hyperprior": hyperprior,
-            "restart_objective": [r.value if isinstance(r, OptimizationResult) else None for r in results],
+            "restart_objective": values,
         }
         fitted = StructuredGP(self.system, self.prior, self.mean, noise)
         if begin is None:
@@ -327,22 +347,3 @@ class StructuredGP(Model):
 
     def _likelihood(self, training: TrainingData) -> MarginalLikelihood:
         return MarginalLikelihood(self.system, self.prior, self.mean, training)
-
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """One optimisation from start number `index`: 0 begins at `first`, the others around the moments."""
-
-    objective: FitObjective
-    moments: Mapping[str, Tensor]
-    first: Mapping[str, Tensor]
-    seed: int
-    options: OptimizerOptions
-
-    def __call__(self, index: int, progress: FitProgress | None = None) -> OptimizationResult | FitError:
-        first = perturbed(self.moments, self.seed, index) if index else self.first
-        note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
-        try:
-            return minimize_objective(self.objective, first, self.options, note)
-        except FitError as error:
-            return error

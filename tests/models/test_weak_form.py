@@ -1,0 +1,220 @@
+"""Learning from windows of positions or velocities instead of accelerations, through the public interface."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import URDF, arm_system, unknown_force
+
+from forcegp import (
+    JointForces,
+    JointFriction,
+    NoForces,
+    Noise,
+    StructuredGP,
+    VelocityIncrements,
+    WeakForm,
+    evaluate,
+    load_posterior,
+    save_posterior,
+)
+from forcegp.data import Dataset, units_for
+from forcegp.errors import FileFormatError, InvalidInput, NotEnoughMemory
+from forcegp.inference import FunctionalPosterior, OptimizerOptions
+from forcegp.models import MarginalLikelihood, StructuredPosterior, TrainingData
+from forcegp.robots import Robot
+
+STEP = 0.002
+SENSOR = 2e-5
+HOW = WeakForm(0.1, nodes=8)
+FIT = {"points": 24, "restarts": 1}
+
+
+@cache
+def motion(seconds: float = 3.0, seed: int = 0, noise: float = SENSOR) -> Dataset:
+    """A smooth motion of the free arm, the torques that make it, and positions with white noise; nothing else."""
+    system = arm_system(contacts=0)
+    generator = np.random.default_rng(seed)
+    time = STEP * np.arange(round(seconds / STEP))
+    rate, phase = generator.uniform(2.0, 8.0, (3, 1, 3)), generator.uniform(0.0, 6.3, (3, 1, 3))
+    size, angle = generator.uniform(0.5, 1.0, (3, 1, 3)) / rate, rate * time[:, None] + phase
+    q, v = (size * np.sin(angle)).sum(0), (size * rate * np.cos(angle)).sum(0)
+    a = -(size * rate**2 * np.sin(angle)).sum(0)
+    states = [torch.tensor(x) for x in (q, v, np.zeros_like(q))]
+    dynamics = system.dynamics(*states)
+    u = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K - unknown_force(states[1])
+    measured = q + generator.normal(0.0, noise, q.shape)
+    return Dataset(
+        q=measured,
+        v=np.gradient(measured, time, axis=0),
+        u=u.numpy(),
+        a=np.full_like(measured, 1e3),  # nobody may look at it
+        time=time,
+        joint_names=system.robot.joint_names,
+        units=units_for(system.robot),
+        system=system,
+        truth={"a": a},
+    )
+
+
+def with_true_accelerations(dataset: Dataset) -> Dataset:
+    return replace(dataset, a=dataset.truth["a"])
+
+
+@cache
+def fitted() -> StructuredPosterior:
+    data = motion()
+    return StructuredGP(data.system, JointFriction()).fit(data, observe=HOW, **FIT)
+
+
+def test_positions_alone_teach_as_much_as_exact_accelerations():
+    posterior, data = fitted(), with_true_accelerations(motion())
+    test = with_true_accelerations(motion(seed=1))
+    reference = StructuredGP(data.system, JointFriction(), noise=Noise(0.01, learn=True)).fit(data, **FIT)
+    nothing = StructuredGP(data.system, NoForces(), noise=Noise(1.0)).fit(data, points=10)
+    ours, best, without = (evaluate(model, test).mae for model in (posterior, reference, nothing))
+    assert ours < 1.15 * best
+    assert best < 0.2 * without
+
+
+def test_the_noise_that_is_learned_is_that_of_the_sensors_in_a_window():
+    windows = HOW.windows(motion(), 24)
+    stated = SENSOR * np.linalg.norm(HOW.signal_weights(motion().time[None, :51])[0])
+    np.testing.assert_allclose(windows.noise_level, stated, rtol=0.1)
+    assert np.all(fitted().noise_std.numpy() < 2.0 * stated)
+    assert np.all(fitted().noise_std.numpy() > 0.5 * stated)
+    told = fitted().settings
+    assert (told["points"], told["observe"]["name"], told["observe"]["seconds"]) == (24, "weak-form", 0.1)
+    assert told["engine_reason"] == "exact: from 24 windows of 8 nodes"
+    assert isinstance(fitted().latent, FunctionalPosterior)
+
+
+@pytest.mark.parametrize("how", [replace(HOW, signal="v", order=1), VelocityIncrements(0.06, 5)], ids=lambda h: h.name)
+def test_velocities_serve_as_well(how):
+    data, test = motion(), with_true_accelerations(motion(seed=1))
+    posterior = StructuredGP(data.system, JointFriction()).fit(data, observe=how, **FIT)
+    assert evaluate(posterior, test).mae < 1.3 * evaluate(fitted(), test).mae
+
+
+def test_one_node_is_a_row_with_that_acceleration():
+    data = motion()
+    windows = replace(HOW, nodes=1).windows(data, 10)
+    model = StructuredGP(data.system, JointForces(inputs=("q", "v")), noise=Noise(0.3, force=0.2))
+    device = torch.device("cpu")
+    observed, rows = TrainingData.of(windows, device), TrainingData.of(windows.nodes, device)
+    likelihoods = [MarginalLikelihood(model.system, model.prior, "analytical", each) for each in (observed, rows)]
+    kernels = likelihoods[1].kernels()
+    parameters = kernels.initial_parameters() | Noise(0.3, force=0.2).parameters(3)
+    with torch.no_grad():
+        left, right = (likelihood(kernels, parameters) for likelihood in likelihoods)
+        torch.testing.assert_close(left, right)
+        new = likelihoods[1].standardization(likelihoods[1].prior.features(likelihoods[1].dynamics()))
+        posteriors = [likelihood.condition(kernels, parameters) for likelihood in likelihoods]
+        torch.testing.assert_close(posteriors[0].mean(new), posteriors[1].mean(new))
+        torch.testing.assert_close(posteriors[0].covariance(new), posteriors[1].covariance(new))
+
+
+def test_gradients_of_the_likelihood_in_kernels_noise_and_inertia():
+    data = motion()
+    windows = replace(HOW, nodes=3).windows(data, 6)
+    likelihood = MarginalLikelihood(
+        data.system, JointFriction(), "analytical", TrainingData.of(windows, torch.device("cpu"))
+    )
+    kernels = likelihood.kernels()
+    parameters = kernels.initial_parameters() | Noise(0.3, force=0.2).parameters(3)
+    parameters = parameters | {"inertials.hand": data.system.robot.inertial_parameters("hand")["hand"]}
+    names = list(parameters)
+
+    def value(*values):
+        return likelihood(kernels, dict(zip(names, values, strict=True)))
+
+    leaves = [parameters[name].clone().requires_grad_() for name in names]
+    gradients = torch.autograd.grad(value(*leaves), leaves)
+    for name, leaf, gradient in zip(names, leaves, gradients, strict=True):
+        direction = torch.randn(leaf.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        with torch.no_grad():
+            moved = [[x + sign * 1e-5 * direction if x is leaf else x for x in leaves] for sign in (1, -1)]
+            slope = (value(*moved[0]) - value(*moved[1])) / 2e-5
+        assert float((gradient * direction).sum()) == pytest.approx(float(slope), rel=2e-5, abs=2e-5), name
+
+
+def test_masses_are_learned_from_positions():
+    wrong = arm_system(contacts=0).with_robot(Robot.from_urdf_text(URDF.replace('value="0.6"', 'value="0.9"')))
+    data = replace(motion(), system=wrong)
+    learn = wrong.robot.link("hand").inertial("mass")
+    posterior = StructuredGP(wrong, JointFriction()).fit(data, observe=replace(HOW, nodes=4), learn=learn, **FIT)
+    assert posterior.identification is not None
+    (start,), (end,) = posterior.identification.start.values(), posterior.identification.values.values()
+    assert start == pytest.approx(0.9)
+    assert abs(end - 0.6) < 0.02
+
+
+def test_a_stored_model_predicts_the_same_and_says_that_it_knows_windows(tmp_path):
+    posterior, at = fitted(), motion(seed=1).rows(slice(0, 40))
+    save_posterior(posterior, tmp_path / "run")
+    loaded = load_posterior(tmp_path / "run")
+    ours, theirs = (model.predict(at.q, at.v, at.u) for model in (posterior, loaded))
+    torch.testing.assert_close(ours.mean, theirs.mean)
+    torch.testing.assert_close(ours.covariance, theirs.covariance)
+    assert len(loaded.training) == 24
+    assert loaded.settings["observe"] == posterior.settings["observe"]
+    document = json.loads((tmp_path / "run" / "model.json").read_text())
+    assert document["format_version"] == 4
+    broken = replace(posterior.training, weights=posterior.training.weights[:-1])
+    object.__setattr__(posterior.likelihood, "training", broken)
+    try:
+        save_posterior(posterior, tmp_path / "broken")
+    finally:
+        object.__setattr__(posterior.likelihood, "training", loaded.training)
+    with pytest.raises(FileFormatError, match=r"training.weights has shape \(23, 8\)"):
+        load_posterior(tmp_path / "broken")
+
+
+def test_predictor_rollout_and_other_devices():
+    posterior, at = fitted(), motion(seed=1).rows(slice(0, 5))
+    prediction = posterior.predict(at.q, at.v, at.u)
+    mean, covariance = posterior.predictor(compile=False)(at.q, at.v, at.u)
+    torch.testing.assert_close(mean, prediction.mean)
+    torch.testing.assert_close(covariance, prediction.covariance)
+    moved = posterior.to("cpu").predict(at.q, at.v, at.u)
+    torch.testing.assert_close(moved.mean, prediction.mean)
+    motions = posterior.rollout(at.q[0], at.v[0], at.u, 0.002, samples=3)
+    assert motions.samples is not None
+    assert np.abs(motions.q[-1].numpy() - motion(seed=1).q[5]).max() < 1e-3
+
+
+def test_what_needs_single_rows_is_refused_with_a_remedy():
+    data, posterior = motion(), fitted()
+    for attempt in (
+        posterior.leave_out,
+        lambda: posterior.update(data.rows([1, 2])),
+        lambda: posterior.predictor(covariance="compressed", compile=False),
+    ):
+        with pytest.raises(InvalidInput, match="fit to accelerations, without observe"):
+            attempt()
+    model = StructuredGP(data.system, JointFriction())
+    for how in ({"engine": "inducing"}, {"learning_points": 5}):
+        with pytest.raises(InvalidInput, match=r"windows .* are conditioned on exactly"):
+            model.fit(data, observe=HOW, **how)
+    with pytest.raises(InvalidInput, match=r"no observation 'weak' .*did you mean 'weak-form'"):
+        model.fit(data, observe="weak")
+    with pytest.raises(InvalidInput, match=r"points=99 is not between 2 and the \d+ windows of 0.1 s"):
+        model.fit(data, observe=HOW, points=99)
+
+
+def test_more_windows_than_memory_holds_are_refused(monkeypatch):
+    monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda device: 10_000)
+    data = motion()
+    with pytest.raises(NotEnoughMemory, match=r"the likelihood of 24 windows of 8 nodes needs .* fewer points"):
+        StructuredGP(data.system, JointFriction()).fit(data, observe=HOW, **FIT)
+
+
+def test_equal_seeds_give_equal_models_from_several_starts():
+    data, options = motion(), OptimizerOptions(iterations=5)
+    how = {"observe": "weak-form", "points": 8, "restarts": 2, "seed": 3, "options": options}
+    first, second = (StructuredGP(data.system, JointFriction()).fit(data, **how) for _ in range(2))
+    assert first.result.value == second.result.value
+    assert len(first.settings["restart_objective"]) == 2
