@@ -9,8 +9,9 @@ model-selection for dependent data: hv-block cross-validation").
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any, ClassVar
 
 import numpy as np
@@ -130,9 +131,8 @@ def hold_out_episodes(dataset: Dataset, episodes: Sequence[int]) -> Split:
             f"all episodes {list(dataset.episodes)} are held out; leave one to learn from, or hold out blocks of time "
             f"({DEFAULT_BLOCKS})."
         )
-    listed = _listed(episodes)
-    plural = "s" if len(episodes) > 1 else ""
-    words = f"trained on whole episodes ({_listed(rest)}), tested on others (episode{plural} {listed})"
+    told, others = (_listed([_called(dataset, number) for number in numbers]) for numbers in (episodes, rest))
+    words = f"trained on whole episodes ({others}), tested on others ({told})"
     return Split(f"episodes-{'-'.join(map(str, episodes))}", words, tuple(Stretch(number) for number in episodes))
 
 
@@ -191,6 +191,7 @@ def split_named(text: str, dataset: Dataset, guard: float = 0.25) -> tuple[Split
     """The splits of a text as in --split: several for leave-one-out, else one.
 
     `auto` is a quarter of the episodes, or with one episode blocks 3 and 5 of five. `guard` [s] is for blocks only.
+    Episodes that `forcegp import` made may be named by a part of the name of their log.
     Raises InvalidInput for anything else, and as the functions above.
     """
     kind, _, rest = text.partition(":")
@@ -202,7 +203,7 @@ def split_named(text: str, dataset: Dataset, guard: float = 0.25) -> tuple[Split
         return leave_one_episode_out(dataset)
     try:
         if kind == "episodes":
-            return (hold_out_episodes(dataset, _numbers(rest)),)
+            return (hold_out_episodes(dataset, [n for word in rest.split(",") for n in _episodes(dataset, word)]),)
         if kind == "fraction":
             fraction, _, seed = rest.partition(":")
             return (hold_out_fraction(dataset, float(fraction), int(seed or 0)),)
@@ -216,10 +217,44 @@ def split_named(text: str, dataset: Dataset, guard: float = 0.25) -> tuple[Split
     raise InvalidInput(f"the split is {text!r}; give auto, {FORMS}, for example {DEFAULT_BLOCKS}.")
 
 
+def _episodes(dataset: Dataset, word: str) -> list[int]:
+    """The episode of this number, or those of the one log with this text in its name."""
+    word = word.strip()
+    if word.isdecimal() and int(word) in dataset.episodes:
+        return [int(word)]
+    logs = _logs(dataset)
+    found = sorted({name for name in logs.values() if word and word in name})
+    if len(found) != 1:
+        what = f"several logs are called so ({', '.join(found)})" if found else "no episode or log is called so"
+        known = f", from {', '.join(dict.fromkeys(logs.values()))}" if logs else ""
+        raise InvalidInput(f"episodes:{word}: {what}; the dataset has episodes {list(dataset.episodes)}{known}.")
+    return [number for number, name in logs.items() if name == found[0]]
+
+
+def _logs(dataset: Dataset) -> dict[int, str]:
+    """Name of the log of every episode, where `forcegp import` wrote it down."""
+    imported = dataset.metadata.get("import")
+    listed = imported.get("episodes") if isinstance(imported, Mapping) else None
+    if not isinstance(listed, Sequence):
+        return {}
+    names = {
+        number: PurePath(str(entry["recording"])).name
+        for number, entry in enumerate(listed)
+        if isinstance(entry, Mapping) and "recording" in entry
+    }
+    return {number: names[number] for number in dataset.episodes if number in names}
+
+
+def _called(dataset: Dataset, number: int) -> str:
+    name = _logs(dataset).get(number)
+    return f"episode {number}" if name is None else f"episode {number}, {name}"
+
+
 def _numbers(text: str) -> list[int]:
     return [int(part) for part in text.split(",")]
 
 
-def _listed(numbers: Sequence[int]) -> str:
-    *first, last = map(str, numbers)
-    return f"{', '.join(first)} and {last}" if first else last
+def _listed(parts: Sequence[int | str]) -> str:
+    *first, last = map(str, parts)
+    separator = "; " if any("," in part for part in (*first, last)) else ", "
+    return f"{separator.join(first)} and {last}" if first else last

@@ -1,0 +1,71 @@
+"""A small arm that moves through time: heavier than its URDF says, and with friction that nobody told the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tests.models.arm import URDF
+
+from forcegp.data import Dataset, units_for
+from forcegp.integration import integrator_named
+from forcegp.mechanics import (
+    Actuation,
+    CoulombJointFriction,
+    MechanicalSystem,
+    RigidBodyBias,
+    ViscousJointFriction,
+)
+from forcegp.robots import Robot
+
+NOISE = 0.2
+STEP = 0.01
+
+
+def given_system() -> MechanicalSystem:
+    """What the model is told: the URDF alone."""
+    return MechanicalSystem(Robot.from_urdf_text(URDF))
+
+
+def true_system() -> MechanicalSystem:
+    """What really moves: other masses, dry and viscous friction."""
+    heavier = URDF.replace('mass value="1.2"', 'mass value="1.5"').replace('mass value="0.6"', 'mass value="0.8"')
+    friction = (ViscousJointFriction(0.3), CoulombJointFriction(0.5, 0.1))
+    return MechanicalSystem(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodyBias(), *friction))
+
+
+def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0) -> Dataset:
+    """Episodes of a controlled motion at 100 Hz; u[k] acts from row k to row k + 1, a has noise of known level."""
+    system, generator = true_system(), np.random.default_rng(seed)
+    rows = round(seconds / STEP)
+    time = STEP * np.arange(rows)
+    shape = (3, 1, episodes, 3)  # sines, times, episodes, joints
+    rate, phase = generator.uniform(2.0, 6.0, shape), generator.uniform(0.0, 6.0, shape)
+    size = generator.uniform(0.1, 0.3, shape)
+    angle = rate * time[:, None, None] + phase
+    wanted = (size * np.sin(angle)).sum(0) + np.array([0.0, 0.7, 0.7])
+    speed = (size * rate * np.cos(angle)).sum(0)
+    q, v = torch.tensor(wanted[0]), torch.tensor(speed[0])
+    integrator = integrator_named("rk4", system)
+    found: dict[str, list[np.ndarray]] = {"q": [], "v": [], "u": [], "a": []}
+    for k in range(rows):
+        u = system.robot.bias_forces(q, v) + torch.tensor([30.0, 30.0, 15.0]) * (torch.tensor(wanted[k]) - q)
+        u = u + torch.tensor([4.0, 4.0, 2.0]) * (torch.tensor(speed[k]) - v)
+
+        def acceleration(q, v, u=u):
+            return system.dynamics(q, v, u).acceleration_map().offset
+
+        for name, values in (("q", q), ("v", v), ("u", u), ("a", acceleration(q, v))):
+            found[name].append(values.numpy())
+        step = integrator.step(acceleration, q, v, STEP)
+        q, v = step.q, step.v
+    arrays = {name: np.stack(values, axis=1).reshape(-1, 3) for name, values in found.items()}
+    given = given_system()
+    return Dataset(
+        **{**arrays, "a": arrays["a"] + NOISE * generator.normal(size=arrays["a"].shape)},
+        time=np.tile(time, episodes),
+        episode=np.repeat(np.arange(episodes), rows),
+        joint_names=given.robot.joint_names,
+        units=units_for(given.robot),
+        system=given,
+        noise_std=np.full(3, NOISE),
+    )
