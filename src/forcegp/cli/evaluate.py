@@ -69,7 +69,7 @@ class Evaluate(Command):
             "every": self.every,
             "system": self.system,
             "model": posterior.description,
-            "points": len(posterior.training.q),
+            "points": len(posterior.training),
             **evaluation.to_dict(),
             "forces": forces.to_dict(),
             "normal_force_rests_on_prior": rests_on_prior,
@@ -146,7 +146,7 @@ def _report(
 ) -> list[Any]:
     from forcegp.cli.tables import evaluation_table, facts, number
 
-    points = len(posterior.training.q)
+    points = len(posterior.training)
     units = dataset.units["a"]
     unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
     where = "" if posterior.target is None else ", carried to the robot and contacts of the data"

@@ -15,10 +15,13 @@ from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import (
     ITERATIONS_HINT,
     POINTS_HINT,
+    WINDOW,
+    LearnFrom,
     ModelName,
     make_model,
     resolved,
     search_arguments,
+    window_observation,
 )
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
@@ -62,6 +65,7 @@ class Fit(FitOptions):
       forcegp fit train.h5 --model independent-gp --points 100 --out baseline
       forcegp fit train.h5 --points 100 --restarts 8 --backend ray --address 10.0.0.1:6379 --out run
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
+      forcegp fit raw.h5 --learn-from weak-form --window 0.1 --points 100 --out run
     """
 
     model: ModelName = "structured"
@@ -95,6 +99,13 @@ class Fit(FitOptions):
     """What the unknown forces may be. joint: a force at every joint, on (q, v, u). joint-friction: on its own velocity.
     tool-friction: tangential forces at the contact, on its velocity. contact-friction: isotropic; load-friction:
     the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md."""
+    learn_from: Annotated[LearnFrom, arg(metavar="accelerations|increments|weak-form")] = "accelerations"
+    """accelerations: of the dataset. increments, weak-form: from raw velocities or positions over short windows, of
+    which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
+    window: Annotated[
+        float | None, arg(metavar="SECONDS", constructor=float, help_behavior_hint=f"(default: {WINDOW})")
+    ] = None
+    """Length of the windows."""
     iterations: Annotated[
         int | None,
         arg(metavar="N", constructor=int, help_behavior_hint=ITERATIONS_HINT),
@@ -122,7 +133,8 @@ class Fit(FitOptions):
         system = self._system(dataset)
         dataset, rows_note = self._rows(dataset, system)
         model = make_model(command, system.to(self.device), dataset)
-        points = min(command.points, len(dataset))
+        observe = window_observation(command.learn_from, command.window)
+        points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
         posterior = fit(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
         with folder_written_whole(self.out) as folder:
@@ -161,8 +173,8 @@ def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
     return {
         "model": posterior.description,
         "objective_is": posterior.objective,
-        "points": len(posterior.training.q),
-        "learning_points": settings.get("learning_points", len(posterior.training.q)),
+        "points": len(posterior.training),
+        "learning_points": settings.get("learning_points", len(posterior.training)),
         "objective_start": result.history[0],
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,

@@ -10,11 +10,13 @@ from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
     from forcegp.cli.fit import Fit
-    from forcegp.data import Dataset
+    from forcegp.data import Dataset, WindowObservation
     from forcegp.mechanics import MechanicalSystem
     from forcegp.models import Model, Noise
 
 ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
+
+LearnFrom = Literal["accelerations", "increments", "weak-form"]
 
 NETWORKS = ("neural-network", "ensemble")
 SEARCHED = ("structured", "unconstrained", "independent-gp")
@@ -28,6 +30,7 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "jobs": SEARCHED,
     "engine": ("structured", "unconstrained"),
     "learning_points": ("structured", "unconstrained"),
+    "learn_from": ("structured", "unconstrained", "analytical"),
     "backend": SEARCHED,
     "address": SEARCHED,
     "adam_steps": (*SEARCHED, "analytical"),
@@ -37,6 +40,8 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
 
 POINTS, NETWORK_POINTS = 200, 10_000
 POINTS_HINT = f"(default: {POINTS}; networks {NETWORK_POINTS})"
+WINDOW = 0.1
+"""Length of a window where none is given, in s."""
 ITERATIONS = 200
 ITERATIONS_HINT = f"(default: {ITERATIONS}; networks 5000, ensembles 3000)"
 START_NOISE = 0.1
@@ -57,6 +62,8 @@ def resolved(command: Fit) -> Fit:
             f"--noise learned means nothing to --model {command.model}: it estimates the noise where the dataset does "
             "not state it; leave --noise out, or give SIGMA."
         )
+    if command.window is not None and command.learn_from == "accelerations":
+        raise InvalidInput("--window means nothing to accelerations; add --learn-from weak-form, or leave it out.")
     network = command.model in NETWORKS
     changes: dict[str, Any] = {}
     if command.points is None:
@@ -77,7 +84,8 @@ def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Mode
         noise = _known_noise(command.noise, dataset)
         steps = {} if command.iterations is None else {"steps": command.iterations}
         return (NeuralNetwork if command.model == "neural-network" else NetworkEnsemble)(system, noise, **steps)
-    noise = resolved_noise(command.noise, dataset, command.force_noise)
+    windows = command.learn_from != "accelerations"
+    noise = (noise_of_windows if windows else resolved_noise)(command.noise, dataset, command.force_noise)
     if command.model == "independent-gp":
         return IndependentGP(system, noise=noise)
     if command.model == "unconstrained":
@@ -97,15 +105,33 @@ def search_arguments(command: Fit, points: int) -> dict[str, Any]:
         return {"seed": command.seed}
     assert command.iterations is not None, "a resolved command has iterations"
     engine = {"engine": command.engine, "learning_points": command.learning_points}
+    observe = window_observation(command.learn_from, command.window)
     options = default_options(points)
     return {
         "seed": command.seed,
         **(engine if command.model in MEANT_FOR["engine"] else {}),
+        **({} if observe is None else {"observe": observe}),
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,
         "options": replace(options, iterations=command.iterations, adam_steps=command.adam_steps),
     }
+
+
+def window_observation(learn_from: LearnFrom, seconds: float | None) -> WindowObservation | None:
+    """What to observe of windows of that length; None for accelerations. Raises InvalidInput for no length."""
+    if learn_from == "accelerations":
+        return None
+    from forcegp.data import VelocityIncrements, WeakForm
+
+    return (WeakForm if learn_from == "weak-form" else VelocityIncrements)(WINDOW if seconds is None else seconds)
+
+
+def noise_of_windows(given: str, dataset: Dataset, force: float | None = None) -> Noise | None:
+    """`resolved_noise` of windows, which no dataset states: it is learned unless it is a number."""
+    from forcegp.models import Noise
+
+    return resolved_noise(given, dataset, force) if given not in ("dataset", "learned") else Noise(None, force, True)
 
 
 def resolved_noise(given: str, dataset: Dataset, force: float | None = None) -> Noise | None:

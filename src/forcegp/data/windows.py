@@ -98,6 +98,10 @@ class WindowObservation(ABC):
         """Name and settings as plain JSON values."""
         return {"name": self.name, **asdict(self)}  # type: ignore[call-overload]  # every observation is a dataclass
 
+    def count(self, dataset: Dataset) -> int:
+        """How many windows the dataset has; raises as `windows`."""
+        return len(_window_rows(dataset, self))
+
     def windows(self, dataset: Dataset, points: int | None = None) -> Windows:
         """The `points` windows whose mean states (q, v, u) lie farthest apart; all of them for None.
 

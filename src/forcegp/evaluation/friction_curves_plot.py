@@ -119,7 +119,7 @@ def friction_curves_figure(
     what = "Friction" if all("friction" in panel.component for panel in chosen) else "Forces"
     left_out = len(panels) - len(chosen)
     figure.suptitle(
-        f"{what} learned from {len(posterior.training.q)} points"
+        f"{what} learned from {len(posterior.training)} points"
         + (f" ({len(chosen)} of {len(panels)} curves)" if left_out else ""),
         fontsize=LARGE,
         fontweight="bold",

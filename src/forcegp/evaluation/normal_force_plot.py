@@ -69,7 +69,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     handles, labels = legend_entries(*grid.ravel())
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False)
     figure.suptitle(
-        f"Normal force after {len(posterior.training.q)} training points",
+        f"Normal force after {len(posterior.training)} training points",
         fontsize=LARGE,
         fontweight="bold",
         x=0.01,

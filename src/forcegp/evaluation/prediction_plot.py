@@ -57,7 +57,7 @@ def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 
         fontsize=NORMAL,
         frameon=False,
         markerscale=4,
-        title=f"Prediction after {len(posterior.training.q)} training points",
+        title=f"Prediction after {len(posterior.training)} training points",
         title_fontproperties={"size": LARGE, "weight": "bold"},
         alignment="left",
     )

@@ -79,7 +79,7 @@ def summary_figure(
         handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False, markerscale=4
     )
     figure.suptitle(
-        f"{len(posterior.training.q)} points teach {_what(posterior)}"
+        f"{len(posterior.training)} points teach {_what(posterior)}"
         + excerpt(rows, dataset, before=" (time panels: ", after=")"),
         fontsize=LARGE + 1,
         fontweight="bold",
