@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import h5py
 import numpy as np
@@ -48,7 +48,7 @@ class DatasetWriter:
         self._stack = ExitStack()
         self._file: h5py.File
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> DatasetWriter:
         with ExitStack() as stack:
             temporary = stack.enter_context(file_written_whole(self.path))
             self._file = stack.enter_context(h5py.File(temporary, "x"))

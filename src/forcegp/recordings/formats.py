@@ -16,7 +16,7 @@ from forcegp.recordings.matlab import matlab_file
 from forcegp.recordings.numpy_archive import NumpyArchive
 from forcegp.recordings.parquet import ParquetFile
 from forcegp.recordings.ros_bag import RosBag
-from forcegp.recordings.source import Source
+from forcegp.recordings.source import Source, reading
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")
 ARRAYS: dict[str, Callable[..., ArrayFile]] = {
@@ -87,6 +87,6 @@ def _kind(path: Path) -> str:
 
 
 def _require_foreign(path: Path) -> None:
-    with h5py.File(path, "r") as file:
+    with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
         if file.attrs.get("format") == "forcegp-dataset":
             raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")

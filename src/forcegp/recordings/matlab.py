@@ -43,7 +43,7 @@ class MatlabHDF5(HDF5Arrays):
         yield from self._row_blocks(name, rows) if self._is_row(name) else super().blocks(name, rows)
 
     def _is_row(self, name: str) -> bool:
-        with h5py.File(self.path, "r") as file:
+        with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
             return _is_row(tuple(reversed(file[name].shape)))  # type: ignore[union-attr]  # one of the arrays
 
     def _row_blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:

@@ -150,7 +150,7 @@ class _Batches:
 
     def __init__(self, kind: str, types: Mapping[str, Any], wanted: Mapping[str, str], *, ros1: bool) -> None:
         self.kind, self.types, self.ros1 = kind, types, ros1
-        self.stamps = [name for name, own in wanted.items() if own == LOG_TIME]
+        self.wanted = wanted
         self.fields = {name: own for name, own in wanted.items() if own != LOG_TIME}
         self.layouts: dict[int, list[MessageLayout]] = {}
 
@@ -167,8 +167,10 @@ class _Batches:
             return {}, 0
         rows = np.concatenate([part[0] for part in parts])
         order = np.argsort(rows)
-        columns = {name: np.concatenate([part[1][name] for part in parts])[order] for name in self.fields}
-        columns |= {name: stamps[rows[order]] for name in self.stamps}
+        columns: Columns = {}
+        for name, own in self.wanted.items():
+            joined = stamps[rows] if own == LOG_TIME else np.concatenate([part[1][name] for part in parts])
+            columns[name] = joined[order]
         return columns, len(rows)
 
     def _of_one_length(self, messages: np.ndarray, rows: np.ndarray) -> Iterator[tuple[np.ndarray, Columns]]:

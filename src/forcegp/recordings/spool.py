@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +23,7 @@ class Spool:
         self.rows = 0
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # closed by __exit__
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Spool:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,0 +1,259 @@
+"""Every format passes the same tests."""
+
+import numpy as np
+import pytest
+from tests.recordings.log_files import (
+    EPOCH,
+    JOINTS,
+    motion,
+    table,
+    write_bag1,
+    write_bag2,
+    write_hdf5,
+    write_lerobot,
+    write_matlab5,
+    write_matlab73,
+    write_parquet,
+    write_text,
+)
+from tests.recordings.source_conformance import SourceConformance
+
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.recordings import open_source
+
+
+class Tables(SourceConformance):
+    def open(self, path):
+        return open_source(path)
+
+    def expected(self):
+        return table(motion())
+
+
+class TestCsv(Tables):
+    def write(self, folder):
+        return write_text(folder / "log.csv", table(motion()))
+
+    def truncated(self, path):
+        lines = path.read_text().splitlines()
+        cut = path.read_text().rindex(lines[-1]) + 10  # in the middle of the last line
+        path.write_text(path.read_text()[:cut])
+        return None
+
+
+class TestCompressedCsv(Tables):
+    def write(self, folder):
+        return write_text(folder / "log.csv.gz", table(motion()))
+
+
+class TestTabs(TestCsv):
+    def write(self, folder):
+        return write_text(folder / "log.tsv", table(motion()), delimiter="\t")
+
+
+class TestBlanksAndComments(TestCsv):
+    def write(self, folder):
+        return write_text(folder / "log.txt", table(motion()), delimiter="   ", before="# a robot\n\n# 2 joints\n")
+
+
+class TestHeaderInComment(TestCsv):
+    def write(self, folder):
+        return write_text(folder / "log.dat", table(motion()), delimiter=" ", before="# ")
+
+
+class TestHeaderless(TestCsv):
+    def write(self, folder):
+        values = np.stack(list(table(motion()).values()), axis=1)
+        path = folder / "log.txt"
+        path.write_text("\n".join(repr(float(value)) for value in values.ravel()) + "\n")
+        return path
+
+    def open(self, path):
+        return open_source(path, headerless=7)
+
+    def expected(self):
+        return {f"c{index + 1}": values for index, values in enumerate(table(motion()).values())}
+
+
+class TestParquet(Tables):
+    def write(self, folder):
+        return write_parquet(folder / "log.parquet", table(motion()))
+
+
+class TestParquetOfLists(Tables):
+    def write(self, folder):
+        return write_parquet(folder / "log.parquet", motion())
+
+    def expected(self):
+        return arrays("")
+
+
+def arrays(prefix):
+    data = motion()
+    columns = {f"{prefix}time": data["time"]}
+    for signal in "qvu":
+        columns |= {f"{prefix}{signal}[{index}]": data[signal][:, index] for index in range(2)}
+    return columns
+
+
+class TestNumpyArchive(Tables):
+    def write(self, folder):
+        np.savez(folder / "log.npz", dt=0.1, name="arm", **motion())
+        return folder / "log.npz"
+
+    def expected(self):
+        return arrays("")
+
+
+class TestCompressedNumpyArchiveColumnByColumn(TestNumpyArchive):
+    def write(self, folder):
+        data = {name: np.asfortranarray(values) for name, values in motion().items()}
+        np.savez_compressed(folder / "log.npz", **data)
+        return folder / "log.npz"
+
+
+class TestPartOfAnArchive(TestNumpyArchive):
+    def write(self, folder):
+        both = {"run1": np.zeros((3, 2)), "run2": motion()["q"]}
+        np.savez_compressed(folder / "log.npz", **both)
+        return folder / "log.npz"
+
+    def open(self, path):
+        return open_source(path, within="run2")
+
+    def expected(self):
+        return {f"[{index}]": motion()["q"][:, index] for index in range(2)}
+
+
+class TestHDF5(Tables):
+    def write(self, folder):
+        return write_hdf5(folder / "log.h5", motion())
+
+    def expected(self):
+        return arrays("log/")
+
+
+class TestMatlab5(Tables):
+    def write(self, folder):
+        return write_matlab5(folder / "log.mat", motion())
+
+    def expected(self):
+        return arrays("log/")
+
+
+class TestMatlab73(Tables):
+    def write(self, folder):
+        return write_matlab73(folder / "log.mat", motion())
+
+    def expected(self):
+        return arrays("")
+
+
+class Bags(Tables):
+    @pytest.fixture(autouse=True, scope="class")
+    def rosbags(self):
+        pytest.importorskip("rosbags")
+
+    def expected(self):
+        data, topic = motion(), "/joint_states"
+        stamps = EPOCH + np.round(data["time"] * 1e9).astype(np.int64)
+        columns = {f"{topic}:header.stamp": stamps, f"{topic}:log_time": stamps + 1000}
+        for signal, name in (("q", "position"), ("v", "velocity"), ("u", "effort")):
+            columns |= {f"{topic}:{name}.{joint}": data[signal][:, i] for i, joint in enumerate(JOINTS)}
+        return columns
+
+
+class TestRos1Bag(Bags):
+    def write(self, folder):
+        return write_bag1(folder / "log.bag", motion())
+
+
+class TestRos2Folder(Bags):
+    def write(self, folder):
+        return write_bag2(folder / "log", motion())
+
+    def truncated(self, path):
+        return next(path.glob("*.mcap"))
+
+
+class TestRos2FolderOfSqlite(TestRos2Folder):
+    def write(self, folder):
+        return write_bag2(folder / "log", motion(), "sqlite3")
+
+    def truncated(self, path):
+        return next(path.glob("*.db3"))
+
+
+class TestBareMcap(Bags):
+    def write(self, folder):
+        return next(write_bag2(folder / "log", motion()).glob("*.mcap"))
+
+
+class TestBareSqlite(Bags):
+    def write(self, folder):
+        return next(write_bag2(folder / "log", motion(), "sqlite3").glob("*.db3"))
+
+
+class TestTopicWithTwoPublishers(TestRos2Folder):
+    def write(self, folder):
+        return write_bag2(folder / "log", motion(), gripper=True)
+
+    def test_messages_of_the_other_are_counted(self, source):
+        list(source.chunks(["/joint_states:position.elbow"], 64))
+        assert source.notes()[0].startswith("67 messages")
+
+
+class TestAnyMessage(TestRos2Folder):
+    def expected(self):
+        row = np.arange(200.0)
+        return {
+            "/wrench:wrench.force.x": row,
+            "/wrench:wrench.force.y": np.full(200, 0.5),
+            "/wrench:wrench.torque.z": row**2,
+        }
+
+
+class TestLeRobot3(Tables):
+    version = "v3.0"
+
+    def write(self, folder):
+        return write_lerobot(folder / "log", motion(), self.version)
+
+    def truncated(self, path):
+        return sorted(path.rglob("*.parquet"))[-1]
+
+    def expected(self):
+        data = motion()
+        columns = {
+            f"observation.state.{signal}_{joint}": data[signal][:, i]
+            for signal in "qv"
+            for i, joint in enumerate(JOINTS)
+        }
+        columns |= {f"observation.effort.{joint}": data["u"][:, i] for i, joint in enumerate(JOINTS)}
+        return columns | {"episode_index": np.repeat([0, 1], 100)}
+
+
+class TestLeRobot21(TestLeRobot3):
+    version = "v2.1"
+
+
+def test_columns_of_several_topics_are_refused(tmp_path):
+    pytest.importorskip("rosbags")
+    source = open_source(write_bag2(tmp_path / "log", motion(10)))
+    with pytest.raises(InvalidInput, match="topics /joint_states, /wrench"):
+        list(source.chunks(["/joint_states:log_time", "/wrench:log_time"], 10))
+
+
+def test_options_of_other_formats_are_refused(tmp_path):
+    with pytest.raises(InvalidInput, match="mean nothing to"):
+        open_source(write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)
+    with pytest.raises(InvalidInput, match="means nothing to"):
+        open_source(write_text(tmp_path / "log.csv", table(motion(10))), within="run1")
+
+
+def test_a_dataset_of_our_own_is_not_a_log(tmp_path):
+    from tests.models.arm import arm_data
+
+    arm_data(20, seed=0).save(tmp_path / "arm.h5")
+    with pytest.raises(FileFormatError, match="a dataset of forcegp already"):
+        open_source(tmp_path / "arm.h5")
