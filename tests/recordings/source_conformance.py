@@ -28,9 +28,10 @@ class SourceConformance(ABC):
         return path
 
     @pytest.fixture(scope="class")
-    def path(self, tmp_path_factory) -> Path:
+    @classmethod
+    def path(cls, tmp_path_factory) -> Path:
         """Nobody changes this one."""
-        return self.write(tmp_path_factory.mktemp("log"))
+        return cls().write(tmp_path_factory.mktemp("log"))
 
     @pytest.fixture
     def own_path(self, path: Path, tmp_path: Path) -> Path:
@@ -39,8 +40,9 @@ class SourceConformance(ABC):
         return Path(shutil.copytree(path, made) if path.is_dir() else shutil.copy(path, made))
 
     @pytest.fixture(scope="class")
-    def source(self, path: Path) -> Source:
-        return self.open(path)
+    @classmethod
+    def source(cls, path: Path) -> Source:
+        return cls().open(path)
 
     def read(self, source: Source, names: list[str], rows: int) -> dict[str, np.ndarray]:
         pieces = list(source.chunks(names, rows))

@@ -151,7 +151,8 @@ class TestMatlab73(Tables):
 
 class Bags(Tables):
     @pytest.fixture(autouse=True, scope="class")
-    def rosbags(self):
+    @classmethod
+    def rosbags(cls):
         pytest.importorskip("rosbags")
 
     def expected(self):
