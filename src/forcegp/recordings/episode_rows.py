@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 
 from forcegp.data import differentiate
 from forcegp.recordings.spool import Spool
 from forcegp.recordings.time_stamps import Stretch
 
-ROWS_AT_A_TIME = 65536
+ROWS_AT_A_TIME = 16384
 
 SPLINE_HALO = 64
 """Rows on either side that a piece of a spline is fitted with: the rest moves it by less than 0.27^64 of itself."""
@@ -88,4 +88,4 @@ class EpisodeRows:
         def interpolated(self, time: np.ndarray) -> np.ndarray:
             low = max(int(np.searchsorted(self.time, time[0])) - SPLINE_HALO, 0)
             high = min(int(np.searchsorted(self.time, time[-1])) + SPLINE_HALO, len(self.time))
-            return CubicSpline(self.time[low:high], self.rows(low, high), axis=0)(time)
+            return make_interp_spline(self.time[low:high], self.rows(low, high), k=3)(time)

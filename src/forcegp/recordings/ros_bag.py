@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput, MissingExtra
 from forcegp.recordings.message_layout import MessageLayout, message_layout
+from forcegp.recordings.raw_messages import RawMessages, topic_messages
 from forcegp.recordings.size_limits import require_plausible_size
 from forcegp.recordings.source import Columns, Source, reading
 
@@ -135,12 +136,9 @@ class RosBag(Source):
             if len(kinds) > 1:
                 raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
             batches = _Batches(kinds[0], reader.typestore.fielddefs, wanted, ros1=self.ros1)
-            messages = reader.messages(connections)
-            while batch := list(islice(messages, rows)):
-                raw = [bytes(data) for _, _, data in batch]
-                stamps = np.fromiter((stamp for _, stamp, _ in batch), np.int64, len(batch))
-                columns, kept = batches.columns(raw, stamps)
-                self._left_out += len(batch) - int(kept)
+            for messages in topic_messages(reader, connections, rows):
+                columns, kept = batches.columns(messages)
+                self._left_out += len(messages.stamps) - kept
                 if kept:
                     yield columns
 
@@ -154,22 +152,19 @@ class _Batches:
         self.fields = {name: own for name, own in wanted.items() if own != LOG_TIME}
         self.layouts: dict[int, list[MessageLayout]] = {}
 
-    def columns(self, raw: list[bytes], stamps: np.ndarray) -> tuple[Columns, int]:
+    def columns(self, messages: RawMessages) -> tuple[Columns, int]:
         """The columns of the messages that have them all, and how many these are."""
-        lengths = np.fromiter(map(len, raw), np.int64, len(raw))
         parts: list[tuple[np.ndarray, Columns]] = []
-        for length in np.unique(lengths):
-            rows = np.flatnonzero(lengths == length)
-            joined = b"".join(raw) if len(rows) == len(raw) else b"".join(raw[row] for row in rows)
-            messages = np.frombuffer(joined, np.uint8).reshape(len(rows), int(length))
-            parts.extend(self._of_one_length(messages, rows))
+        for length in np.unique(messages.lengths):
+            rows = np.flatnonzero(messages.lengths == length)
+            parts.extend(self._of_one_length(messages.table(rows, int(length)), rows))
         if not parts:
             return {}, 0
         rows = np.concatenate([part[0] for part in parts])
         order = np.argsort(rows)
         columns: Columns = {}
         for name, own in self.wanted.items():
-            joined = stamps[rows] if own == LOG_TIME else np.concatenate([part[1][name] for part in parts])
+            joined = messages.stamps[rows] if own == LOG_TIME else np.concatenate([part[1][name] for part in parts])
             columns[name] = joined[order]
         return columns, len(rows)
 
