@@ -1,5 +1,18 @@
 """What classical identification offers: linear regression of joint torques and its physically consistent relatives."""
 
+from forcegp.analytical.base_parameters import BaseParameters, base_parameters, excitation
+from forcegp.analytical.identification import identify_analytical
 from forcegp.analytical.regressor import body_names, parameter_names, standard_parameters, torque_regressor
+from forcegp.analytical.result import AnalyticalIdentification
 
-__all__ = ["body_names", "parameter_names", "standard_parameters", "torque_regressor"]
+__all__ = [
+    "AnalyticalIdentification",
+    "BaseParameters",
+    "base_parameters",
+    "body_names",
+    "excitation",
+    "identify_analytical",
+    "parameter_names",
+    "standard_parameters",
+    "torque_regressor",
+]

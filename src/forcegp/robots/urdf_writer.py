@@ -1,12 +1,14 @@
-"""Write identified inertials back into the original URDF text; every other byte stays as it is."""
+"""Write identified inertials and friction back into the original URDF text; every other byte stays as it is."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from xml.parsers import expat
 
 import numpy as np
 
-from forcegp.errors import UnknownLink
+from forcegp.errors import UnknownJoint, UnknownLink
 
 
 def replace_inertial(
@@ -18,7 +20,7 @@ def replace_inertial(
     """
     data = text.encode("utf-8")
     newline = b"\r\n" if b"\r\n" in data else b"\n"
-    spans = _find_link(data, link)
+    spans = _find(data, "link", link, "inertial")
     if spans is None:
         raise UnknownLink(f"{source}: no link {link!r} in the URDF text.")
     (start, head_end), inertial = spans
@@ -34,13 +36,38 @@ def replace_inertial(
     return (data[:head_end] + element + data[head_end:]).decode("utf-8")
 
 
-def _find_link(data: bytes, link: str) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
-    """Byte offsets (first, one past last) of a link's start tag and of the ``<inertial>`` element directly in it."""
+def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
+    """URDF text with attributes of the ``<dynamics>`` element of ``joint`` replaced or added ('damping', 'friction').
+
+    Attributes that are not named stay, with digits that read back exactly.
+    """
+    data = text.encode("utf-8")
+    spans = _find(data, "joint", joint, "dynamics")
+    if spans is None:
+        raise UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
+    (start, head_end), dynamics = spans
+    if dynamics is None:
+        indent = _indent_of(data, start)
+        newline = b"\r\n" if b"\r\n" in data else b"\n"
+        attributes = " ".join(f'{name}="{value!r}"' for name, value in values.items())
+        element = newline + indent + b"  " + f"<dynamics {attributes}/>".encode()
+        return (data[:head_end] + element + data[head_end:]).decode("utf-8")
+    first, last = dynamics
+    element = data[first:last].decode("utf-8")
+    for name, value in values.items():
+        written = f' {name}="{value!r}"'
+        element, found = re.subn(rf"\s{name}\s*=\s*(\"[^\"]*\"|'[^']*')", written, element, count=1)
+        element = element if found else element.replace("<dynamics", f"<dynamics{written}", 1)
+    return (data[:first] + element.encode() + data[last:]).decode("utf-8")
+
+
+def _find(data: bytes, kind: str, name: str, part: str) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
+    """Byte offsets (first, one past last) of an element's start tag, and of the element ``part`` directly in it."""
     parser = expat.ParserCreate("utf-8")
     depth = 0
     inside = False
     found: list[int] = []
-    inertial: list[int] = []
+    child: list[int] = []
 
     def after_tag(position: int) -> int:
         quote = b""
@@ -58,16 +85,16 @@ def _find_link(data: bytes, link: str) -> tuple[tuple[int, int], tuple[int, int]
         nonlocal depth, inside
         position = parser.CurrentByteIndex
         depth += 1
-        if depth == 2 and tag == "link" and attributes.get("name") == link:
+        if depth == 2 and tag == kind and attributes.get("name") == name:
             inside = True
             found.extend((position, after_tag(position)))
-        elif inside and depth == 3 and tag == "inertial":
-            inertial.append(position)
+        elif inside and depth == 3 and tag == part:
+            child.append(position)
 
     def end(tag: str) -> None:
         nonlocal depth, inside
-        if inside and depth == 3 and tag == "inertial":
-            inertial.append(after_tag(parser.CurrentByteIndex))
+        if inside and depth == 3 and tag == part:
+            child.append(after_tag(parser.CurrentByteIndex))
         inside = inside and depth > 2
         depth -= 1
 
@@ -76,7 +103,7 @@ def _find_link(data: bytes, link: str) -> tuple[tuple[int, int], tuple[int, int]
     parser.Parse(data, True)
     if not found:
         return None
-    return (found[0], found[1]), ((inertial[0], inertial[1]) if inertial else None)
+    return (found[0], found[1]), ((child[0], child[1]) if child else None)
 
 
 def _indent_of(data: bytes, position: int) -> bytes:

@@ -1,0 +1,143 @@
+"""Identification of a robot from recorded motions by regression: what classical methods make of the same data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+
+from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies
+from forcegp.analytical.identified_robot import thickened
+from forcegp.analytical.joint_terms import JointTerms
+from forcegp.analytical.least_squares import weighted_least_squares
+from forcegp.analytical.recorded_rows import RecordedRows
+from forcegp.analytical.regressor import body_pseudo_inertias
+from forcegp.analytical.result import AnalyticalIdentification
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import MechanicalSystem
+
+Inertias = Literal["consistent", "free"]
+Likelihood = Literal["torque", "acceleration"]
+ROWS = 20_000
+"""Rows that are used at most, evenly spread: more of a filtered recording say little more."""
+
+
+def identify_analytical(
+    system: MechanicalSystem,
+    dataset: Dataset,
+    *,
+    friction: Sequence[str] = ("viscous", "coulomb"),
+    rotors: Literal["armature", "rotor"] | None = "armature",
+    inertias: Inertias = "consistent",
+    likelihood: Likelihood = "torque",
+    prior_strength: float = 1.0,
+    robust: bool = False,
+    rows: int = ROWS,
+    progress: Callable[[int, float], None] | None = None,
+) -> AnalyticalIdentification:
+    """Inertial parameters of every body, friction and rotor inertia by weighted least squares.
+
+    Parameters
+    ----------
+    system: start and prior: the robot, friction it lists, and forces that are given. In no contact.
+    dataset: q, v, u and a, filtered alike (`forcegp.data.Preparation`); rows need not be in order of time.
+    friction: out of "viscous", "coulomb" or "stribeck", "offset". Velocity scales are estimated, too.
+    rotors: "armature": one inertia per joint. "rotor": those of the system's RotorInertia. None: as listed.
+    inertias: "consistent": every estimate belongs to a body (log-Cholesky coordinates, Rucker & Wensing 2022). "free":
+        any numbers, that is, ordinary least squares of base parameters, which often give no robot.
+    likelihood: "torque": residuals of inverse dynamics. "acceleration": of forward dynamics, maximum likelihood where
+        the noise is that of differentiated positions; needs consistent inertias.
+    prior_strength: weight w of a prior w/2 d^2 around the system that is given, with d the affine-invariant distance of
+        bodies (a mass wrong by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
+        decides what the data do not, and hardly what they do.
+    robust: count residuals beyond 1.5 standard deviations by their absolute value (soft L1).
+    rows: use so many at most, evenly spread.
+    progress: called as progress(round, rms of the residual).
+
+    Raises InvalidInput for options that make no sense and for a system in contact.
+    """
+    if dataset.joint_names != system.robot.joint_names:
+        raise InvalidInput(
+            f"the dataset has joints {', '.join(dataset.joint_names)}; the robot {', '.join(system.robot.joint_names)}."
+        )
+    for name, given, allowed in (
+        ("inertias", inertias, ("consistent", "free")),
+        ("likelihood", likelihood, ("torque", "acceleration")),
+    ):
+        if given not in allowed:
+            raise InvalidInput(f"{name} is {given!r}; give one of {', '.join(allowed)}.")
+    if inertias == "free" and likelihood == "acceleration":
+        raise InvalidInput(
+            "accelerations need a mass matrix that can be inverted, which free inertias need not have; use "
+            "inertias='consistent' with likelihood='acceleration'."
+        )
+    if not (np.isfinite(prior_strength) and prior_strength > 0.0):
+        raise InvalidInput(f"prior_strength is {prior_strength}; it must be > 0, since data never determine all of it.")
+    if rows < 1:
+        raise InvalidInput(f"rows is {rows}; it must be at least 1.")
+    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(rows, len(dataset))).astype(int))
+    q, v, u, a = (getattr(dataset, name)[chosen] for name in ("q", "v", "u", "a"))
+    robot, thick = thickened(system.robot)
+    system = system.with_robot(robot)
+    reference = body_pseudo_inertias(robot).cpu().numpy()
+    bodies: BodyCoordinates = ConsistentBodies(reference) if inertias == "consistent" else FreeBodies(reference)
+    terms = joint_terms(system, friction, rotors, q, v, a)
+    recorded = RecordedRows(system, terms, q, v, u)
+    regressor = recorded.regressor(a)
+    split = bodies.size
+
+    def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        parameters = bodies.parameters(x[:split])
+        if likelihood == "torque":
+            r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
+        else:
+            r, in_parameters, in_terms = recorded.in_acceleration(parameters, x[split:], a)
+        in_bodies = np.einsum("nibp,bpk->nibk", in_parameters, bodies.derivatives(x[:split]))
+        return r, np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1)
+
+    center, spread = terms.prior()
+    weight = prior_strength**0.5
+
+    def prior(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance, in_bodies = bodies.distance(x[:split])
+        values = np.concatenate([distance, (x[split:] - center) / spread])
+        jacobian = np.zeros((len(x), len(x)))
+        jacobian[:split, :split] = in_bodies
+        jacobian[split:, split:] = np.diag(1.0 / spread)
+        return weight * values, weight * jacobian
+
+    low, high = terms.bounds
+    fit = weighted_least_squares(
+        residual,
+        prior,
+        np.concatenate([np.zeros(split), terms.start()]),
+        (np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])),
+        robust=robust,
+        progress=progress,
+    )
+    return AnalyticalIdentification(
+        given=system,
+        bodies=bodies,
+        terms=terms,
+        fit=fit,
+        likelihood=likelihood,
+        prior_strength=prior_strength,
+        episode=dataset.episode[chosen],
+        regressor=regressor,
+        thickened=thick,
+    )
+
+
+def joint_terms(
+    system: MechanicalSystem, friction: Sequence[str], rotors: str | None, q: np.ndarray, v: np.ndarray, a: np.ndarray
+) -> JointTerms:
+    """Terms whose coordinates are in proportion to the torques of inverse dynamics, velocities and M of these rows."""
+    kinematics = system.robot.kinematics(*(torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v)))
+    torque = kinematics.inverse_dynamics(torch.as_tensor(np.array(a), device=system.robot.device)).cpu().numpy()
+    mass = system.mass_matrix(kinematics).diagonal(dim1=-2, dim2=-1).mean(0).cpu().numpy()
+    typical = [np.sqrt((x**2).mean(0)) for x in (torque, v)]
+    torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in typical)
+    return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)

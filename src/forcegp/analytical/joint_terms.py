@@ -1,0 +1,298 @@
+"""Terms of the joint torque beside the rigid bodies: friction, offset, and the inertia of rotors.
+
+A term adds ``f(parameters; v) + B(parameters) a`` to the torque that a motion needs, and becomes a known force of the
+system (which has the opposite sign). A new friction law is one entry in `LAWS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import (
+    Armature,
+    ConstantJointForce,
+    CoulombJointFriction,
+    KnownForce,
+    MechanicalSystem,
+    RotorInertia,
+    StribeckJointFriction,
+    ViscousJointFriction,
+)
+
+Arrays = Mapping[str, np.ndarray]
+Reader = Callable[[KnownForce], dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One number per joint: its name and unit, its size as a multiple of torque and velocity, what it may be.
+
+    `size` is (power of the typical torque, power of the typical velocity, factor). With `logarithm` the coordinate is
+    the logarithm of the number over that size, within `lowest` and `highest` times it; else the number over it.
+    """
+
+    name: str
+    unit: str
+    size: tuple[int, int, float]
+    lowest: float = 0.0
+    highest: float = np.inf
+    logarithm: bool = False
+
+
+@dataclass(frozen=True)
+class Law:
+    """A joint force as a function of velocity, with its parameters, derivatives, and the known force it becomes.
+
+    `torque(values, v)` gives f (rows, nv) and df (fields, rows, nv), where values[name] has shape (nv,).
+    """
+
+    kind: type[KnownForce]
+    fields: tuple[Field, ...]
+    torque: Callable[[Arrays, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    known: Callable[[Arrays], KnownForce]
+    read: Reader
+
+
+def _viscous(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return p["viscous"] * v, v[None]
+
+
+def _offset(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.broadcast_to(-p["offset"], v.shape), -np.ones((1, *v.shape))
+
+
+def _coulomb(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale = p["velocity_scale"]
+    sign = np.tanh(v / scale)
+    return p["coulomb"] * sign, np.stack([sign, -p["coulomb"] * (1.0 - sign**2) * v / scale**2])
+
+
+def _stribeck(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale, fall = p["velocity_scale"], p["stribeck_velocity"]
+    sign, bump = np.tanh(v / scale), np.exp(-((v / fall) ** 2))
+    level = p["coulomb"] + p["breakaway"] * bump
+    in_fall = p["breakaway"] * bump * 2.0 * v**2 / fall**3 * sign
+    return level * sign, np.stack([sign, bump * sign, in_fall, -level * (1.0 - sign**2) * v / scale**2])
+
+
+def _numbers(force: KnownForce, **names: str) -> dict[str, np.ndarray]:
+    return {name: torch.as_tensor(getattr(force, field)).numpy().copy() for name, field in names.items()}
+
+
+def _read_stribeck(force: KnownForce) -> dict[str, np.ndarray]:
+    values = _numbers(force, **{name: name for name in StribeckJointFriction.per_joint})
+    values["breakaway"] = np.maximum(values.pop("static") - values["coulomb"], 0.0)
+    return values
+
+
+VELOCITY_SCALE = Field("velocity_scale", "1/s", (0, 1, 0.1), 0.03, 20.0, logarithm=True)
+COULOMB = Field("coulomb", "force", (1, 0, 0.1))
+LAWS: dict[str, Law] = {
+    "viscous": Law(
+        ViscousJointFriction,
+        (Field("viscous", "force s", (1, -1, 0.1)),),
+        _viscous,
+        lambda p: ViscousJointFriction(torch.tensor(p["viscous"])),
+        lambda force: _numbers(force, viscous="coefficients"),
+    ),
+    "coulomb": Law(
+        CoulombJointFriction,
+        (COULOMB, VELOCITY_SCALE),
+        _coulomb,
+        lambda p: CoulombJointFriction(torch.tensor(p["coulomb"]), torch.tensor(p["velocity_scale"])),
+        lambda force: _numbers(force, coulomb="coefficients", velocity_scale="velocity_scale"),
+    ),
+    "stribeck": Law(
+        StribeckJointFriction,
+        (
+            COULOMB,
+            Field("breakaway", "force", (1, 0, 0.1)),
+            Field("stribeck_velocity", "1/s", (0, 1, 0.3), 0.1, 10.0, logarithm=True),
+            VELOCITY_SCALE,
+        ),
+        _stribeck,
+        lambda p: StribeckJointFriction(
+            torch.tensor(p["coulomb"]),
+            torch.tensor(p["coulomb"] + p["breakaway"]),
+            torch.tensor(p["stribeck_velocity"]),
+            torch.tensor(p["velocity_scale"]),
+        ),
+        _read_stribeck,
+    ),
+    "offset": Law(
+        ConstantJointForce,
+        (Field("offset", "force", (1, 0, 0.1), lowest=-np.inf),),
+        _offset,
+        lambda p: ConstantJointForce(torch.tensor(p["offset"])),
+        lambda force: _numbers(force, offset="values"),
+    ),
+}
+"""Friction laws and the offset by the name that `friction=` has for them."""
+LINEAR_SPREAD = 10.0
+"""Standard deviation of the prior on numbers that are not logarithms, in their sizes: as large as the torques."""
+INERTIA = Field("armature", "inertia", (0, 0, 0.1))
+INERTIAS: dict[str, type[Armature | RotorInertia]] = {"armature": Armature, "rotor": RotorInertia}
+
+
+class JointTerms:
+    """The terms that are estimated, in coordinates x of size 1 for typical values; 10 times smaller is likely as well.
+
+    Parameters
+    ----------
+    system: where their start values are read, and the transmission of rotors.
+    friction: names out of `LAWS`; "coulomb" and "stribeck" exclude each other, since the latter contains the former.
+    inertia: "armature", "rotor" (rotors of the system's RotorInertia) or None.
+    torque, velocity, mass: typical size of joint forces, velocities and diagonal entries of M (nv,), with the unit
+        of a coordinate in proportion.
+
+    Raises InvalidInput for other names.
+    """
+
+    def __init__(
+        self,
+        system: MechanicalSystem,
+        friction: Sequence[str],
+        inertia: str | None,
+        *,
+        torque: Float[np.ndarray, " nv"],
+        velocity: Float[np.ndarray, " nv"],
+        mass: Float[np.ndarray, " nv"],
+    ):
+        unknown = next((name for name in friction if name not in LAWS), None)
+        if unknown is not None or isinstance(friction, str):
+            raise InvalidInput(f"friction is {friction!r}; give a tuple of names out of {', '.join(LAWS)}.")
+        if {"coulomb", "stribeck"} <= set(friction):
+            raise InvalidInput("friction names coulomb and stribeck; leave coulomb out, stribeck contains it.")
+        if inertia not in (None, *INERTIAS):
+            raise InvalidInput(f"rotors are {inertia!r}; give one of {', '.join(INERTIAS)}, or None.")
+        self.laws = [LAWS[name] for name in dict.fromkeys(friction)]
+        self.inertia = inertia
+        self.joints = system.robot.joint_names
+        self.kinds = tuple([law.kind for law in self.laws] + ([INERTIAS[inertia]] if inertia else []))
+        listed = {kind: [force for force in system.known_forces if type(force) is kind] for kind in self.kinds}
+        twice = next((kind.__name__ for kind, found in listed.items() if len(found) > 1), None)
+        if twice is not None:
+            raise InvalidInput(f"the system lists {twice} more than once; list it once to have it estimated.")
+        self._given = {kind: found[0] for kind, found in listed.items() if found}
+        if inertia == "rotor" and RotorInertia not in self._given:
+            raise InvalidInput(
+                "rotors='rotor' estimates the rotors of a RotorInertia(...) with its transmission, and the system "
+                "lists none; add it to known_forces, or use rotors='armature'."
+            )
+        self.fields = [field for law in self.laws for field in law.fields] + ([INERTIA] if inertia else [])
+        mass = mass / self._geared() if inertia else mass
+        sizes = [
+            f.size[2] * torque ** f.size[0] * velocity ** f.size[1] * (mass if f is INERTIA else 1.0)
+            for f in self.fields
+        ]
+        self._sizes = np.array(sizes).reshape(len(self.fields), len(self.joints))
+        self._logarithms = np.array([field.logarithm for field in self.fields], dtype=bool).reshape(-1, 1)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self._sizes.size
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of every coordinate's number: `viscous.JOINT`, ..., in the order of x."""
+        return tuple(f"{field.name}.{joint}" for field in self.fields for joint in self.joints)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest coordinates."""
+        limits = [np.log([f.lowest, f.highest]) if f.logarithm else (f.lowest, f.highest) for f in self.fields]
+        each = np.repeat(np.array(limits).reshape(-1, 2), len(self.joints), axis=0)
+        return each[:, 0], each[:, 1]
+
+    def start(self, unlisted: float = 1.0) -> Float[np.ndarray, " k"]:
+        """Coordinates of what the system lists; of what it does not, `unlisted`, and typical velocities."""
+        rows: list[np.ndarray] = []
+        for kind, fields, read in self._blocks():
+            given = read(self._given[kind]) if kind in self._given else {}
+            for field in fields:
+                size = self._sizes[len(rows)]
+                value = given.get(field.name, size if field.logarithm else unlisted * size)
+                rows.append(np.log(value / size) if field.logarithm else value / size)
+        low, high = self.bounds
+        return np.clip(np.array(rows).ravel(), low, high)
+
+    def prior(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Mean and standard deviation of a weak prior: around what the system lists, else 0 or typical velocities."""
+        spread = np.where(self._logarithms, 1.0, LINEAR_SPREAD) * np.ones_like(self._sizes)
+        return self.start(unlisted=0.0), spread.ravel()
+
+    def values(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields nv"]:
+        """The numbers in SI units."""
+        x = x.reshape(self._sizes.shape)
+        return np.where(self._logarithms, np.exp(np.where(self._logarithms, x, 0.0)), x) * self._sizes
+
+    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields nv"]:
+        """Derivative of each number in its own coordinate."""
+        return np.where(self._logarithms, self.values(x), self._sizes)
+
+    def torque(
+        self, x: Float[np.ndarray, " k"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
+    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv k"]]:
+        """What the terms add to the torque at velocities v and accelerations a, and its derivatives in x."""
+        values, slopes = self.values(x), self.slopes(x)
+        total, nv, row = np.zeros_like(v), len(self.joints), 0
+        jacobian = np.zeros((*v.shape, len(self.fields), nv))
+        diagonal = np.arange(nv)
+        for law in self.laws:
+            named = {field.name: values[row + k] for k, field in enumerate(law.fields)}
+            added, derivatives = law.torque(named, v)
+            total = total + added
+            for k in range(len(law.fields)):
+                jacobian[:, diagonal, row + k, diagonal] = derivatives[k] * slopes[row + k]
+            row += len(law.fields)
+        if self.inertia:
+            moved = np.einsum("pij,nj->nip", self._inertia_basis(), a)
+            total = total + moved @ values[row]
+            jacobian[:, :, row] = moved * slopes[row]
+        return total, jacobian.reshape(*v.shape, -1)
+
+    def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
+        """What the rotors add to the mass matrix."""
+        if not self.inertia:
+            return np.zeros((len(self.joints),) * 2)
+        return np.tensordot(self.values(x)[-1], self._inertia_basis(), 1)
+
+    def known_forces(self, x: Float[np.ndarray, " k"]) -> tuple[KnownForce, ...]:
+        """The terms as known forces of a system."""
+        values, forces, row = self.values(x), [], 0
+        for law in self.laws:
+            named = {field.name: values[row + k] for k, field in enumerate(law.fields)}
+            forces.append(law.known(named))
+            row += len(law.fields)
+        if self.inertia == "armature":
+            forces.append(Armature(torch.tensor(values[row])))
+        elif self.inertia == "rotor":
+            forces.append(RotorInertia(torch.tensor(values[row]), self._transmission()))
+        return tuple(forces)
+
+    def _blocks(self) -> list[tuple[type[KnownForce], tuple[Field, ...], Reader]]:
+        blocks: list[tuple[type[KnownForce], tuple[Field, ...], Reader]]
+        blocks = [(law.kind, law.fields, law.read) for law in self.laws]
+        if self.inertia:
+            blocks.append((INERTIAS[self.inertia], (INERTIA,), lambda force: _numbers(force, armature="inertia")))
+        return blocks
+
+    def _transmission(self) -> torch.Tensor:
+        if self.inertia == "armature":
+            return torch.eye(len(self.joints), dtype=torch.float64)
+        return torch.as_tensor(getattr(self._given[RotorInertia], "transmission"))  # noqa: B009  # of a subclass
+
+    def _inertia_basis(self) -> np.ndarray:
+        """(rotor, nv, nv): inertia added per unit of each rotor's."""
+        T = self._transmission().numpy()
+        return T[:, :, None] * T[:, None, :]
+
+    def _geared(self) -> np.ndarray:
+        return np.maximum((self._transmission().numpy() ** 2).sum(1), 1e-12)

@@ -1,0 +1,180 @@
+"""Weighted non-linear least squares: the noise of each joint is found along with the coordinates.
+
+Gaussian residuals of joint j with unknown variance are most likely where ``sum_j rows log(sum_n r_nj^2)`` is least;
+weighting each joint by the residuals of the last round until nothing changes finds that (iteratively reweighted least
+squares). The prior stands among the residuals. With `robust` residuals beyond 1.5 standard deviations count by their
+absolute value (soft L1), and the scale of each joint comes from the median.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+ROUNDS = 12
+"""Most rounds of reweighting."""
+MOST_EVALUATIONS = 300
+"""Of the residuals in one round."""
+CONTENT = 0.01
+"""Two steps in a row that lower the objective by less than so many nats end a round."""
+SETTLED = 1e-3
+"""Relative change of the noise level that ends them."""
+BEND = 1.5
+"""Standard deviations beyond which a robust residual counts by its absolute value."""
+MAD = 1.4826
+"""Median absolute deviation of a normal distribution -> its standard deviation."""
+
+Residual = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""x -> residuals (rows, nv) and Jacobian (rows, nv, k)."""
+Prior = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""x -> residuals of the prior (p,) and Jacobian (p, k)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where least squares ended.
+
+    `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k) there, `noise` (nv,) in units of the residual, `weight`
+    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and what the search said.
+    """
+
+    x: Float[np.ndarray, " k"]
+    residual: Float[np.ndarray, "rows nv"]
+    jacobian: Float[np.ndarray, "rows nv k"]
+    noise: Float[np.ndarray, " nv"]
+    weight: Float[np.ndarray, "rows nv"]
+    prior_information: Float[np.ndarray, "k k"]
+    evaluations: int
+    settled: bool
+
+    @property
+    def information(self) -> Float[np.ndarray, "k k"]:
+        """Gauss-Newton curvature of the data, each residual weighted by its noise."""
+        scaled = self.jacobian * (np.sqrt(self.weight) / self.noise)[..., None]
+        flat = scaled.reshape(-1, scaled.shape[-1])
+        return flat.T @ flat
+
+
+def weighted_least_squares(
+    residual: Residual,
+    prior: Prior,
+    start: Float[np.ndarray, " k"],
+    bounds: tuple[np.ndarray, np.ndarray],
+    *,
+    robust: bool = False,
+    progress: Callable[[int, float], None] | None = None,
+) -> Fit:
+    """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round."""
+    last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
+
+    def at(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not last or not np.array_equal(last[0][0], point):
+            last[:] = [(point.copy(), residual(point))]
+        return last[0][1]
+
+    low, high = bounds
+    x = np.clip(start, low, high)
+    r, jacobian = at(x)
+    noise, evaluations, settled, converged = _noise(r, robust), 0, False, False
+    for round_number in range(1, ROUNDS + 1):
+        x, nfev, converged = _minimized(at, prior, x, bounds, noise, robust)
+        evaluations += nfev
+        r, jacobian = at(x)
+        before, noise = noise, _noise(r, robust)
+        if progress is not None:
+            progress(round_number, float(np.sqrt((r**2).mean())))
+        settled = bool((abs(noise - before) <= SETTLED * before).all())
+        if settled:
+            break
+    weight = _weights(r / noise, robust)
+    in_prior = prior(x)[1]
+    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, evaluations, settled and converged)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Cost, gradient and Gauss-Newton curvature (both halved) at x."""
+
+    x: np.ndarray
+    cost: float
+    gradient: np.ndarray
+    curvature: np.ndarray
+
+
+def _minimized(
+    at: Residual, prior: Prior, x: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], noise: np.ndarray, robust: bool
+) -> tuple[np.ndarray, int, bool]:
+    """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, and whether it converged.
+
+    Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
+    """
+    low, high = bounds
+    here, damping, idle = _point(at, prior, x, noise, robust), 1e-4, 0
+    for evaluation in range(1, MOST_EVALUATIONS + 1):
+        held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
+        free = ~held
+        curvature = here.curvature[np.ix_(free, free)]
+        step = np.zeros_like(here.x)
+        step[free] = -np.linalg.solve(curvature + damping * np.diag(curvature.diagonal()), here.gradient[free])
+        there = np.clip(here.x + step, low, high)
+        moved = there - here.x
+        expected = -(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
+        if abs(expected) <= 1e-3 * CONTENT or idle == 2:
+            return here.x, evaluation, True
+        trial = _point(at, prior, there, noise, robust)
+        if trial.cost < here.cost:
+            idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
+            here, damping = trial, max(0.2 * damping, 1e-12)
+        elif damping > 1e12:  # rounding hides any descent
+            return here.x, evaluation, True
+        else:
+            damping *= 10.0
+    return here.x, MOST_EVALUATIONS, False
+
+
+def _point(at: Residual, prior: Prior, x: np.ndarray, noise: np.ndarray, robust: bool) -> _Point:
+    (r, jacobian), (prior_r, prior_jacobian) = at(x), prior(x)
+    white = r / noise
+    if not (np.isfinite(white).all() and np.isfinite(jacobian).all()):
+        return _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
+    weight = _weights(white, robust)
+    cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
+    flat = (jacobian * (np.sqrt(weight) / noise)[..., None]).reshape(-1, len(x))
+    gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
+    curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
+    return _Point(x, float(cost + 0.5 * (prior_r**2).sum()), gradient, curvature)
+
+
+def _weights(white: np.ndarray, robust: bool) -> np.ndarray:
+    """Derivative of the soft L1 loss 2 BEND^2 (sqrt(1 + z) - 1) in r^2, z = (r / BEND)^2; 1 for plain squares."""
+    return (1.0 + (white / BEND) ** 2) ** -0.5 if robust else np.ones_like(white)
+
+
+def _noise(r: np.ndarray, robust: bool) -> np.ndarray:
+    scale = MAD * np.median(abs(r), axis=0) if robust else np.sqrt((r**2).mean(axis=0))
+    return np.maximum(scale, 1e-12)
+
+
+def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Float[np.ndarray, " rows"]) -> np.ndarray:
+    """Rows that one independent residual is worth, per joint: 1 + 2 sum of autocorrelations until they turn negative.
+
+    Filtered signals have residuals that resemble their neighbours; without this factor standard errors are too small.
+    The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).
+    """
+    centered = residual
+    total = (centered**2).sum(0)
+    times = np.ones(residual.shape[1])
+    open_ = np.ones(residual.shape[1], dtype=bool)
+    for lag in range(1, len(residual) - 1, 2):
+        pair = np.zeros(residual.shape[1])
+        for shift in (lag, lag + 1):
+            same = episode[shift:] == episode[:-shift]
+            pair += (centered[shift:] * centered[:-shift] * same[:, None]).sum(0) / np.maximum(total, 1e-300)
+        open_ &= pair > 0.0
+        if not open_.any():
+            break
+        times += np.where(open_, 2.0 * pair, 0.0)
+    return times

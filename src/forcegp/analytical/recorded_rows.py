@@ -1,0 +1,109 @@
+"""Rows of a recording as least squares sees them: residuals of torque or acceleration, with exact Jacobians.
+
+With the standard parameters pi of the bodies, the joint terms t(x; v, a) and the forces Q that are given,
+
+    torque           r = Y(q, v, a) pi + M_0 a + t(x; v, a) - Q
+    acceleration     r = a - a^,    a^ = (M(pi) + M_0 + M_t(x))^-1 (Q - bias(pi) - t(x; v, 0))
+
+where M_0 is the inertia of what is listed and not estimated. Differentiating M a^ = Q - bias - t,
+
+    dr/dpi = M^-1 Y(q, v, a^),    dr/dx = M^-1 dt/dx (v, a^).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.analytical.joint_terms import JointTerms
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.mechanics import KnownForce, MechanicalSystem, RigidBodyBias, State
+
+
+class RecordedRows:
+    """States (rows, nv) of a robot, the given forces there, and what the equation of motion says of them."""
+
+    def __init__(
+        self,
+        system: MechanicalSystem,
+        terms: JointTerms,
+        q: Float[np.ndarray, "rows nv"],
+        v: Float[np.ndarray, "rows nv"],
+        u: Float[np.ndarray, "rows nv"],
+    ):
+        robot = system.robot
+        at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
+        state = State.of(robot, at_q, at_v, at_u)
+        self.kinematics, self.terms, self.v = state.kinematics, terms, np.array(v)
+        given = kept_forces(system, terms)
+        self.force = np.zeros_like(self.v)
+        self.inertia = np.zeros((robot.nv, robot.nv))
+        for force in given:
+            self.force = self.force + force.force(state).detach().cpu().numpy()
+            added = force.added_inertia()
+            self.inertia = self.inertia + (0.0 if added is None else added.detach().cpu().numpy())
+        self._armature = np.diag(robot.armature.cpu().numpy())
+
+    def regressor(self, a: Float[np.ndarray, "rows nv"]) -> Float[np.ndarray, "rows nv bodies 10"]:
+        """Y at these states and accelerations."""
+        at = torch.as_tensor(np.array(a), device=self.kinematics.robot.device)
+        return self.kinematics.torque_regressor(at).cpu().numpy()
+
+    def needed_torque(
+        self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The force Q (rows, nv) under which the model accelerates by a."""
+        Y = self.regressor(a) if regressor is None else regressor
+        torque, _ = self.terms.torque(x, self.v, a)
+        return np.einsum("nibp,bp->ni", Y, parameters) + a @ (self.inertia + self._armature) + torque
+
+    def acceleration(self, parameters: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """a^ (rows, nv) and the mass matrices (rows, nv, nv). Raises NumericalError where one is singular."""
+        given = torch.as_tensor(parameters, device=self.kinematics.robot.device)
+        M, bias = (part.cpu().numpy() for part in self.kinematics.dynamics_of_bodies(given))
+        M = M + self.inertia + self.terms.added_inertia(x)
+        torque, _ = self.terms.torque(x, self.v, np.zeros_like(self.v))
+        try:
+            return np.linalg.solve(M, (self.force - bias - torque)[..., None])[..., 0], M
+        except np.linalg.LinAlgError:
+            raise NumericalError(
+                "the mass matrix of the estimates is singular at a row; use inertias='consistent'."
+            ) from None
+
+    def in_torque(
+        self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residual (rows, nv) and its derivatives in the parameters (rows, nv, bodies, 10) and in x (rows, nv, k)."""
+        _, in_x = self.terms.torque(x, self.v, a)
+        return self.needed_torque(parameters, x, a, regressor) - self.force, regressor, in_x
+
+    def in_acceleration(
+        self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `in_torque`, of a - a^."""
+        predicted, M = self.acceleration(parameters, x)
+        Y = self.regressor(predicted)
+        _, in_x = self.terms.torque(x, self.v, predicted)
+        rows, nv = predicted.shape
+        solved = np.linalg.solve(M, np.concatenate([Y.reshape(rows, nv, -1), in_x], axis=-1))
+        return a - predicted, solved[..., : 10 * nv].reshape(Y.shape), solved[..., 10 * nv :]
+
+
+def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce, ...]:
+    """Known forces that are not estimated, the rigid-body bias left out.
+
+    Raises InvalidInput for a system without it, or in contact, whose forces are not known.
+    """
+    if system.contacts:
+        frames = ", ".join(contact.frame for contact in system.contacts)
+        raise InvalidInput(
+            f"the robot touches something with {frames}, and contact forces are not measured; identify it from a "
+            "motion in the air (system.with_contacts([])), or use StructuredGP.fit(learn=...)."
+        )
+    if not any(type(force) is RigidBodyBias for force in system.known_forces):
+        raise InvalidInput("the known forces lack RigidBodyBias(); list it, since its parameters are estimated.")
+    skipped: Sequence[type[KnownForce]] = (RigidBodyBias, *terms.kinds)
+    return tuple(force for force in system.known_forces if type(force) not in skipped)

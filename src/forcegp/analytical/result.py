@@ -1,0 +1,205 @@
+"""`AnalyticalIdentification`: what was estimated, how sure it is, and what it predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.analytical.base_parameters import BaseParameters
+from forcegp.analytical.bodies import BodyCoordinates
+from forcegp.analytical.identified_robot import with_bodies, with_joint_dynamics
+from forcegp.analytical.joint_terms import JointTerms
+from forcegp.analytical.least_squares import Fit, correlation_time
+from forcegp.analytical.recorded_rows import RecordedRows
+from forcegp.analytical.regressor import UNITS, body_names, parameter_names
+from forcegp.data import Dataset
+from forcegp.mechanics import CoulombJointFriction, MechanicalSystem, StribeckJointFriction, ViscousJointFriction
+
+Rows = Float[np.ndarray, "rows nv"]
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyticalIdentification:
+    """Estimates of `identify_analytical`; `given` is the system that it started from, some bodies `thickened`."""
+
+    given: MechanicalSystem
+    bodies: BodyCoordinates
+    terms: JointTerms
+    fit: Fit
+    likelihood: str
+    prior_strength: float
+    episode: Float[np.ndarray, " rows"]
+    regressor: Float[np.ndarray, "rows nv bodies 10"]
+    thickened: tuple[str, ...]
+
+    # ------------------------------------------------------------------ the estimates
+
+    @property
+    def parameters(self) -> Float[np.ndarray, "nv 10"]:
+        """Standard parameters of the bodies, see `forcegp.analytical.regressor`."""
+        return self.bodies.parameters(self._in_bodies)
+
+    @cached_property
+    def system(self) -> MechanicalSystem:
+        """The robot and known forces that were found.
+
+        Viscous and Coulomb friction stand in the URDF's <dynamics> as well. Raises NonPhysicalInertia where free
+        inertias belong to no robot.
+        """
+        robot = with_bodies(self.given.robot, self.bodies.pseudo_inertias(self._in_bodies))
+        found = self.terms.known_forces(self._in_terms)
+        dry = [f.coefficients for f in found if type(f) is CoulombJointFriction]
+        dry += [f.coulomb for f in found if type(f) is StribeckJointFriction]
+        viscous = [f.coefficients for f in found if type(f) is ViscousJointFriction]
+        damping, friction = (None if not x else torch.as_tensor(x[0]).numpy() for x in (viscous, dry))
+        others = [force for force in self.given.known_forces if type(force) not in self.terms.kinds]
+        robot = with_joint_dynamics(robot, damping, friction)
+        return replace(self.given, robot=robot, known_forces=(*others, *found))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all numbers: standard parameters `LINK.m` ..., then `viscous.JOINT` and so on."""
+        return (*parameter_names(self.given.robot), *self.terms.names)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """By name."""
+        joints = {joint.name: joint.type == "prismatic" for joint in self.given.robot.joints}
+        out = dict(zip(parameter_names(self.given.robot), UNITS * self.given.robot.nv, strict=True))
+        for field in self.terms.fields:
+            for name, prismatic in joints.items():
+                out[f"{field.name}.{name}"] = _unit(field.unit, prismatic)
+        return out
+
+    @property
+    def values(self) -> dict[str, float]:
+        """By name, in SI units."""
+        numbers = np.concatenate([self.parameters.ravel(), self.terms.values(self._in_terms).ravel()])
+        return dict(zip(self.names, numbers.tolist(), strict=True))
+
+    @property
+    def start(self) -> dict[str, float]:
+        """The same numbers of the system that was given; 0 where it lists no such force."""
+        zero = self.bodies.parameters(np.zeros(self.bodies.size))
+        center, _ = self.terms.prior()
+        return dict(zip(self.names, np.concatenate([zero.ravel(), self.terms.values(center).ravel()]), strict=True))
+
+    @cached_property
+    def standard_errors(self) -> dict[str, float]:
+        """By name: of the posterior under the prior, with residuals that resemble their neighbours accounted for.
+
+        Where the data say nothing it is the prior's spread. Linearised (delta method).
+        """
+        return dict(zip(self.names, np.sqrt(np.diag(self._covariance)).tolist(), strict=True))
+
+    @cached_property
+    def _covariance(self) -> np.ndarray:
+        """Sandwich: information of the data counted as if only one row in a correlation time were independent."""
+        time = correlation_time(self.fit.residual / self.fit.noise, self.episode)
+        scaled = self.fit.jacobian * (np.sqrt(self.fit.weight / time) / self.fit.noise)[..., None]
+        flat = scaled.reshape(-1, scaled.shape[-1])
+        inverse = np.linalg.inv(flat.T @ flat + self.fit.prior_information)
+        moved = np.zeros((len(self.names), len(inverse)))
+        split = self.bodies.size
+        for body, block in enumerate(self.bodies.derivatives(self._in_bodies)):
+            moved[10 * body : 10 * body + 10, 10 * body : 10 * body + 10] = block
+        moved[split:, split:] = np.diag(self.terms.slopes(self._in_terms).ravel())
+        return moved @ inverse @ moved.T
+
+    # ------------------------------------------------------------------ what the data tell
+
+    @cached_property
+    def base(self) -> BaseParameters:
+        """Base parameters of the recorded motion, with their condition number."""
+        columns = self.regressor.reshape(-1, self.regressor.shape[-2] * 10)
+        return BaseParameters.of(columns, parameter_names(self.given.robot))
+
+    @property
+    def condition_number(self) -> float:
+        """Of the base parameters' columns, each divided by its norm; beyond 100 is poor excitation (Gautier 1992)."""
+        return self.base.condition
+
+    @cached_property
+    def weak_directions(self) -> tuple[tuple[str, float], ...]:
+        """Bodies and the number of their ten directions of which the data say less than the prior, worst first."""
+        out = []
+        for body, name in enumerate(body_names(self.given.robot)):
+            own = slice(10 * body, 10 * body + 10)
+            values = np.linalg.eigvalsh(self.fit.information[own, own])
+            prior = np.linalg.eigvalsh(self.fit.prior_information[own, own]).mean()
+            out.append((name, float((values < prior).sum())))
+        return tuple(sorted((entry for entry in out if entry[1]), key=lambda entry: -entry[1]))
+
+    # ------------------------------------------------------------------ what it predicts
+
+    def accelerations(self, q: Rows, v: Rows, u: Rows) -> Rows:
+        """Accelerations under the forces u, also of free inertias. Raises NumericalError for a singular M."""
+        return self._recorded(q, v, u).acceleration(self.parameters, self._in_terms)[0]
+
+    def torques(self, q: Rows, v: Rows, a: Rows) -> Rows:
+        """The joint forces u under which it moves so: inverse dynamics, friction included."""
+        rows = self._recorded(q, v, np.zeros_like(v))
+        return rows.needed_torque(self.parameters, self._in_terms, a) - rows.force
+
+    def torque_residual(self, dataset: Dataset) -> Rows:
+        """Measured less predicted u."""
+        return dataset.u - self.torques(dataset.q, dataset.v, dataset.a)
+
+    def scores(self, dataset: Dataset) -> dict[str, list[float]]:
+        """Per joint: rms of the torque residual (Nm or N), rms and nRMSE of the acceleration (rad/s^2 or m/s^2)."""
+        error = dataset.a - self.accelerations(dataset.q, dataset.v, dataset.u)
+        rms = np.sqrt((error**2).mean(0))
+        return {
+            "torque_rms": np.sqrt((self.torque_residual(dataset) ** 2).mean(0)).tolist(),
+            "acceleration_rms": rms.tolist(),
+            "acceleration_nrmse": (rms / dataset.a.std(0)).tolist(),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON values."""
+        values, start, errors, units = self.values, self.start, self.standard_errors, self.units
+        return {
+            "likelihood": self.likelihood,
+            "inertias": "consistent" if type(self.bodies).__name__ == "ConsistentBodies" else "free",
+            "prior_strength": self.prior_strength,
+            "parameters": {
+                name: {
+                    "unit": units[name],
+                    "start": float(start[name]),
+                    "identified": value,
+                    "standard_error": errors[name],
+                }
+                for name, value in values.items()
+            },
+            "noise_std": self.fit.noise.tolist(),
+            "rows": len(self.episode),
+            "base_parameters": list(self.base.expressions),
+            "condition_number": self.condition_number,
+            "weak": dict(self.weak_directions),
+            "thickened": list(self.thickened),
+            "converged": self.fit.settled,
+            "evaluations": self.fit.evaluations,
+        }
+
+    # ------------------------------------------------------------------ inside
+
+    @property
+    def _in_bodies(self) -> np.ndarray:
+        return self.fit.x[: self.bodies.size]
+
+    @property
+    def _in_terms(self) -> np.ndarray:
+        return self.fit.x[self.bodies.size :]
+
+    def _recorded(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> RecordedRows:
+        return RecordedRows(self.given, self.terms, q, v, u)
+
+
+def _unit(kind: str, prismatic: bool) -> str:
+    force, speed, inertia = ("N", "m/s", "kg") if prismatic else ("Nm", "rad/s", "kg m^2")
+    return {"force": force, "force s": f"{force} s/{speed[:-2]}", "1/s": speed, "inertia": inertia}[kind]
