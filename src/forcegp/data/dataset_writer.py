@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 ROWS_PER_CHUNK = 8192
 TABLES = ("q", "v", "u", "a")
 THREADS = min(4, os.cpu_count() or 1)
-MOST_JOBS = 64
+MOST_JOBS = 16
 """Chunks that are being compressed while rows go on coming, 0.5 MiB each with seven joints."""
 
 

@@ -15,7 +15,7 @@ from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings.source import Columns, Source, reading, require_distinct
 from forcegp.recordings.text_lines import CleanLines, opened
 
-BLOCK = 2**23
+BLOCK = 2**22
 """Bytes that pyarrow parses at a time; no line may be longer."""
 
 BLANKS = "blanks"

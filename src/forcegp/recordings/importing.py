@@ -42,7 +42,7 @@ class ImportOptions:
     ------
     gap: seconds between two rows that begin another episode; None for ten median steps.
     resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
-    rate: of the even times in Hz, instead of the median.
+    rate: of the even times in Hz, instead of the median of the recordings' median rates.
     start, end: seconds from the first row of each episode that are kept.
     unwrap: continue positions of turning joints that jump by a turn.
     beyond_limits: accept positions beyond the limits of the URDF.
@@ -169,7 +169,7 @@ def _read(
 
 def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
     """The step of even times that all episodes get, or None if every stamp stays."""
-    median = float(np.median(np.concatenate([own.steps for own in stamps])))
+    median = float(np.median([own.step for own in stamps]))
     if options.rate is not None:
         if options.rate < 0.9 / median:
             warnings.warn(

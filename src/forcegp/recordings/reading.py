@@ -13,7 +13,7 @@ from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
 from forcegp.recordings.spool import Spool
 
-ROWS_AT_A_TIME = 65536
+ROWS_AT_A_TIME = 16384
 TURN = 2.0 * np.pi
 MOST_JUMPS = 1000
 """That are remembered of one piece: the first one that matters is reported."""

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError
@@ -42,8 +42,8 @@ class Stretch:
 class Stamps:
     """The stamps of one recording.
 
-    `kept` (rows,) are the rows that are used; `step` is the median of the steps between them [s]; `steps` are these
-    steps within stretches; `worst` the largest relative deviation of one from the median.
+    `kept` (rows,) are the rows that are used; `step` is the median of the steps between them [s]; `worst` the largest
+    relative deviation of a step within a stretch from it.
     """
 
     __no_type_check__: ClassVar[bool] = True
@@ -51,15 +51,10 @@ class Stamps:
     stretches: tuple[Stretch, ...]
     kept: Bool[np.ndarray, " rows"]
     step: float
-    steps: Float[np.ndarray, " steps"]
+    worst: float
     repeated: int
     gaps: tuple[float, ...]
     dropped_rows: int
-
-    @property
-    def worst(self) -> float:
-        """Largest relative deviation of a step from the median step."""
-        return float(np.abs(self.steps / self.step - 1.0).max())
 
     @property
     def even(self) -> bool:
@@ -74,38 +69,21 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
     time is not known. `start` and `end` [s] are counted from the first row of each episode.
     Raises DatasetError for time that runs backwards, and for rates that no robot is logged at.
     """
-    time = recording.time
     begins = recording.episodes[:, 1]
-    steps = np.diff(time)
-    inner = np.ones(len(steps), bool)
-    inner[begins[begins > 0] - 1] = False
-    _require_order(recording, steps, inner)
-    positive = steps[inner & (steps > 0)]
-    if not positive.size:
-        raise DatasetError(f"{recording.label}: all rows have the same time stamp; map another column as the time.")
-    _require_rate(recording, float(np.median(positive)))
-    kept = _first_of_each(time, begins, REPEATED * float(np.median(positive)))
-    repeated = int((~kept).sum())
+    typical = _typical_step(recording)
+    _require_rate(recording, typical)
+    kept = _first_of_each(recording.time, begins, REPEATED * typical)
+    repeated = len(kept) - int(kept.sum())
+    if start is not None or end is not None:
+        kept &= _between(recording, start, end)
     used = np.flatnonzero(kept)
     number = np.searchsorted(begins, used, side="right") - 1
-    since = time[used] - time[begins[number]]
-    inside = np.ones(len(used), bool)
-    if start is not None:
-        inside &= since >= start
-    if end is not None:
-        inside &= since <= end
-    used, number = used[inside], number[inside]
-    if not used.size:
-        raise DatasetError(f"{recording.label}: no row lies between --start and --end; it has {since.max():.6g} s.")
-    kept[:] = False
-    kept[used] = True
-    between = np.diff(time[used])
     same = np.diff(number) == 0
-    typical = between[same]
-    step = float(np.median(typical)) if typical.size else float(np.median(positive))
+    between = np.diff(recording.time[used])
+    step = float(np.median(between[same])) if same.any() else typical
     limit = GAP * step if gap is None else gap
-    cuts = np.flatnonzero(~same | (between > limit)) + 1
-    bounds = [0, *cuts.tolist(), len(used)]
+    inside = same & (between <= limit)
+    bounds = [0, *(np.flatnonzero(~inside) + 1).tolist(), len(used)]
     stretches, dropped = [], 0
     for first, last in pairwise(bounds):
         if last - first < FEWEST_ROWS:
@@ -118,13 +96,17 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
             f"{recording.label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
             "a longer --gap may be right."
         )
-    inside_stretches = between[same & (between <= limit)]
-    gaps = tuple(float(value) for value in between[same & (between > limit)])
-    return Stamps(tuple(stretches), kept, step, inside_stretches, repeated, gaps, dropped)
+    gaps = tuple(between[same & ~inside].tolist())
+    worst = float(np.abs(between[inside] / step - 1.0).max())
+    return Stamps(tuple(stretches), kept, step, worst, repeated, gaps, dropped)
 
 
-def _require_order(recording: RawRecording, steps: np.ndarray, inner: np.ndarray) -> None:
-    backwards = np.flatnonzero(inner & (steps < 0))
+def _typical_step(recording: RawRecording) -> float:
+    """The median step within episodes. Raises DatasetError for time that runs backwards or stands still."""
+    begins = recording.episodes[:, 1]
+    steps = np.diff(recording.time)
+    steps[begins[begins > 0] - 1] = np.nan
+    backwards = np.flatnonzero(steps < 0)
     if backwards.size:
         row = int(backwards[0]) + 1
         raise DatasetError(
@@ -132,6 +114,23 @@ def _require_order(recording: RawRecording, steps: np.ndarray, inner: np.ndarray
             f"({recording.time[row]:.6g} s from the start), {backwards.size} times in all. Sort the log, map another "
             "column as the time, or name the column that numbers its episodes (--episode)."
         )
+    positive = steps[steps > 0]
+    if len(recording.time) < FEWEST_ROWS:
+        raise DatasetError(f"{recording.label} has {len(recording.time)} rows; an episode has at least {FEWEST_ROWS}.")
+    if not positive.size:
+        raise DatasetError(f"{recording.label}: all rows have the same time stamp; map another column as the time.")
+    return float(np.median(positive))
+
+
+def _between(recording: RawRecording, start: float | None, end: float | None) -> np.ndarray:
+    """Rows from `start` to `end` seconds after the first of their episode. Raises DatasetError if there is none."""
+    begins = recording.episodes[:, 1]
+    counts = np.diff([*begins, len(recording.time)])
+    since = recording.time - np.repeat(recording.time[begins], counts)
+    inside = (since >= (-np.inf if start is None else start)) & (since <= (np.inf if end is None else end))
+    if not inside.any():
+        raise DatasetError(f"{recording.label}: no row lies between --start and --end; it has {since.max():.6g} s.")
+    return inside
 
 
 def _require_rate(recording: RawRecording, step: float) -> None:
