@@ -22,7 +22,7 @@ def test_a_raw_log_teaches_without_accelerations(forcegp, folder, name, window):
     done = forcegp(*FIT, "--learn-from", name, "--window", window, "--out", name, folder=folder)
     assert done.returncode == 0, done.stderr
     assert "learned from 12 points" in " ".join(done.stdout.split())
-    assert "12 windows of 10 nodes" in " ".join(done.stdout.split())
+    assert "12 windows of 6 nodes" in " ".join(done.stdout.split())
     posterior = load_posterior(folder / name)
     assert posterior.settings["observe"]["seconds"] == window
     assert len(posterior.training) == 12

@@ -12,10 +12,10 @@ from forcegp.data.windows import white_noise
 from forcegp.errors import DatasetError, InvalidInput
 
 HOWS = {
-    "weak form on q": WeakForm(0.1),
-    "weak form on v": WeakForm(0.1, signal="v", order=1),
-    "narrow weak form on q": WeakForm(0.1, order=4),
-    "increments": VelocityIncrements(0.1),
+    "weak form on q": WeakForm(0.1, nodes=10),
+    "weak form on v": WeakForm(0.1, nodes=10, signal="v", order=1),
+    "narrow weak form on q": WeakForm(0.1, nodes=10, order=4),
+    "increments": VelocityIncrements(0.1, nodes=10),
 }
 
 

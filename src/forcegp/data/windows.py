@@ -158,7 +158,7 @@ class WeakForm(WindowObservation):
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "weak-form"
     seconds: float = 0.1
-    nodes: int = 10
+    nodes: int = 6
     signal: Literal["q", "v"] = "q"
     order: int = 2
 
@@ -205,7 +205,7 @@ class VelocityIncrements(WindowObservation):
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "increments"
     seconds: float = 0.1
-    nodes: int = 10
+    nodes: int = 6
     signal: Literal["q", "v"] = field(default="v", init=False)
 
     @override
