@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 
 from forcegp.data.dataset import Dataset
@@ -40,7 +39,9 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
 
     Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
-    from forcegp.mechanics.state import State  # a Dataset is read without mechanics unless it needs them
+    import torch  # a Dataset is read without torch and mechanics unless it needs them
+
+    from forcegp.mechanics.state import State
 
     system = dataset.system
     if system is None or not system.contacts:
