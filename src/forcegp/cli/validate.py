@@ -53,6 +53,9 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
     PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
     identified from the same rows."""
+    identification: Annotated[str, arg(metavar="METHOD")] = "acceleration"
+    """What @identified takes, and whose mass matrix turns errors of accelerations into forces: acceleration, torque or
+    least-squares, or from all training rows acceleration-all or torque-all."""
     points: Annotated[int, arg(metavar="N")] = 100
     """Rows that every model learns from: those that lie farthest apart among two thirds of the training rows."""
     seeds: Annotated[int, arg(metavar="N")] = 5
@@ -126,6 +129,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             horizons=horizons,
             starts=self.starts,
             integrator=self.integrator,
+            identification=self.identification,
             restarts=self.restarts,
             iterations=self.iterations,
             force_noise=self.force_noise,

@@ -2,6 +2,7 @@
 
 from forcegp.validation.candidates import CANDIDATES, DEFAULT_MODELS, Candidate, Training
 from forcegp.validation.comparison import Comparison
+from forcegp.validation.identified_systems import IDENTIFICATIONS, Identification
 from forcegp.validation.run import Validation, validate
 from forcegp.validation.splits import (
     Split,
@@ -19,6 +20,8 @@ __all__ = [
     "DEFAULT_MODELS",
     "Candidate",
     "Comparison",
+    "IDENTIFICATIONS",
+    "Identification",
     "Split",
     "Stretch",
     "Training",

@@ -1,7 +1,7 @@
 """The models of a comparison, by name: each is told the same training rows and makes a posterior of them.
 
-A name is an entry of `CANDIDATES`, or an expression of priors as in `forcegp fit --prior` with the system that its mean
-takes: `joint-friction` (as given), `joint + joint-friction@identified`. Add your own:
+A name is an entry of `CANDIDATES`, a way to identify the system (`identified-torque`), or an expression of priors as in
+`forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. Add yours:
 
     CANDIDATES["mine"] = Candidate("what it is", "black box", fit_mine)
 """
@@ -20,10 +20,12 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Posterior, StructuredGP
 from forcegp.priors import NoForces, named_prior
-from forcegp.validation.identified_systems import IDENTIFICATIONS, learned_noise
+from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, learned_noise
 
-Kind = Literal["given", "identified", "black box", "force prior"]
-"""Parametric physics as given or identified, a model without physics, and Gaussian processes on unknown forces."""
+Kind = Literal["given", "identified", "yardstick", "black box", "force prior"]
+"""Parametric physics as given or identified, or identified from more rows than others see and therefore in no verdict,
+a model without physics, and Gaussian processes on unknown forces.
+"""
 
 MEAN = "@"
 """Between a prior and the system that the mean takes, in the name of a model."""
@@ -122,15 +124,6 @@ CANDIDATES: dict[str, Candidate] = {
     "analytical": Candidate(
         "the system as given (URDF and known forces), noise learned", "given", partial(_fit_system, "given")
     ),
-    **{
-        f"identified-{name}": Candidate(
-            f"the system identified by {name}, noise learned",
-            "identified",
-            partial(_fit_system, name),
-            name,
-        )
-        for name in IDENTIFICATIONS
-    },
     "independent-gp": Candidate(
         "one Gaussian process per joint on (q, v, u), without physics", "black box", _fit_independent, cost=5.0
     ),
@@ -144,14 +137,15 @@ CANDIDATES: dict[str, Candidate] = {
         cost=20.0,
     ),
 }
-"""Models by name; Gaussian processes on forces need no entry, see `candidate`."""
+"""Models by name. Identified systems and Gaussian processes on forces need no entry, see `candidate`."""
 
-BEST_IDENTIFICATION = list(IDENTIFICATIONS)[-1]
-"""What `@identified` and the mass matrix of force errors take."""
+IDENTIFIED = "identified-"
 
 DEFAULT_MODELS = (
     "analytical",
-    *(f"identified-{name}" for name in IDENTIFICATIONS),
+    "identified-torque",
+    "identified-acceleration",
+    "identified-acceleration-all",
     "independent-gp",
     "ensemble",
     "joint",
@@ -163,43 +157,56 @@ DEFAULT_MODELS = (
 )
 
 
-def candidate(name: str, system: MechanicalSystem) -> Candidate:
-    """The model of this name, or Gaussian processes with the priors of this expression on forces.
+def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT_IDENTIFICATION) -> Candidate:
+    """The model of this name: an entry, `identified-METHOD`, or Gaussian processes with these priors on forces.
 
-    Raises InvalidInput for names that are neither, and for priors that do not fit the system.
+    `identification` is what `@identified` takes. Raises InvalidInput for names that are none of these, and for priors
+    that do not fit the system.
     """
     if name in CANDIDATES:
         return CANDIDATES[name]
+    if name.removeprefix(IDENTIFIED) in IDENTIFICATIONS and name.startswith(IDENTIFIED):
+        return _identified_candidate(name.removeprefix(IDENTIFIED))
     expression, at, mean = (part.strip() for part in name.partition(MEAN))
     mean = mean if at else "given"
-    identification = BEST_IDENTIFICATION if mean == "identified" else None if mean == "given" else mean
-    if identification is not None and identification not in IDENTIFICATIONS:
+    method = {"given": None, "identified": identification}.get(mean, mean)
+    if method is not None and method not in IDENTIFICATIONS:
         allowed = ", ".join(("given", "identified", *IDENTIFICATIONS))
         raise InvalidInput(f"model {name!r} takes its mean from {mean!r}; give PRIOR{MEAN}MEAN with one of {allowed}.")
     try:
         named_prior(expression, system)
     except InvalidInput as error:
-        close = difflib.get_close_matches(name, CANDIDATES, n=1)
+        known = [*CANDIDATES, *(f"{IDENTIFIED}{method}" for method in IDENTIFICATIONS)]
+        close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise InvalidInput(
-            f"no model is called {name!r}; {hint}there are {', '.join(CANDIDATES)}, and PRIOR{MEAN}MEAN with the mean "
-            f"given or identified ({error})"
+            f"no model is called {name!r}; {hint}there are {', '.join(known)}, and priors PRIOR{MEAN}MEAN with the "
+            f"mean given or identified ({error})"
         ) from None
-    takes = "as given" if identification is None else f"identified by {identification}"
+    takes = "as given" if method is None else f"identified by {IDENTIFICATIONS[method].summary}"
     return Candidate(
         f"Gaussian processes on unknown forces ({expression}), mean of the system {takes}",
-        "force prior",
-        partial(_fit_forces, expression, "given" if identification is None else identification),
-        identification,
+        "force prior" if method is None or not IDENTIFICATIONS[method].all_rows else "yardstick",
+        partial(_fit_forces, expression, "given" if method is None else method),
+        method,
         cost=10.0,
     )
 
 
-def candidates(names: Sequence[str], system: MechanicalSystem) -> dict[str, Candidate]:
+def _identified_candidate(method: str) -> Candidate:
+    chosen = IDENTIFICATIONS[method]
+    kind: Kind = "yardstick" if chosen.all_rows else "identified"
+    summary = f"the system identified by {chosen.summary}; noise learned"
+    return Candidate(summary, kind, partial(_fit_system, method), method)
+
+
+def candidates(
+    names: Sequence[str], system: MechanicalSystem, identification: str = DEFAULT_IDENTIFICATION
+) -> dict[str, Candidate]:
     """The models of these names. Raises InvalidInput for none, for a name that comes twice, and as `candidate`."""
     if not names:
         raise InvalidInput("no model is named; name one or more.")
     repeated = sorted({name for name in names if list(names).count(name) > 1})
     if repeated:
         raise InvalidInput(f"models {repeated} are named twice; name each once.")
-    return {name: candidate(name, system) for name in names}
+    return {name: candidate(name, system, identification) for name in names}

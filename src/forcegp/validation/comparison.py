@@ -20,9 +20,9 @@ from forcegp.errors import FitError, ForceGPError, InvalidInput
 from forcegp.evaluation.machine import machine
 from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
-from forcegp.validation.candidates import BEST_IDENTIFICATION, Candidate, Training
+from forcegp.validation.candidates import Candidate, Training
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions, motion_scores
-from forcegp.validation.identified_systems import IDENTIFICATIONS
+from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, Identification
 from forcegp.validation.kept_cells import KeptCells
 from forcegp.validation.scores import acceleration_scores, mass_matrices
 from forcegp.validation.splits import Split
@@ -43,6 +43,7 @@ class Comparison:
     splits: what is held out; with several of them everything is done for each.
     points: training rows of every model.
     horizons, starts, integrator: of the predicted motions.
+    identification: what `@identified` and the mass matrix of force errors take, a key of `IDENTIFICATIONS`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
 
@@ -57,6 +58,7 @@ class Comparison:
     horizons: tuple[float, ...] = HORIZONS
     starts: int = STARTS
     integrator: str = "rk4"
+    identification: str = DEFAULT_IDENTIFICATION
     restarts: int | None = None
     iterations: int | None = None
     force_noise: float | None = None
@@ -73,6 +75,9 @@ class Comparison:
             if value is not None and value < 1:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
         integrator_named(self.integrator, self.system)
+        if self.identification not in IDENTIFICATIONS:
+            given, allowed = self.identification, ", ".join(IDENTIFICATIONS)
+            raise InvalidInput(f"no identification is called {given!r}; there are {allowed}.")
         if len({split.name for split in self.splits}) < len(self.splits) or not self.splits:
             raise InvalidInput("give one split or more, each of its own name.")
         for split in self.splits:  # refused now, not after an hour
@@ -86,7 +91,7 @@ class Comparison:
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the numbers, as plain JSON values."""
-        options = ("points", "starts", "integrator", "restarts", "iterations", "force_noise")
+        options = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise")
         return {
             "forcegp": __version__,
             "rows_sha256": fingerprint(self.rows),
@@ -104,22 +109,26 @@ class Cell:
 
     kind: str
     name: str
-    candidate: Candidate | None
+    work: Candidate | Identification
     split: int
     seed: int
 
     @property
     def cost(self) -> float:
         """CPU time relative to others, for the remaining time alone."""
-        return 2.0 if self.candidate is None else self.candidate.cost
+        return self.work.cost if isinstance(self.work, Candidate) else 1.0
 
     def file_name(self, comparison: Comparison) -> str:
-        """Without ending; every character is one that all file systems take."""
-        plain = re.sub(r"[^\w.+@-]+", "_", self.name.replace(" ", ""))
-        if plain != self.name.replace(" ", ""):  # names that differ in other characters only
-            plain += f"-{hashlib.sha256(self.name.encode()).hexdigest()[:6]}"
-        kind = "" if self.kind == MODEL else f"{self.kind}-"
-        return f"{comparison.splits[self.split].name}-seed{self.seed}-{kind}{plain}"
+        """Without ending."""
+        return file_name(comparison.splits[self.split], self.seed, self.kind, self.name)
+
+
+def file_name(split: Split, seed: int, kind: str, name: str) -> str:
+    """Of a cell, without ending; every character is one that all file systems take."""
+    plain = re.sub(r"[^\w.+@-]+", "_", name.replace(" ", ""))
+    if plain != name.replace(" ", ""):  # names that differ in other characters only
+        plain += f"-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
+    return f"{split.name}-seed{seed}-{'' if kind == MODEL else f'{kind}-'}{plain}"
 
 
 def cells_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Cell], list[Cell]]:
@@ -127,10 +136,10 @@ def cells_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int
     wanted = {each.identification for each in models.values() if each.identification is not None}
     places = [(split, seed) for seed in range(seeds) for split in range(len(comparison.splits))]
     first = [
-        Cell(IDENTIFICATION, name, None, *place)
+        Cell(IDENTIFICATION, name, each, *place)
         for place in places
-        for name in IDENTIFICATIONS
-        if name in wanted or (name == BEST_IDENTIFICATION and place[1] == 0)
+        for name, each in IDENTIFICATIONS.items()
+        if name in wanted or (name == comparison.identification and place[1] == 0)
     ]
     return first, [Cell(MODEL, name, each, *place) for place in places for name, each in models.items()]
 
@@ -146,9 +155,9 @@ def compute(comparison: Comparison, kept: KeptCells, cell: Cell) -> None:
             work = _identify if cell.kind == IDENTIFICATION else _score
             result = work(comparison, kept, cell)
         except ForceGPError as problem:
-            error = str(problem)
+            error = " ".join(str(problem).split())
         except Exception as problem:  # a model of somebody else may fail in any way; its row will say how
-            error = f"{type(problem).__name__}: {problem}"
+            error = " ".join(f"{type(problem).__name__}: {problem}".split())
     kept.write(
         cell.file_name(comparison),
         {
@@ -171,16 +180,21 @@ def _training_rows(comparison: Comparison, cell: Cell) -> tuple[Dataset, Dataset
 
 
 def _identify(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any]:
+    assert isinstance(cell.work, Identification), "a cell of an identification knows how"
     rows, _ = _training_rows(comparison, cell)
+    if cell.work.all_rows:
+        rows, _ = comparison.splits[cell.split].apply(comparison.rows)
     start = time.process_time()
-    system = IDENTIFICATIONS[cell.name](comparison.system, rows)
-    return {"cpu_seconds": time.process_time() - start, "system": system.to_dict()}
+    system = cell.work.identify(comparison.system, rows)
+    seconds = time.process_time() - start
+    told = {"how": cell.work.summary, "training_rows": len(rows)}
+    return {"cpu_seconds": seconds, **told, "system": system.to_dict()}
 
 
 def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any]:
-    assert cell.candidate is not None, "a cell of a model has its candidate"
+    assert isinstance(cell.work, Candidate), "a cell of a model has its candidate"
     rows, test = _training_rows(comparison, cell)
-    name = cell.candidate.identification
+    name = cell.work.identification
     identified: dict[str, MechanicalSystem | str] = {}
     before = 0.0
     if name is not None:
@@ -195,7 +209,7 @@ def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any
         comparison.force_noise,
     )
     start = time.process_time()
-    posterior = cell.candidate.fit(training)
+    posterior = cell.work.fit(training)
     seconds = before + time.process_time() - start
     mass, whose = reference_mass(comparison, kept, cell.split, test)
     scores = acceleration_scores(posterior, test, mass)
@@ -209,12 +223,17 @@ def identified_system(
     comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int
 ) -> tuple[MechanicalSystem | str, float]:
     """The system of a finished identification, or why there is none, and the CPU seconds that it took."""
-    stored = kept.read(Cell(IDENTIFICATION, name, None, split, seed).file_name(comparison))
+    found = _identification(comparison, kept, name, split, seed)
+    if found["result"] is None:
+        return str(found["error"]), 0.0
+    return MechanicalSystem.from_dict(found["result"]["system"]), found["result"]["cpu_seconds"]
+
+
+def _identification(comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int) -> dict[str, Any]:
+    stored = kept.read(file_name(comparison.splits[split], seed, IDENTIFICATION, name))
     if stored is None:
         raise FitError(f"the identification {name!r} with seed {seed} was not done")
-    if stored["result"] is None:
-        return str(stored["error"]), 0.0
-    return MechanicalSystem.from_dict(stored["result"]["system"]), stored["result"]["cpu_seconds"]
+    return stored
 
 
 def reference_mass(
@@ -225,11 +244,12 @@ def reference_mass(
     One and the same for all models and seeds of a split: of the system identified with the first seed, because a URDF
     seldom knows rotor inertias; of the system as given where that identification failed.
     """
-    system, _ = identified_system(comparison, kept, BEST_IDENTIFICATION, split, 0)
-    if isinstance(system, str):
-        told = f"the system as given, because its identification failed ({system})"
+    found = _identification(comparison, kept, comparison.identification, split, 0)
+    if found["result"] is None:
+        told = f"the system as given, because its identification failed ({found['error']})"
         return mass_matrices(comparison.system, test), told
-    return mass_matrices(system, test), f"the system identified by {BEST_IDENTIFICATION} from the rows of seed 0"
+    system = MechanicalSystem.from_dict(found["result"]["system"])
+    return mass_matrices(system, test), f"the system identified with seed 0 by {found['result']['how']}"
 
 
 def fingerprint(dataset: Dataset) -> str:

@@ -1,26 +1,21 @@
-"""Systems whose inertial parameters and friction were identified from training rows: a mean for other models."""
+"""Systems whose inertial parameters and friction were identified from training rows: models, and means of others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
-import torch
 
+from forcegp.analytical import identify_analytical
 from forcegp.data import Dataset
-from forcegp.mechanics import Armature, CoulombJointFriction, KnownForce, MechanicalSystem, ViscousJointFriction
-from forcegp.models import Coefficients, Noise, StructuredGP
-from forcegp.priors import NoForces
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import Noise
 
 START_NOISE = 0.1
 """Where a learned noise begins, as a part of the standard deviation of the measured acceleration of each joint."""
-
-PRIOR_STRENGTH = 1.0
-"""Of the prior on inertias when they are identified by likelihood: a mass 30 % off costs 0.2 nats."""
-
-SMOOTHING = 0.05
-"""Velocity scale of Coulomb friction, as a part of the standard deviation of each joint's velocity."""
 
 
 def learned_noise(rows: Dataset, force: float | None = None) -> Noise:
@@ -36,35 +31,42 @@ def learned_noise(rows: Dataset, force: float | None = None) -> Noise:
     return Noise(tuple(float(level) for level in start), force, learn=True)
 
 
-def identified_by_likelihood(system: MechanicalSystem, rows: Dataset) -> MechanicalSystem:
-    """All inertias, viscous and Coulomb friction and armature by maximum likelihood of the accelerations.
+@dataclass(frozen=True)
+class Identification:
+    """One way to identify a system.
 
-    Physically consistent by construction. Friction and armature that the system does not list are added.
+    Fields
+    ------
+    summary: how, as a part of a sentence.
+    identify: (given system, training rows) -> identified system.
+    all_rows: from all training rows, not from those few that every model learns from: a yardstick.
     """
-    robot, listed = system.robot, {type(force) for force in system.known_forces}
-    scale = torch.tensor(np.maximum(SMOOTHING * rows.v.std(axis=0), 1e-3))
-    M = system.mass_matrix(robot.kinematics(torch.tensor(rows.q)))
-    rotor = 0.01 * M.diagonal(dim1=-2, dim2=-1).mean(0)
-    start = torch.tensor(np.maximum(0.01 * np.abs(rows.u).mean(axis=0), 1e-4))
-    added: list[KnownForce] = []
-    if ViscousJointFriction not in listed:
-        added.append(ViscousJointFriction(start))
-    if CoulombJointFriction not in listed:
-        added.append(CoulombJointFriction(start, scale))
-    if Armature not in listed:
-        added.append(Armature(rotor))
-    widened = replace(system, known_forces=(*system.known_forces, *added))
-    links = [robot.link(joint.child) for joint in robot.joints]
-    learn = [link.inertial("mass", "com", "inertia") for link in links if link.mass > 0.0]
-    names = ("viscous-joint-friction", "coulomb-joint-friction", "armature")
-    model = StructuredGP(widened, NoForces(), "analytical", learned_noise(rows))
-    posterior = model.fit(
-        rows, restarts=1, learn=[*learn, *(Coefficients(name) for name in names)], prior_strength=PRIOR_STRENGTH
-    )
-    return posterior.system
+
+    summary: str
+    identify: Callable[[MechanicalSystem, Dataset], MechanicalSystem]
+    all_rows: bool = False
 
 
-Identify = Callable[[MechanicalSystem, Dataset], MechanicalSystem]
+def _identified(system: MechanicalSystem, rows: Dataset, **how: Any) -> MechanicalSystem:
+    return identify_analytical(system, rows, **how).system
 
-IDENTIFICATIONS: Mapping[str, Identify] = {"likelihood": identified_by_likelihood}
-"""How a system is identified, by name: (given system, training rows) -> identified system."""
+
+_LEAST_SQUARES = partial(_identified, inertias="free", likelihood="torque")
+_TORQUE = partial(_identified, inertias="consistent", likelihood="torque")
+_ACCELERATION = partial(_identified, inertias="consistent", likelihood="acceleration")
+
+IDENTIFICATIONS: dict[str, Identification] = {
+    "least-squares": Identification(
+        "ordinary least squares of joint forces, whose inertias need not belong to a body", _LEAST_SQUARES
+    ),
+    "torque": Identification("least squares of joint forces, physically consistent", _TORQUE),
+    "acceleration": Identification("maximum likelihood of accelerations, physically consistent", _ACCELERATION),
+    "torque-all": Identification("least squares of joint forces of ALL training rows", _TORQUE, all_rows=True),
+    "acceleration-all": Identification(
+        "maximum likelihood of accelerations of ALL training rows", _ACCELERATION, all_rows=True
+    ),
+}
+"""By name. Add your own: IDENTIFICATIONS["mine"] = Identification("how", identify_mine)."""
+
+DEFAULT_IDENTIFICATION = "acceleration"
+"""What `@identified` and the mass matrix of force errors take where nothing else is asked for."""

@@ -103,8 +103,8 @@ def _against_baseline(found: Mapping[str, Any] | None) -> list[str]:
         if not any(answer["verdict"] == "better" for answer in answers.values() if answer is not None)
     ]
     told.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
-    header = ["model", *(f"{SCORES[score]}, {'minus' if score == 'nlpd' else 'times'}" for score in scores)]
-    text = f"Against {baseline}, with 95 % intervals; bold where the interval shows the model to be better."
+    header = ["model", *(f"{SCORES[score]}{', difference' if score == 'nlpd' else ', ratio'}" for score in scores)]
+    text = "Paired over runs, with 95 % intervals; bold where the interval shows the model to be better."
     return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(told)]
 
 

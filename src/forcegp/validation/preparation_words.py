@@ -42,7 +42,9 @@ def _step(report: Mapping[str, Any]) -> str:
             f"zero-phase Butterworth low-pass of order {report.get('order')} at {cutoff:g} Hz on {what}, {made}"
         )
     if report.get("every", 1) > 1:
-        parts.append(f"every {report['every']}th row")
+        every = report["every"]
+        ending = "th" if every % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(every % 10, "th")
+        parts.append(f"every {every}{ending} row")
     if report.get("trim"):
         parts.append(f"{report['trim']:g} s dropped at both ends of every episode")
     return "; ".join(parts) + "."

@@ -78,7 +78,7 @@ def validate(
         raise InvalidInput(f"the backend {workers.name} does not share files; choose serial or joblib.")
     if isinstance(seeds, bool) or seeds < 1:
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
-    chosen = candidates(models, comparison.system)
+    chosen = candidates(models, comparison.system, comparison.identification)
     configuration = comparison.configuration()
     kept = KeptCells.open(Path(folder), configuration, overwrite=overwrite)
     identifications, fits = cells_of(comparison, chosen, seeds)
@@ -186,5 +186,5 @@ def _brief(cell: Mapping[str, Any]) -> dict[str, Any]:
     """Without the system of an identification, which its own file holds."""
     result = cell["result"]
     if cell["kind"] == "identification" and result is not None:
-        result = {"cpu_seconds": result["cpu_seconds"]}
+        result = {name: value for name, value in result.items() if name != "system"}
     return {**cell, "result": result}

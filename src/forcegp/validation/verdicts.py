@@ -69,11 +69,11 @@ class Paired:
         spread = "one run, so no interval"
         if self.interval is not None:
             spread = f"95 % interval {_told(self.score, self.interval[0])} to {_told(self.score, self.interval[1])}"
-        of = "minus that" if self.score == "nlpd" else "times that"
-        return (
-            f"{said} by the {SCORES[self.score]}: that of {self.challenger} is {_told(self.score, self.value)} {of} of "
-            f"{self.baseline} ({spread}; better in {self.wins} of {self.runs} runs)."
-        )
+        if self.score == "nlpd":
+            pair = f"{self.challenger} − {self.baseline} = {_told(self.score, self.value)} nats"
+        else:
+            pair = f"{self.challenger} / {self.baseline} = {_told(self.score, self.value)}"
+        return f"{said} by the {SCORES[self.score]}: {pair} ({spread}; better in {self.wins} of {self.runs} runs)."
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""

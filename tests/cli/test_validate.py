@@ -1,0 +1,150 @@
+"""`forcegp validate` from end to end: the real executable on a small arm whose truth is known."""
+
+import dataclasses
+import json
+import re
+
+import pytest
+from tests.models.arm import URDF
+from tests.validation.moving_arm import moving_arm
+
+from forcegp.cli.main import main
+
+MODELS = ("analytical", "identified-acceleration", "joint-friction", "joint-friction@identified")
+QUICK = ("--points", 40, "--restarts", 1, "--iterations", 30, "--horizon", "0.1,0.3", "--starts", 2)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("validate")
+    (path / "arm.urdf").write_text(URDF)
+    log = moving_arm(2.0, 2)
+    log.save(path / "log.h5")
+    dataclasses.replace(log, system=None, noise_std=None, metadata={"rig": "small"}).save(path / "raw.h5")
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(forcegp, folder):
+    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, "--models", *MODELS)
+    done = forcegp(*words, "--out", "results", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_what_is_known_of_the_arm_comes_out(found):
+    """The URDF lacks friction and mass: identifying them helps, and so does a process that learns the friction."""
+    models = found["models"]
+    median = {name: {score: models[name][score]["median"] for score in ("nrmse", "force_rms")} for name in MODELS}
+    for score in ("nrmse", "force_rms"):
+        assert median["identified-acceleration"][score] < median["analytical"][score]
+        assert median["joint-friction"][score] < median["analytical"][score]
+        assert median["joint-friction@identified"][score] < median["joint-friction"][score]
+    assert median["identified-acceleration"]["force_rms"] < 0.2 * median["analytical"]["force_rms"]
+    assert (
+        models["identified-acceleration"]["motions"]["rms"][1]["median"]
+        < 0.1 * (models["analytical"]["motions"]["rms"][1]["median"])
+    )
+    answers = {
+        answer["score"]: (answer["value"] < 0.2, answer["wins"], answer["runs"])
+        for item in found["verdicts"]
+        if item["question"] == "Is the identified model better than the system as given?"
+        for answer in item["answers"]
+    }
+    assert answers["nrmse"] == answers["force_rms"] == (True, 2, 2)
+    assert found["against_baseline"]["baseline"] == "identified-acceleration"
+
+
+def test_the_page_says_what_was_done(found, folder):
+    page = (folder / "results" / "report.md").read_text()
+    assert "trained on whole episodes (episode 0), tested on others (episode 1)" in page
+    assert "no filter; every 2nd row." in page
+    assert "the same 40 rows" in page
+    assert "the system identified with seed 0 by maximum likelihood of accelerations" in page
+    for name in MODELS:
+        assert re.search(rf"^\| {re.escape(name)} \| [*\d]", page, re.M)
+    assert "Does a Gaussian process on forces beat the identified model?\n  * **" in page
+    stored = json.loads((folder / "results" / "results.json").read_text())
+    assert {name: stored[name] for name in found if name != "out"} == {k: v for k, v in found.items() if k != "out"}
+    assert len(stored["source"]["sha256"]) == 64
+    assert stored["configuration"]["points"] == 40
+    assert len(list((folder / "results" / "cells").glob("*.json"))) == 2 * (1 + len(MODELS))
+    for name in ("errors", "calibration", "motions"):
+        assert f"({name}.png)" in page
+        assert (folder / "results" / f"{name}.png").stat().st_size > 5000
+
+
+def test_the_same_command_goes_on_and_another_is_refused(forcegp, found, folder):
+    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, *QUICK, "--out", "results")
+    (lost,) = (folder / "results" / "cells").glob("*seed1-analytical.json")
+    lost.unlink()
+    done = forcegp(*words, "--seeds", 2, "--models", *MODELS, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    for name in MODELS:
+        for score in ("nrmse", "force_rms", "nlpd", "motions"):
+            assert told["models"][name][score] == found["models"][name][score]
+    done = forcegp(*words, "--seeds", 2, "--models", *MODELS, "--points", 39, folder=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "holds results with another points" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder):
+    words = ["validate", "raw.h5", "--robot", "arm.urdf", "--out", "raw", "--seeds", 1, *QUICK]
+    words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.05]
+    words += ["--models", "analytical"]
+    done = forcegp(*words, "ensmble", folder=folder)
+    assert done.returncode == 2
+    assert "did you mean 'ensemble'" in done.stderr
+    done = forcegp(*words, "payload:frame=hand", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"analytical\s+\d+\.\d+", done.stdout)
+    page = (folder / "raw" / "report.md").read_text()
+    assert "zero-phase Butterworth low-pass of order 4 at 15 Hz on q and u, v and a from it by central" in page
+    assert "every episode cut into 4 consecutive blocks of equal duration, block 2 held out" in page
+    assert "within 0.05 s of them left out" in page
+    assert "The filter took" in page
+    stored = json.loads((folder / "raw" / "results.json").read_text())
+    assert stored["models"]["analytical"]["motions"]["dt"] == pytest.approx(0.01), "at the full rate"
+    assert stored["splits"][0]["guard"] == 0.05
+
+
+def test_help_has_an_example(forcegp):
+    done = forcegp("validate", "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(r"For instance:\n\s+forcegp validate \S", done.stdout)
+
+
+OUT = "--out never"
+WRONG = [
+    (f"validate missing.h5 {OUT}", "missing.h5 is not a file"),
+    (f"validate raw.h5 {OUT}", "does not carry its robot; add --robot"),
+    (f"validate log.h5 {OUT} --split thirds", "the split is 'thirds'"),
+    (f"validate log.h5 {OUT} --split episodes:9", "no episode or log is called so"),
+    (f"validate log.h5 {OUT} --split blocks:5:9", "name some of 1 to 5"),
+    (f"validate log.h5 {OUT} --split blocks:5:3 --guard -1", "guard is -1"),
+    (f"validate log.h5 {OUT} --points 500", "two thirds"),
+    (f"validate log.h5 {OUT} --seeds 0", "number of seeds is 0"),
+    (f"validate log.h5 {OUT} --horizon soon", "--horizon is 'soon'"),
+    (f"validate log.h5 {OUT} --horizon 0", "horizons are [0.0]"),
+    (f"validate log.h5 {OUT} --models analytical analytical", "named twice"),
+    (f"validate log.h5 {OUT} --models anaytical", "did you mean 'analytical'"),
+    (f"validate log.h5 {OUT} --identification magic", "no identification is called 'magic'"),
+    (f"validate log.h5 {OUT} --cutoff 80", "cutoff is 80.0 Hz"),
+    (f"validate log.h5 {OUT} --backend ray", "does not share files"),
+    ("validate log.h5 --out log.h5", "was not written by `forcegp validate`"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG, ids=[words for words, _ in WRONG])
+def test_a_wrong_command_is_one_line_and_exit_code_2(folder, monkeypatch, capfd, words, message):
+    monkeypatch.chdir(folder)
+    before = sorted(folder.rglob("*"))
+    assert main(words.split()) == 2
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("forcegp: ")
+    assert told.err.count("\n") == 1, told.err
+    assert message in told.err
+    assert sorted(folder.rglob("*")) == before

@@ -1,0 +1,116 @@
+"""Errors of predicted motions against closed forms: a sledge whose mass the model has wrong."""
+
+import numpy as np
+import pytest
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import StructuredGP
+from forcegp.priors import NoForces
+from forcegp.robots import Robot
+from forcegp.validation.horizons import held_out_motions, motion_scores
+
+SLEDGE = """<robot name="sledge"><link name="base"/><link name="sledge"><inertial><mass value="{mass}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="rail" type="prismatic"><parent link="base"/><child link="sledge"/><axis xyz="1 0 0"/>
+<limit lower="-9" upper="9" effort="9" velocity="9"/></joint></robot>"""
+FORCE, TRUE_MASS, STEP = 3.0, 2.0, 0.01
+
+
+def sledge(mass: float) -> MechanicalSystem:
+    return MechanicalSystem(Robot.from_urdf_text(SLEDGE.format(mass=mass)))
+
+
+def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Dataset:
+    time = STEP * np.arange(rows)
+    a = np.full((rows, 1), force / TRUE_MASS)
+    v = 0.1 + a * time[:, None]
+    q = 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
+    arrays = {"q": q, "v": v, "u": np.full((rows, 1), force), "a": a}
+    system = sledge(TRUE_MASS)
+    return Dataset(
+        **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()},
+        time=np.tile(time, episodes),
+        episode=np.repeat(np.arange(episodes), rows),
+        system=system,
+    )
+
+
+def posterior(mass: float, data: Dataset):
+    return StructuredGP(sledge(mass), NoForces(), "analytical", 1.0).fit(data, points=5)
+
+
+@pytest.mark.parametrize("mass", [1.0, 2.5])
+def test_a_wrong_mass_is_off_by_half_of_its_acceleration_times_the_time_squared(mass):
+    data = recording()
+    motions = held_out_motions(data, data.episode == 1, (0.1, 0.5), starts=4)
+    assert motions.notes == ()
+    scores = motion_scores(posterior(mass, data), motions)
+    assert scores["motions"] == 4
+    assert scores["diverged"] == [0, 0]
+    expected = [0.5 * FORCE * abs(1.0 / mass - 1.0 / TRUE_MASS) * horizon**2 for horizon in (0.1, 0.5)]
+    assert np.allclose(scores["rms"], expected, rtol=1e-9)
+    assert np.allclose(np.array(scores["rms_per_joint"])[:, 0], expected, rtol=1e-9)
+
+
+def test_the_right_mass_has_no_error():
+    data = recording()
+    scores = motion_scores(posterior(TRUE_MASS, data), held_out_motions(data, data.episode == 0, (1.0,)))
+    assert scores["rms"][0] < 1e-12
+
+
+def test_motions_begin_in_held_out_stretches_and_cross_no_gap():
+    data = recording()
+    held_out = (data.episode == 0) & (data.time > 0.3) | (data.episode == 1) & (data.time < 0.45)
+    found = held_out_motions(data, held_out, (0.4,), starts=3)
+    first = {
+        (round(float(q), 9), round(float(v), 9))
+        for q, v in zip(found.motions.q[:, 0, 0], found.motions.v[:, 0, 0], strict=True)
+    }
+    rows = {
+        (round(float(q), 9), round(float(v), 9)) for q, v in zip(data.q[held_out, 0], data.v[held_out, 0], strict=True)
+    }
+    assert first <= rows
+    assert len(found.motions.q) == 6
+    gap = data.rows(np.flatnonzero((data.time < 0.5) | (data.time > 0.7)))
+    found = held_out_motions(gap, np.ones(len(gap), dtype=bool), (0.25, 0.4, 0.6), starts=5)
+    assert np.allclose(np.diff(found.motions.q[..., 0], n=2, axis=1), FORCE / TRUE_MASS * STEP**2)
+    assert found.horizons == (0.25, 0.4)
+    assert "not predicted: 0.6 s" in found.notes[0]
+
+
+def test_what_cannot_be_predicted_is_said():
+    data = recording()
+    none = held_out_motions(data, data.time < 0.02, (0.5,))
+    assert none.motions is None
+    assert "not predicted: 0.5 s; held-out stretches last 0.01 s" in none.notes[0]
+    assert motion_scores(posterior(1.0, data), none) is None
+    times = data.time.copy()
+    times[1::2] += 0.002
+    uneven = Dataset(q=data.q, v=data.v, u=data.u, a=data.a, time=times, episode=data.episode, system=data.system)
+    found = held_out_motions(uneven, data.episode == 0, (0.5,))
+    assert found.motions is None
+    assert "uneven" in found.notes[0]
+    mixed = data.rows(np.random.default_rng(0).permutation(len(data)))
+    assert "not in the order of time" in held_out_motions(mixed, np.ones(len(data), bool), (0.5,)).notes[0]
+
+
+def test_diverged_motions_are_counted_and_not_averaged():
+    data = recording(force=3.0)
+    motions = held_out_motions(data, data.episode == 0, (0.1, 0.9), starts=2)
+    with pytest.warns(NumericalWarning, match="2 of 2 rollouts diverged"):
+        scores = motion_scores(posterior(0.01, data), motions)  # 300 m/s^2: beyond 100 m/s after a third of a second
+    assert scores["diverged"] == [0, 2]
+    assert scores["rms"][0] == pytest.approx(0.5 * 0.1**2 * (300.0 - 1.5))
+    assert scores["rms"][1] is None
+    assert scores["rms_per_joint"][1] == [None]
+
+
+@pytest.mark.parametrize("horizons", [(), (0.0,), (-1.0,), (float("nan"),)])
+def test_wrong_horizons_are_refused(horizons):
+    data = recording()
+    with pytest.raises(InvalidInput, match="horizons are"):
+        held_out_motions(data, data.episode == 0, horizons)
+    with pytest.raises(InvalidInput, match="number of starts is 0"):
+        held_out_motions(data, data.episode == 0, (0.1,), starts=0)

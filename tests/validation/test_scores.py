@@ -1,0 +1,99 @@
+"""Scores against closed forms: inverse dynamics for forces, Gaussian densities and counts for intervals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+from tests.validation.moving_arm import given_system, moving_arm
+
+from forcegp.mechanics import Armature, MechanicalSystem
+from forcegp.models import StructuredGP
+from forcegp.priors import NoForces
+from forcegp.validation.scores import (
+    LEVELS,
+    acceleration_scores,
+    force_errors,
+    mass_matrices,
+    normalized_error,
+    over_joints,
+)
+
+SIGMA = np.array([3.0, 2.0, 5.0])
+
+
+@pytest.fixture(scope="module")
+def test_rows():
+    return dataclasses.replace(moving_arm(0.4, 1), noise_std=None)
+
+
+@pytest.fixture(scope="module")
+def scores(test_rows):
+    """Of the URDF alone with a given noise: its prediction and its density are known in closed form."""
+    system = given_system()
+    posterior = StructuredGP(system, NoForces(), "analytical", tuple(SIGMA)).fit(test_rows, points=5)
+    return acceleration_scores(posterior, test_rows, mass_matrices(system, test_rows))
+
+
+def predicted(test_rows) -> np.ndarray:
+    robot = given_system().robot
+    return np.array(
+        [
+            np.linalg.solve(robot.mass_matrix(q).numpy(), u - robot.bias_forces(q, v).numpy())
+            for q, v, u in zip(*map(torch.tensor, (test_rows.q, test_rows.v)), test_rows.u, strict=True)
+        ]
+    )
+
+
+def test_errors_of_the_acceleration(scores, test_rows):
+    error = predicted(test_rows) - test_rows.a
+    assert np.allclose(scores["rmse"], np.sqrt((error**2).mean(0)))
+    assert np.allclose(scores["mae"], np.abs(error).mean(0))
+    assert np.allclose(scores["nrmse"], np.sqrt((error**2).mean(0)) / test_rows.a.std(0))
+
+
+def test_force_errors_are_the_residuals_of_inverse_dynamics(scores, test_rows):
+    """M (a_predicted - a) = (u - bias) - M a: what inverse dynamics leaves of the torque, with the model's own M."""
+    robot = given_system().robot
+    q, v, a = map(torch.tensor, (test_rows.q, test_rows.v, test_rows.a))
+    residual = test_rows.u - robot.inverse_dynamics(q, v, a).numpy()
+    assert np.allclose(scores["force_rms"], np.sqrt((residual**2).mean(0)))
+    assert np.allclose(scores["force_mae"], np.abs(residual).mean(0))
+
+
+def test_densities_and_intervals_are_those_of_the_noise(scores, test_rows):
+    error = test_rows.a - predicted(test_rows)
+    density = norm.logpdf(error, scale=SIGMA)
+    assert scores["nlpd"] == pytest.approx(-density.sum(1).mean())
+    assert np.allclose(scores["nlpd_per_joint"], -density.mean(0))
+    for level, covered in zip(LEVELS, scores["coverage"], strict=True):
+        half = norm.ppf(0.5 + 0.5 * level) * SIGMA
+        assert np.allclose(covered, (np.abs(error) <= half).mean(0))
+    assert scores["levels"][4] == 0.5
+    assert 0.95 in scores["levels"]
+    assert np.allclose(scores["noise_std"], SIGMA)
+
+
+def test_the_mass_matrix_counts_rotors(test_rows):
+    system = given_system()
+    with_rotors = MechanicalSystem(system.robot, (), (*system.known_forces, Armature((0.1, 0.2, 0.3))))
+    added = mass_matrices(with_rotors, test_rows) - mass_matrices(system, test_rows)
+    assert np.allclose(added, np.diag([0.1, 0.2, 0.3]))
+    change = force_errors(np.ones((len(test_rows), 3)), np.zeros((len(test_rows), 3)), added)
+    assert np.allclose(change, [0.1, 0.2, 0.3])
+
+
+def test_normalised_errors_are_one_for_the_mean_and_unknown_for_what_never_changes():
+    generator = np.random.default_rng(0)
+    target = generator.normal(size=(50, 3))
+    target[:, 1] = 2.0
+    found = normalized_error(np.broadcast_to(target.mean(0), target.shape) + 0.0, target)
+    assert np.isnan(found[1])
+    assert np.allclose(found[[0, 2]], 1.0)
+
+
+def test_over_joints():
+    assert over_joints("nrmse", [1.0, None, 3.0]) == 2.0
+    assert over_joints("force_rms", [3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
+    assert over_joints("nrmse", [None]) is None

@@ -1,0 +1,187 @@
+"""A whole comparison: one file per piece of work, resumed, extended, refused, and with a model that fails."""
+
+import json
+
+import pytest
+from tests.validation.moving_arm import given_system, moving_arm
+
+from forcegp.data.whole_files import only_one_process
+from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.models import StructuredGP
+from forcegp.priors import NoForces
+from forcegp.validation import (
+    CANDIDATES,
+    IDENTIFICATIONS,
+    Candidate,
+    Comparison,
+    Identification,
+    Training,
+    split_named,
+    validate,
+)
+from forcegp.validation.kept_cells import KIND
+
+MODELS = ("analytical", "joint-friction", "broken")
+
+
+@pytest.fixture(scope="module")
+def data():
+    return moving_arm(0.6, 2)
+
+
+def comparison(data, **changes) -> Comparison:
+    how = {"points": 15, "horizons": (0.1, 0.2), "starts": 2, "restarts": 1, "iterations": 5, **changes}
+    return Comparison(data, data, given_system(), split_named("episodes:1", data), **how)
+
+
+@pytest.fixture(autouse=True)
+def model_of_somebody_else(monkeypatch):
+    def fit_broken(training: Training):
+        if training.seed == 1:
+            raise ZeroDivisionError("nothing left")
+        model = StructuredGP(training.given, NoForces(), "analytical", 5.0)
+        return model.fit(training.rows, restarts=1)
+
+    monkeypatch.setitem(CANDIDATES, "broken", Candidate("fails with seed 1", "given", fit_broken))
+
+
+def changed(folder) -> dict[str, int]:
+    return {file.name: file.stat().st_mtime_ns for file in (folder / "cells").glob("*.json")}
+
+
+def test_a_run_goes_on_where_it_was_and_grows(data, tmp_path):
+    folder, notes = tmp_path / "out", []
+    first = validate(comparison(data), folder, models=MODELS[:1], seeds=1, progress=lambda *told: notes.append(told))
+    assert notes[-1][0] == notes[-1][1]
+    kept = changed(folder)
+    assert set(kept) == {  # the identification for the mass matrix, and the model
+        "episodes-1-seed0-identification-acceleration.json",
+        "episodes-1-seed0-analytical.json",
+    }
+    assert set(first.document["models"]) == {"analytical"}
+    grown = validate(comparison(data), folder, models=MODELS, seeds=2)
+    assert {name: changed(folder)[name] for name in kept} == kept, "finished pieces are not computed again"
+    assert len(changed(folder)) == 1 + 2 * len(MODELS)
+    before = changed(folder)
+    lost = folder / "cells" / "episodes-1-seed1-joint-friction.json"
+    lost.unlink()
+    (folder / "cells" / ".episodes-1-seed1-joint-friction.json.abc.tmp").write_text("{")  # of a killed run
+    again = validate(comparison(data), folder, models=MODELS, seeds=2)
+    after = changed(folder)
+    assert {name for name in before if before[name] != after[name]} == {lost.name}
+    assert not list(folder.rglob("*.tmp"))
+    for name in MODELS[:2]:
+        for score in ("nrmse", "force_rms", "nlpd"):
+            assert again.document["models"][name][score] == grown.document["models"][name][score]
+
+
+def test_a_model_that_fails_is_a_row_that_says_why(data, tmp_path):
+    found = validate(comparison(data), tmp_path / "out", models=MODELS, seeds=2)
+    broken = found.document["models"]["broken"]
+    assert broken["runs"] == 1
+    assert broken["failures"] == [{"split": "episodes-1", "seed": 1, "error": "ZeroDivisionError: nothing left"}]
+    page = (tmp_path / "out" / "report.md").read_text()
+    assert "| broken (1 of 2 runs) |" in page
+    assert "**broken** failed in 1 of 2 runs (episodes-1, seed 1): ZeroDivisionError: nothing left" in page
+    assert json.loads((tmp_path / "out" / "results.json").read_text()) == json.loads(json.dumps(found.document))
+    for name in found.document["figures"]:
+        assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert f"({name}.png)" in page
+
+
+def test_processes_find_the_same_as_this_one(data, tmp_path):
+    models = ("analytical", "joint-friction")
+    one, two = (validate(comparison(data), tmp_path / str(jobs), models=models, seeds=1, jobs=jobs) for jobs in (1, 2))
+    for name in models:
+        for score in ("nrmse", "force_rms", "nlpd", "motions"):
+            assert one.document["models"][name][score] == two.document["models"][name][score]
+
+
+def test_all_that_failed_still_makes_a_page(data, tmp_path):
+    def fit(training: Training):
+        raise InvalidInput("not today")
+
+    CANDIDATES["broken"] = Candidate("fails always", "given", fit)  # put back by the fixture
+    found = validate(comparison(data), tmp_path / "out", models=("broken",), seeds=1)
+    assert found.verdicts == []
+    assert "not today" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_another_configuration_is_refused_and_overwritten_on_demand(data, tmp_path):
+    folder = tmp_path / "out"
+    validate(comparison(data), folder, models=("analytical",), seeds=1)
+    with pytest.raises(InvalidInput, match="holds results with another points, restarts; choose another --out"):
+        validate(comparison(data, points=16, restarts=2), folder, models=("analytical",), seeds=1)
+    shorter = moving_arm(0.5, 2)
+    with pytest.raises(InvalidInput, match="another recording_sha256, rows_sha256"):
+        validate(comparison(shorter), folder, models=("analytical",), seeds=1)
+    with only_one_process(folder, KIND), pytest.raises(InvalidInput, match="another `forcegp validate` is at work"):
+        validate(comparison(data), folder, models=("analytical",), seeds=1)
+    found = validate(comparison(data, points=16), folder, models=("analytical",), seeds=1, overwrite=True)
+    assert found.document["points"] == 16
+    (folder / "cells" / "episodes-1-seed0-analytical.json").write_text('{"name": ')
+    with pytest.raises(FileFormatError, match="half written or damaged"):
+        validate(comparison(data, points=16), folder, models=("analytical",), seeds=1)
+
+
+def test_folders_of_others_are_not_touched(data, tmp_path):
+    (tmp_path / "mine.txt").write_text("precious")
+    for overwrite in (False, True):
+        with pytest.raises(InvalidInput, match="was not written by `forcegp validate`"):
+            validate(comparison(data), tmp_path, models=("analytical",), seeds=1, overwrite=overwrite)
+    (tmp_path / "configuration.json").write_text("{}")
+    with pytest.raises(InvalidInput, match="was not written by `forcegp validate`"):
+        validate(comparison(data), tmp_path, models=("analytical",), seeds=1, overwrite=True)
+    assert (tmp_path / "mine.txt").read_text() == "precious"
+
+
+def test_an_identification_that_fails_leaves_the_mass_matrix_as_given_and_its_models_without_a_mean(
+    data, tmp_path, monkeypatch
+):
+    def fail(system, rows):
+        raise InvalidInput("too still")
+
+    monkeypatch.setitem(IDENTIFICATIONS, "mine", Identification("my own way", fail))
+    models = ("analytical", "identified-mine", "joint-friction@mine", "joint-friction@identified")
+    found = validate(comparison(data, identification="mine"), tmp_path / "out", models=models, seeds=1)
+    told = found.document["mass_matrix"]
+    assert told == ["the system as given, because its identification failed (too still)"]
+    for name in models[1:]:
+        (failure,) = found.document["models"][name]["failures"]
+        assert failure["error"] == "the mine identification of its mean failed: too still"
+    assert found.document["models"]["analytical"]["runs"] == 1
+    assert "the mine identification failed (episodes-1, seed 0): too still" in (tmp_path / "out/report.md").read_text()
+
+
+WRONG = [
+    ({"models": ()}, "no model is named"),
+    ({"models": ("analytical", "analytical")}, "named twice"),
+    ({"models": ("analytcal",)}, "did you mean 'analytical'"),
+    ({"models": ("joint@measured",)}, "takes its mean from 'measured'"),
+    ({"models": ("joint:colour=red",)}, "cannot take 'colour=red'"),
+    ({"seeds": 0}, "number of seeds is 0"),
+    ({"backend": "ray"}, "does not share files"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), WRONG, ids=[message for _, message in WRONG])
+def test_wrong_arguments_are_refused_before_anything_is_written(data, tmp_path, changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        validate(comparison(data), tmp_path / "out", **{"models": ("analytical",), "seeds": 1, **changes})
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points": 1000}, "two thirds"),
+        ({"horizons": ()}, "horizons are"),
+        ({"starts": 0}, "number of starts"),
+        ({"restarts": 0}, "restarts is 0"),
+        ({"integrator": "euler"}, "euler"),
+        ({"identification": "guessing"}, "no identification is called 'guessing'"),
+    ],
+)
+def test_a_comparison_that_cannot_be_made_is_refused(data, changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        comparison(data, **changes)
