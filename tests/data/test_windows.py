@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from forcegp.data import REVOLUTE_UNITS, Dataset, VelocityIncrements, WeakForm
+from forcegp.data import REVOLUTE_UNITS, Dataset, Preparation, VelocityIncrements, WeakForm
 from forcegp.data.windows import white_noise
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import DatasetError, DataWarning, InvalidInput
 
 HOWS = {
     "weak form on q": WeakForm(0.1, nodes=10),
@@ -151,3 +151,11 @@ def test_logs_that_cannot_be_cut_into_windows_are_refused():
     wrapped = sine(time)
     with pytest.raises(DatasetError, match="the angle wraps"):
         WeakForm(0.1).windows(replace(wrapped, q=np.where(time[:, None] > 0.1, wrapped.q - 2 * np.pi, wrapped.q)))
+
+
+def test_a_filtered_log_is_warned_of():
+    filtered = Preparation(cutoff=20.0).apply(sine(0.002 * np.arange(1000))).dataset
+    with pytest.warns(DataWarning, match="was filtered at 20 Hz"):
+        WeakForm(0.1).windows(filtered)
+    kept = Preparation(trim=0.1).apply(sine(0.002 * np.arange(1000))).dataset
+    assert len(WeakForm(0.1).windows(kept)) == 17

@@ -13,6 +13,7 @@ the norm of the weights as its standard deviation in units of the signal's.
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -26,7 +27,7 @@ from typing_extensions import override
 from forcegp.data.dataset import Dataset
 from forcegp.data.farthest_points import farthest_point_sampling
 from forcegp.data.filtering import episodes_in_order, require_no_turns
-from forcegp.errors import DatasetError, InvalidInput, unknown_name_message
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message
 
 EXACT_DEGREE = 5
 """Weights are exact for polynomials of time up to this degree, however uneven the steps."""
@@ -106,11 +107,12 @@ class WindowObservation(ABC):
         """The `points` windows whose mean states (q, v, u) lie farthest apart; all of them for None.
 
         Windows follow each other without sharing a row, so their noise is independent. Rows must be in order of time,
-        at the rate of the sensors and unfiltered: noise of filtered signals is not white.
+        at the rate of the sensors and unfiltered: noise of filtered signals is not white (a DataWarning says so).
         Raises DatasetError for rows in another order, positions that jump by a turn and logs without a window;
         InvalidInput for more points than windows, windows of too few rows and more nodes than rows.
         """
         rows = _window_rows(dataset, self)
+        _warn_of_filtered(dataset)
         if points is not None and not 2 <= points <= len(rows):
             raise InvalidInput(
                 f"points={points} is not between 2 and the {len(rows)} windows of {self.seconds:g} s in the dataset; "
@@ -269,6 +271,18 @@ def _window_rows(dataset: Dataset, how: WindowObservation) -> Int[np.ndarray, "N
             f"{median:.4g} s); give shorter windows, or a log without gaps."
         )
     return every
+
+
+def _warn_of_filtered(dataset: Dataset) -> None:
+    preparation = dataset.metadata.get("preparation")
+    cutoff = preparation.get("cutoff") if isinstance(preparation, Mapping) else None
+    if cutoff is not None:
+        warnings.warn(
+            f"the dataset was filtered at {cutoff:g} Hz, so the noise of its windows is not what they take it for; "
+            "learn from windows of the raw log.",
+            DataWarning,
+            stacklevel=4,
+        )
 
 
 def _scaled(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

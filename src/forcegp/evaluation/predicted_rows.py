@@ -115,9 +115,9 @@ def stated_noise_level(posterior: Posterior, dataset: Dataset) -> Float[np.ndarr
     """What the noise of the model has to be compared with; None where the Dataset does not state its noise.
 
     Where it states that of every row, rows of a recording may be quieter on the whole than those of another: the level
-    is then that of the training rows, if they stated theirs as well.
+    is then that of the training rows, if they stated theirs as well (windows state that of their own mean).
     """
-    trained = posterior.training.noise_std
+    trained = None if posterior.training.weights is not None else posterior.training.noise_std
     if dataset.noise_std is None or dataset.noise_std.ndim == 1 or trained is None:
         return dataset.noise_level
     return _array(trained.square().mean(0).sqrt())
