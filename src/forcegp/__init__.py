@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     )
     from forcegp.robots import Robot
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+    from forcegp.validation import Comparison, Validation, split_named, validate
 
     __version__: str
 
@@ -110,6 +111,10 @@ __all__ = [
     "Evaluation",
     "compare_priors",
     "PriorComparison",
+    "validate",
+    "Comparison",
+    "Validation",
+    "split_named",
 ]
 
 _ROOMS = {
@@ -125,6 +130,7 @@ _ROOMS = {
     | {"StructuredGP", "Noise", "Coefficients", "save_posterior", "load_posterior"},
     "parallel": {"Serial", "Joblib", "Ray"},
     "simulation": {"KukaSurfaceConfig", "simulate_kuka_surface"},
+    "validation": {"Comparison", "Validation", "split_named", "validate"},
     "evaluation": {"Evaluation", "evaluate", "PriorComparison", "compare_priors"},
 }
 
