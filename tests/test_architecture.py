@@ -24,6 +24,7 @@ ROOMS = {
     "data": {"errors", "robots", "mechanics"},
     "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
+    "checks": {"errors", "robots", "mechanics", "data", "analytical"},
     "priors": {"errors", "robots", "mechanics"},
     "inference": {"errors", "native_code"},
     "integration": {"errors", "robots", "mechanics"},

@@ -22,11 +22,11 @@ STEPS = 100
 
 BLOCKS = 8
 TINY = 1e-12
-MOST_ROWS = 20_000
+MOST_ROWS = 5_000
 SIGNIFICANT = 3.0
 """Standard deviations by which a delay must differ from zero to be used."""
 
-WORTH = 0.9
+WORTH = 0.8
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 
 
@@ -52,7 +52,7 @@ class Delay:
 
     @property
     def significant(self) -> float:
-        """The common delay if it is more than three standard deviations from zero and explains a tenth, else 0.
+        """The common delay if it is more than three standard deviations from zero and explains a fifth, else 0.
 
         A log whose torque is mostly friction shows delays that explain nothing: they are properties of the friction.
         """
@@ -69,7 +69,7 @@ class Delay:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
         if abs(self.common) <= SIGNIFICANT * self.common_std:
             return f"{size}, less than three standard deviations: none is assumed"
-        return f"{size}, but it explains less than a tenth of what inverse dynamics does not: none is assumed"
+        return f"{size}, but it explains less than a fifth of what inverse dynamics does not: none is assumed"
 
 
 def estimate_delay(dataset: Dataset, robot: Robot | None = None, *, largest: float = LARGEST_DELAY) -> Delay:
@@ -98,11 +98,11 @@ def estimate_delay(dataset: Dataset, robot: Robot | None = None, *, largest: flo
             continue  # a torque that does not change has no delay
         profiles[joint] = _profiles(_orthonormal(features[joint]), shifted)
         residual[:, joint] = profiles[joint, 0, STEPS] / spread[STEPS], profiles[joint, 0].min() / spread[STEPS]
-    seconds = np.array([[_lowest(profile, parts.shifts) for profile in own] for own in profiles])
+    seconds = np.array([[lowest(profile, parts.shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
     told = profiles[np.isfinite(residual[0])]
     likelihoods = np.log(told + TINY * told.max(initial=0.0)).sum(axis=0)
-    common = np.array([_lowest(profile, parts.shifts) for profile in likelihoods])
+    common = np.array([lowest(profile, parts.shifts) for profile in likelihoods])
     likelihood = likelihoods[0]
     return Delay(
         common=float(common[0]),
@@ -205,7 +205,7 @@ def _unexplained(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> F
     return np.maximum(square - (right * solution).sum(axis=0), 0.0)
 
 
-def _lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shifts"]) -> float:
+def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shifts"]) -> float:
     """Place of the least value, by a parabola; NaN at either end."""
     at = int(np.argmin(values))
     if at in (0, len(values) - 1):

@@ -98,6 +98,11 @@ class Preparation:
         """The same with numbers in place of "auto". Raises as `motion_spectrum` and `estimate_delay`."""
         return _resolve(self, dataset)[0]
 
+    def rows(self, dataset: Dataset) -> Dataset:
+        """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
+        chosen = self.resolved(dataset)
+        return _filtered(chosen, dataset).rows(_kept(chosen, dataset))
+
     def apply(self, dataset: Dataset) -> Prepared:
         """The prepared Dataset and its price.
 

@@ -1,0 +1,88 @@
+"""`check`: one log against itself and its robot, as a list of findings that a person acts on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from forcegp.checks.evidence import Evidence
+from forcegp.checks.excitation import excitation_findings
+from forcegp.checks.findings import SEVERITIES, Finding, Severity, worst
+from forcegp.checks.mistakes import Hypothesis, without_mistakes
+from forcegp.checks.motion import motion_findings
+from forcegp.checks.noise import noise_findings
+from forcegp.checks.robot_model import robot_findings
+from forcegp.checks.sampling import sampling_findings
+from forcegp.checks.signals import signal_findings
+from forcegp.checks.torque_findings import not_compared, torque_findings
+from forcegp.data import Dataset, Preparation
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import MechanicalSystem
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CheckReport:
+    """The findings, worst first, and what they rest on.
+
+    `evidence` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
+    with the mistakes taken out that were found (None without a robot, or with contacts).
+    """
+
+    __no_type_check__: ClassVar[bool] = True  # made by `check` alone
+
+    findings: tuple[Finding, ...]
+    evidence: Evidence
+    comparison: Hypothesis | None
+
+    @property
+    def severity(self) -> Severity:
+        """That of the worst finding."""
+        return worst(self.findings)
+
+    def of(self, subject: str) -> tuple[Finding, ...]:
+        """The findings on one subject."""
+        return tuple(finding for finding in self.findings if finding.subject == subject)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON: severity, counts, findings."""
+        counts = {severity: sum(each.severity == severity for each in self.findings) for severity in SEVERITIES}
+        prepared = self.evidence.prepared
+        return {
+            "severity": self.severity,
+            "counts": counts,
+            "cutoff": None if prepared is None else prepared.preparation.cutoff,
+            "findings": [finding.to_dict() for finding in self.findings],
+        }
+
+
+def check(
+    dataset: Dataset, system: MechanicalSystem | None = None, *, preparation: Preparation | None = None
+) -> CheckReport:
+    """Look for what would spoil a model: wrong units, signs, joints, delays; dead channels; motion that shows nothing.
+
+    `system` is the robot that was recorded (default: that of the dataset); without one, torques are not compared.
+    `preparation` says how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
+    `trim` are not used. Nothing is changed.
+
+    Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
+    """
+    system = dataset.system if system is None else system
+    if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
+        raise InvalidInput(
+            f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
+            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
+        )
+    evidence = Evidence.of(dataset, system, preparation or Preparation(cutoff="auto"))
+    findings = [*sampling_findings(evidence), *signal_findings(evidence), *motion_findings(evidence)]
+    comparison = None
+    if evidence.robot is not None:
+        findings += robot_findings(evidence.robot)
+    if evidence.prepared is not None:
+        if evidence.robot is None or evidence.contacts:
+            findings.append(not_compared(evidence))
+        elif dataset.u.any():
+            comparison, mistakes = without_mistakes(evidence)
+            findings += [*mistakes, *torque_findings(evidence, comparison)]
+        findings += [*excitation_findings(evidence), *noise_findings(evidence)]
+    ordered = sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
+    return CheckReport(findings=tuple(ordered), evidence=evidence, comparison=comparison)

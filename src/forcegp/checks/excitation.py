@@ -1,0 +1,105 @@
+"""Does the motion show what is to be learned: base parameters, velocities of both signs, range of each joint."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forcegp.analytical.base_parameters import base_parameters, excitation
+from forcegp.checks.evidence import Evidence
+from forcegp.checks.findings import Finding, listed
+from forcegp.errors import InvalidInput
+
+WELL = 100.0
+"""Condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)."""
+
+BADLY = 1000.0
+HYSTERESIS = 0.1
+"""Of the root mean square velocity, beyond which a sign counts."""
+
+FEWEST_CHANGES = 4
+STILL = {True: 0.02, False: 0.002}
+"""Range in rad or m below which a joint does not move."""
+
+
+def excitation_findings(evidence: Evidence) -> list[Finding]:
+    """Joints that hardly move or never turn back, and how well base parameters are determined."""
+    if evidence.prepared is None:
+        return []
+    rows = evidence.prepared.dataset
+    still, one_way, told = [], [], []
+    for joint, name in enumerate(evidence.names):
+        v = rows.v[:, joint]
+        size = float(np.sqrt(np.square(v).mean()))
+        signs = np.sign(v[np.abs(v) > HYSTERESIS * size])
+        changes = int((np.diff(signs) != 0).sum())
+        span = float(np.ptp(rows.q[:, joint]))
+        told.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
+        if span < STILL[bool(evidence.rotates[joint])]:
+            still.append(name)
+        elif changes < FEWEST_CHANGES:
+            one_way.append(name)
+    found = []
+    if still:
+        found.append(
+            Finding(
+                severity="look",
+                subject="excitation",
+                seen=f"{listed(still)} moved less than 0.02 rad (2 mm): {'its' if len(still) == 1 else 'their'} "
+                "friction and "
+                "inertia do not show.",
+                remedy="Move every joint that is to be learned, or lock it in the robot (--lock JOINT=RAD).",
+                joints=tuple(still),
+                numbers={"joints": told},
+            )
+        )
+    if one_way:
+        found.append(
+            Finding(
+                severity="look",
+                subject="excitation",
+                seen=f"{listed(one_way)} changed direction fewer than {FEWEST_CHANGES} times: friction of both "
+                "directions "
+                "cannot be told from gravity.",
+                remedy="Record motion to and fro.",
+                joints=tuple(one_way),
+                numbers={"joints": told},
+            )
+        )
+    return [*found, *_base_parameters(evidence)]
+
+
+def _base_parameters(evidence: Evidence) -> list[Finding]:
+    if evidence.robot is None:
+        return []
+    rows = evidence.rows()
+    try:
+        seen = excitation(evidence.robot, rows.q, rows.v, rows.a)
+    except InvalidInput:  # nothing moves and nothing weighs
+        return []
+    every = base_parameters(evidence.robot)
+    numbers = {"condition": seen.condition, "seen": seen.rank, "base_parameters": every.rank}
+    size = f"condition number {seen.condition:.3g} of {seen.rank} base parameters"
+    if seen.rank < every.rank:
+        return [
+            Finding(
+                severity="look",
+                subject="excitation",
+                seen=f"{size}; {every.rank - seen.rank} more of this robot never show in this motion.",
+                remedy="Identify few parameters, or record a motion of all joints at once.",
+                numbers=numbers,
+            )
+        ]
+    severity = "ok" if seen.condition <= BADLY else "look"
+    quality = "well excited" if seen.condition <= WELL else "usable" if severity == "ok" else "poorly excited"
+    return [
+        Finding(
+            severity=severity,
+            subject="excitation",
+            seen=f"{size}: {quality} (below {WELL:g} is good).",
+            remedy=""
+            if severity == "ok"
+            else "Inertias of single links will be uncertain; record faster motion of all "
+            "joints at once, and keep the URDF's values where data say little.",
+            numbers=numbers,
+        )
+    ]

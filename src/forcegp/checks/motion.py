@@ -1,0 +1,176 @@
+"""Do q, v and a belong to each other: velocities against differenced positions, accelerations against velocities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from forcegp.checks.evidence import DEGREE, Evidence
+from forcegp.checks.findings import Finding, listed
+from forcegp.data import Dataset, differentiate, low_pass
+from forcegp.data.delay import lowest
+
+RPM = np.pi / 30.0
+FACTORS = {
+    1.0 / DEGREE: "deg/s where q is in rad, or q in rad where v is in deg/s",
+    DEGREE: "rad/s where q is in degrees",
+    1.0 / RPM: "rpm where q is in rad",
+    1000.0: "mrad/s",
+    0.001: "per millisecond",
+    1.0 / (2.0 * np.pi): "turns per second where q is in rad",
+}
+"""Ratios of v to dq/dt, and the unit of v that explains each."""
+
+CLOSE = 0.05
+"""Deviation from one of them, or from 1, that noise and filters explain."""
+
+UNEXPLAINED = 0.3
+"""Share of the power of v that dq/dt may leave unexplained, at the best factor and shift."""
+
+FEW = 0.05
+"""Share below which a factor is meant seriously."""
+
+SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
+LEAST_SHIFT = 1.2
+"""Time steps by which v must be late or early to be told."""
+
+
+def motion_findings(evidence: Evidence) -> list[Finding]:
+    """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, joint by joint."""
+    if evidence.prepared is None:
+        return []
+    cutoff = evidence.prepared.preparation.cutoff
+    even = evidence.even
+    if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
+        even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
+    found = []
+    for name, source, what, derivative in (("v", "q", "velocity", "dq/dt"), ("a", "v", "acceleration", "dv/dt")):
+        if name == "a" and found:
+            break  # of wrong velocities nothing better can come
+        fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
+        told = [_finding(evidence, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
+        found += _merged([item for item in told if item is not None])
+        if not found and name == "v":
+            found_ok = [fit for fit in fits if fit is not None]
+            if found_ok:
+                error = max(unexplained for _, _, unexplained in found_ok)
+                found.append(
+                    Finding(
+                        severity="ok",
+                        subject="velocity",
+                        seen=f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not).",
+                        numbers={"unexplained": error},
+                    )
+                )
+    return found
+
+
+def _compared(data: Dataset, name: str, source: str, joint: int) -> tuple[float, float, float] | None:
+    """Factor, delay [s] and unexplained share of `name` against the derivative of `source`; None without motion."""
+    left, right = [], []
+    for number in data.episodes:
+        rows = data.select_episodes([number])
+        inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
+        if inner.sum() < 3:
+            continue
+        slope = differentiate(getattr(rows, source)[:, [joint]], rows.time)[:, 0]
+        late = CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None])
+        left.append(late)
+        right.append(slope[inner])
+    if not left:
+        return None
+    values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
+    power = np.square(values).sum(axis=1)
+    if not np.square(slopes).sum() > 0.0 or not power.min() > 0.0:
+        return None
+    factor = values @ slopes / np.square(slopes).sum()
+    unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
+    best = int(np.argmin(unexplained))
+    shift = lowest(unexplained, SHIFTS)
+    return float(factor[best]), shift, float(max(0.0, unexplained[best]))
+
+
+def _finding(
+    evidence: Evidence, fit: tuple[float, float, float] | None, joint: int, name: str, what: str, derivative: str
+) -> Finding | None:
+    if fit is None:
+        return None
+    factor, shift, unexplained = fit
+    label = evidence.names[joint]
+    numbers = {"quantity": name, "factor": factor, "delay": shift if np.isfinite(shift) else None}
+    numbers["unexplained"] = unexplained
+    if unexplained > UNEXPLAINED:
+        return Finding(
+            severity="wrong" if name == "v" else "look",
+            subject=what,
+            seen=f"the {what} of {label} is not {derivative}: {100.0 * unexplained:.0f} % of its power is something "
+            "else.",
+            remedy=f"Check which column {name} was read from; or leave it out, so that it is computed from "
+            f"{'q' if name == 'v' else 'v'}.",
+            joints=(label,),
+            numbers=numbers,
+        )
+    if unexplained < FEW and factor < 0.0:
+        return Finding(
+            severity="wrong",
+            subject=what,
+            seen=f"the {what} of {label} has the opposite sign of {derivative} (factor {factor:.3g}).",
+            remedy=f"Turn the sign of {name} or of {'q' if name == 'v' else 'v'} for this joint, whichever is wrong.",
+            joints=(label,),
+            numbers=numbers,
+        )
+    if unexplained < FEW and abs(factor - 1.0) > CLOSE:
+        unit = next((unit for known, unit in FACTORS.items() if abs(factor / known - 1.0) < CLOSE), None)
+        guess = f": {name} looks like {unit}" if unit and name == "v" else ""
+        return Finding(
+            severity="wrong" if abs(factor - 1.0) > 4 * CLOSE else "look",
+            subject=what,
+            seen=f"the {what} of {label} is {factor:.4g} times {derivative}{guess}.",
+            remedy=f"Convert {name} or {'q' if name == 'v' else 'v'} to SI units, or remove the gear ratio.",
+            joints=(label,),
+            numbers=numbers,
+        )
+    step = float(np.median(np.diff(evidence.even.time)))
+    if unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
+        return Finding(
+            severity="look",
+            subject=what,
+            seen=f"the {what} of {label} is logged {1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'} "
+            "than "
+            f"{derivative}: {abs(shift) / step:.1f} time steps.",
+            remedy=f"It was filtered by the robot: compute {name} from positions (forcegp prepare --cutoff auto "
+            "--differentiate q).",
+            joints=(label,),
+            numbers=numbers,
+        )
+    return None
+
+
+def _merged(findings: list[Finding]) -> list[Finding]:
+    """One finding for all joints where they say the same."""
+    kinds: dict[tuple, list[Finding]] = {}
+    for item in findings:
+        factor = item.numbers["factor"]
+        kind = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), None) or np.sign(factor)
+        kinds.setdefault((item.severity, item.subject, item.remedy, kind), []).append(item)
+    merged = []
+    for group in kinds.values():
+        first = group[0]
+        if len(group) == 1:
+            merged.append(first)
+            continue
+        joints = tuple(name for item in group for name in item.joints)
+        seen = first.seen.replace(first.joints[0], listed(joints))
+        factors = [f"{item.numbers['factor']:.3g}" for item in group]
+        each = "" if len(set(factors)) == 1 else f" (factors {', '.join(factors)})"
+        merged.append(
+            replace(
+                first,
+                joints=joints,
+                seen=f"{seen}{each}",
+                numbers={"each": [dict(item.numbers) for item in group]},
+            )
+        )
+    return merged

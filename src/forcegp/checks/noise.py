@@ -1,0 +1,91 @@
+"""What noise of the acceleration is left by the filter, and what it means in Nm."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from forcegp.checks.evidence import Evidence
+from forcegp.checks.findings import Finding, plain
+
+MUCH = 0.2
+"""Noise relative to the spread of the signal from which a filter is worth its name."""
+
+
+def noise_findings(evidence: Evidence) -> list[Finding]:
+    """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
+    if evidence.prepared is None:
+        return []
+    report = evidence.prepared.report
+    cutoff = report["cutoff"]
+    if cutoff is None:
+        return [Finding(severity="ok", subject="noise", seen="the positions show no noise worth a filter.")]
+    before, after = (_numbers(report["acceleration_noise"][when]) for when in ("before", "after"))
+    torque = _torque_noise(evidence, after)
+    spread = np.std(evidence.prepared.dataset.a, axis=0)
+    each = []
+    for joint, name in enumerate(evidence.names):
+        unit = "rad/s²" if evidence.rotates[joint] else "m/s²"
+        newton = "" if torque is None else f" = {torque[joint]:.2g} {'Nm' if evidence.rotates[joint] else 'N'}"
+        each.append(f"{name} {before[joint]:.3g} -> {after[joint]:.2g} {unit}{newton}")
+    why = "where the spectrum shows the end of the motion" if evidence.automatic else "as asked for"
+    numbers = {"cutoff": cutoff, "before": plain(before), "after": plain(after)}
+    numbers["torque"] = None if torque is None else plain(torque)
+    found = [
+        Finding(
+            severity="ok",
+            subject="noise",
+            seen=f"filtered at {cutoff:.3g} Hz ({why}), the noise of the acceleration falls: {'; '.join(each)}.",
+            numbers=numbers,
+        )
+    ]
+    raw = "preparation" not in evidence.log.metadata
+    with np.errstate(invalid="ignore"):
+        loud = np.flatnonzero(before > MUCH * spread)
+        left = np.flatnonzero(after > MUCH * spread)
+    if raw and len(loud) and _measured_noise(evidence, loud):
+        names = tuple(evidence.names[joint] for joint in loud)
+        found.append(
+            Finding(
+                severity="look",
+                subject="noise",
+                seen=f"the acceleration in this dataset is not filtered: its noise is up to "
+                f"{np.max(before[loud] / spread[loud]):.2g} "
+                "times the acceleration itself.",
+                remedy=f"forcegp prepare DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
+                joints=names,
+            )
+        )
+    if len(left):
+        names = tuple(evidence.names[joint] for joint in left)
+        found.append(
+            Finding(
+                severity="look",
+                subject="noise",
+                seen=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
+                f"{', '.join(names)}.",
+                remedy="Move faster, filter lower, or learn from torques instead of accelerations.",
+                joints=names,
+            )
+        )
+    return found
+
+
+def _measured_noise(evidence: Evidence, joints: np.ndarray) -> bool:
+    """Whether the accelerations of the log are really that noisy: a log may hold better ones than differences."""
+    assert evidence.prepared is not None
+    spread = np.std(evidence.prepared.dataset.a, axis=0)[joints]
+    return bool((np.std(evidence.log.a, axis=0)[joints] > 1.0 * np.hypot(1.0, MUCH) * spread).any())
+
+
+def _torque_noise(evidence: Evidence, noise: np.ndarray) -> np.ndarray | None:
+    """Standard deviation of M times the noise of a [Nm or N]."""
+    if evidence.robot is None:
+        return None
+    with torch.no_grad():
+        M = evidence.robot.mass_matrix(torch.tensor(evidence.rows().q, device=evidence.robot.device)).cpu().numpy()
+    return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
+
+
+def _numbers(values: list) -> np.ndarray:
+    return np.array([np.nan if value is None else value for value in values], dtype=float)

@@ -1,0 +1,243 @@
+"""Does each channel carry a signal: constant and frozen channels, saturation, limits, resolution."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forcegp.checks.evidence import Evidence, consecutive
+from forcegp.checks.findings import Finding, listed
+
+QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
+FROZEN_SECONDS = 0.1
+FROZEN_ROWS = 10
+MOVES = 0.2
+"""Of its root mean square speed, above which a joint moves."""
+
+CLIPPED_RATIO = 8.0
+"""Rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4."""
+
+CLIPPED_ROWS = 10
+TOLERANCE = 0.01
+"""Of the range between limits, by which a position may exceed them: calibration."""
+
+COARSE = {"q": 1e-3, "v": 1e-2, "u": 1e-2}
+"""Resolution relative to the range that shows: in positions early, since they are differentiated twice."""
+
+
+def signal_findings(evidence: Evidence) -> list[Finding]:
+    """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
+    found = [*_leaps(evidence), *_constant(evidence)]
+    for name in QUANTITY:
+        found += [finding for joint in range(evidence.log.nv) for finding in _frozen(evidence, name, joint)]
+    found += [finding for joint in range(evidence.log.nv) for finding in _clipped(evidence, joint)]
+    return [*found, *_limits(evidence), *_resolution(evidence)]
+
+
+def _leaps(evidence: Evidence) -> list[Finding]:
+    found = []
+    for places, how, remedy in (
+        (evidence.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
+        (evidence.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
+         "torque were not checked. Are the units right (degrees for radians)?"),
+    ):  # fmt: skip
+        if places.any():
+            row, joint = (int(index) for index in np.argwhere(places)[0])
+            name = evidence.names[joint]
+            found.append(
+                Finding(
+                    severity="wrong",
+                    subject="jumps",
+                    seen=f"the position of {name} jumps {how} after row {row} at {evidence.log.time[row]:.3f} s "
+                    f"({int(places.sum())} times in all).",
+                    remedy=remedy,
+                    joints=tuple(evidence.names[k] for k in np.flatnonzero(places.any(axis=0))),
+                    numbers={"row": row, "count": int(places.sum())},
+                )
+            )
+    return found
+
+
+def _constant(evidence: Evidence) -> list[Finding]:
+    found = []
+    log = evidence.log
+    for name, quantity in QUANTITY.items():
+        values = getattr(log, name)
+        dead = [joint for joint in range(log.nv) if np.ptp(values[:, joint]) == 0.0]
+        if not dead:
+            continue
+        names = tuple(evidence.names[joint] for joint in dead)
+        all_passive = name == "u" and len(dead) == log.nv and not values.any()
+        seen = (
+            "no torque was logged at all (every u is 0)."
+            if all_passive
+            else f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
+        )
+        remedy = (
+            "Right for a passive mechanism; else the torque columns are missing."
+            if name == "u"
+            else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
+        )
+        passive = name == "u" and not values[:, dead].any()
+        found.append(
+            Finding(
+                severity="look" if passive or len(dead) == log.nv else "wrong",
+                subject="constant channel",
+                seen=seen,
+                remedy=remedy,
+                joints=names,
+                numbers={"quantity": name},
+            )
+        )
+    return found
+
+
+def _runs(same: np.ndarray) -> tuple[int, int]:
+    """Start and length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    if not len(edges):
+        return 0, 0
+    lengths = edges[1::2] - edges[::2]
+    longest = int(np.argmax(lengths))
+    return int(edges[2 * longest]), int(lengths[longest])
+
+
+def _frozen(evidence: Evidence, name: str, joint: int) -> list[Finding]:
+    """A channel that stands still, to the last digit, while the joint's other channels do not."""
+    log = evidence.log
+    values = getattr(log, name)[:, joint]
+    if np.ptp(values) == 0.0:
+        return []
+    others = np.zeros(len(log) - 1, dtype=bool)
+    for other in QUANTITY:
+        if other != name:
+            others |= np.diff(getattr(log, other)[:, joint]) != 0
+    moves = np.abs(log.v[:, joint]) > MOVES * np.sqrt(np.square(log.v[:, joint]).mean())
+    if name != "u":
+        others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
+        moves = np.ones(len(log), dtype=bool) if name == "v" else moves
+        if name == "v":
+            others &= np.diff(log.q[:, joint]) != 0
+    start, length = _runs((np.diff(values) == 0) & others & consecutive(log)[:-1] & moves[1:])
+    step = float(np.median(np.diff(log.time)[consecutive(log)[:-1]]))
+    if length < FROZEN_ROWS or length * step < FROZEN_SECONDS or _is_extreme(values, values[start]):
+        return []
+    return [
+        Finding(
+            severity="wrong",
+            subject="frozen channel",
+            seen=f"the {QUANTITY[name]} of {evidence.names[joint]} stands still at {values[start]:.6g} for "
+            f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
+            remedy="Leave this stretch out, and look at the logger.",
+            joints=(evidence.names[joint],),
+            numbers={"quantity": name, "row": start, "seconds": length * step},
+        )
+    ]
+
+
+def _is_extreme(values: np.ndarray, value: float) -> bool:
+    return bool(value in (values.min(), values.max()))
+
+
+def _clipped(evidence: Evidence, joint: int) -> list[Finding]:
+    """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
+    log = evidence.log
+    speed = np.abs(log.v[:, joint])
+    u = log.u[speed > MOVES * np.sqrt(np.square(speed).mean()), joint]
+    if len(u) < CLIPPED_ROWS or np.ptp(log.u[:, joint]) == 0.0:
+        return []
+    width = np.ptp(u) / 1000.0
+    found = []
+    for sign, side in ((1.0, "largest"), (-1.0, "smallest")):
+        extreme = float((sign * log.u[:, joint]).max())
+        below = extreme - sign * u
+        at = int((below <= 1e-9 * np.ptp(u)).sum())
+        near = int(((below > 1e-9 * np.ptp(u)) & (below <= 1e-9 * np.ptp(u) + width)).sum())
+        start, length = _runs(np.abs(log.u[:, joint] - sign * extreme) <= 1e-9 * np.ptp(u))
+        if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
+            found.append(
+                Finding(
+                    severity="wrong",
+                    subject="saturation",
+                    seen=f"the torque of {evidence.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
+                    f"{at} "
+                    f"rows of motion; the longest stretch, {length} rows, begins at row {start} at "
+                    f"{log.time[start]:.3f} s.",
+                    remedy="The robot received another torque than the log says, or the sensor is at its end: leave "
+                    "these stretches out, or move more gently.",
+                    joints=(evidence.names[joint],),
+                    numbers={"value": sign * extreme, "rows": at, "row": start},
+                )
+            )
+    return found
+
+
+def _limits(evidence: Evidence) -> list[Finding]:
+    """Positions, velocities and torques beyond the limits of the URDF, the worst joint of each first."""
+    if evidence.robot is None:
+        return []
+    log, joints = evidence.log, evidence.robot.joints
+    lower = np.array([-np.inf if joint.type == "continuous" else joint.lower for joint in joints])
+    upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
+    bounds = {"q": (lower, upper)}
+    for name, limit in (
+        ("v", [joint.velocity_limit for joint in joints]),
+        ("u", [joint.effort_limit for joint in joints]),
+    ):
+        size = np.array([value if value > 0.0 else np.inf for value in limit])  # a limit of 0 is a placeholder
+        bounds[name] = (-size, size)
+    found = []
+    for name, (low, high) in bounds.items():
+        values = getattr(log, name)
+        span = np.where(np.isfinite(high - low), high - low, 1.0)
+        excess = np.maximum(values - high, low - values) / span - TOLERANCE
+        if not (excess > 0.0).any():
+            continue
+        row, joint = (int(index) for index in np.unravel_index(np.argmax(excess), excess.shape))
+        beyond = tuple(evidence.names[k] for k in np.flatnonzero((excess > 0.0).any(axis=0)))
+        others = f" (also {listed(tuple(k for k in beyond if k != evidence.names[joint]))})" if len(beyond) > 1 else ""
+        unit = log.units[name] if isinstance(log.units[name], str) else log.units[name][joint]
+        found.append(
+            Finding(
+                severity="look",
+                subject="limits",
+                seen=f"the {QUANTITY[name]} of {evidence.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
+                f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
+                f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
+                remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
+                "is "
+                "not that of your robot, which does no harm here.",
+                joints=beyond,
+                numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
+            )
+        )
+    return found
+
+
+def _resolution(evidence: Evidence) -> list[Finding]:
+    """Channels with few different values, and how coarse they are against their range."""
+    found = []
+    for name, quantity in QUANTITY.items():
+        told, joints, quanta = [], [], {}
+        for joint, label in enumerate(evidence.names):
+            values = np.unique(getattr(evidence.log, name)[:, joint])
+            if len(values) < 3 or len(values) > 0.2 * len(evidence.log):
+                continue
+            steps = np.diff(values)
+            quantum = float(np.median(steps[steps > 1e-9 * np.ptp(values)]))
+            if quantum < COARSE[name] * np.ptp(values):
+                continue
+            told.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
+            joints.append(label)
+            quanta[label] = quantum
+        if told:
+            found.append(
+                Finding(
+                    severity="look",
+                    subject="resolution",
+                    seen=f"the {quantity} was logged in coarse steps: {', '.join(told)}.",
+                    remedy="Log more digits, or expect noise from this.",
+                    joints=tuple(joints),
+                    numbers={"quantity": name, "quantum": quanta},
+                )
+            )
+    return found

@@ -1,0 +1,198 @@
+"""What the comparison of torques with inverse dynamics says to people: factor, unit, delay, what is left."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from forcegp.checks.evidence import Evidence
+from forcegp.checks.findings import Finding, listed, plain
+from forcegp.checks.mistakes import Hypothesis
+from forcegp.data import Delay, estimate_delay
+from forcegp.data.delay import SIGNIFICANT, WORTH
+from forcegp.errors import DatasetError
+
+RESTS_ON_ROBOT = 0.5
+"""Share of the torque's variance that inverse dynamics must explain beyond friction for its factor to mean "
+"something."""
+
+NO_WORSE = 2.0
+"""Factor by which more may remain without a rotor inertia."""
+
+ROUGHLY = 1.5
+"""Factor either way that wrong inertias explain."""
+
+FAR = 3.0
+MUCH_MORE = 30.0
+"""Factors that they do not: less torque than bodies need cannot be; more may be the inertia of a rotor."""
+
+SAME = 0.1
+"""Spread of factors of joints that share a unit."""
+
+UNEXPLAINED = 0.5
+LEAST_DELAY = 0.25
+"""Time steps below which a delay is not told."""
+
+MUCH = 0.5
+"""A delay that leaves less of what was unexplained is wrong to leave in."""
+
+
+def torque_findings(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+    """Factor and unit, delay, and what remains unexplained, of a log without the mistakes that were found."""
+    found = [*_factors(evidence, log), *_passive(evidence, log), *_unexplained(evidence, log)]
+    return [*found, *_delays(evidence, log)]
+
+
+def _factors(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+    """Torques that are a multiple of what the motion needs."""
+    fit = log.fit
+    with np.errstate(invalid="ignore"):
+        means = (fit.friction - fit.plain > RESTS_ON_ROBOT) & (fit.factor > 0.0)
+        means &= fit.plain < NO_WORSE * fit.unexplained + 0.02  # else a rotor inertia is missing, not a factor
+        ratio = np.where(means, np.maximum(fit.factor, 1.0 / np.maximum(fit.factor, 1e-300)), 1.0)
+    off = np.flatnonzero(ratio > ROUGHLY)
+    if not len(off):
+        return []
+    joints = tuple(evidence.names[joint] for joint in off)
+    factors = fit.factor[off]
+    common = float(np.exp(np.log(factors).mean()))
+    alike = len(off) == int(means.sum()) and len(off) > 1 and np.ptp(np.log(factors)) < SAME
+    each = ", ".join(f"{name} {value:.4g}" for name, value in zip(joints, factors, strict=True))
+    kilo = np.abs(np.log(factors / 1000.0)).max() < np.log(ROUGHLY)
+    milli = np.abs(np.log(factors * 1000.0)).max() < np.log(ROUGHLY)
+    if kilo or milli:
+        unit = "mNm" if kilo else "kNm"
+        seen = f"the measured torque of {listed(joints)} is {common:.4g} times what the motion needs: it looks like "
+        seen += f"{unit}."
+        remedy = f"Convert it (forcegp import --unit u={unit}, or a factor)."
+    else:
+        seen = f"the measured torque is a multiple of what the motion needs: {each}."
+        remedy = "One factor for all joints points to the unit of u or to wrong masses; compare with the data sheet."
+        if not alike:
+            remedy = (
+                "A factor that differs between joints points to torque before the gears (multiply by the gear ratio), "
+                "motor current (multiply by the torque constant), a rotor inertia that is missing, or wrong masses; "
+                "compare with the data sheet."
+            )
+    return [
+        Finding(
+            severity="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
+            subject="torque unit",
+            seen=seen,
+            remedy=remedy,
+            joints=joints,
+            numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
+        )
+    ]
+
+
+def _passive(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+    """Joints whose torque is zero throughout although the motion needs one."""
+    found = []
+    for joint, name in enumerate(evidence.names):
+        u, tau = log.rows.u[:, joint], log.tau[:, joint]
+        if np.ptp(evidence.log.u[:, joint]) > 0.0 or not evidence.log.u.any():
+            continue
+        others = [np.std(log.tau[:, other]) for other in range(len(evidence.names)) if np.ptp(log.rows.u[:, other]) > 0]
+        if np.std(tau) > 0.1 * max(others, default=np.inf):
+            found.append(
+                Finding(
+                    severity="wrong",
+                    subject="dead torque",
+                    seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
+                    f"{np.std(tau):.3g} {_unit(evidence, joint)} rms.",
+                    remedy="The channel is dead, unless the joint has no motor and the URDF is wrong.",
+                    joints=(name,),
+                    numbers={"needed": float(np.std(tau))},
+                )
+            )
+    return found
+
+
+def _unexplained(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+    """How well the torques fit at all."""
+    left = log.fit.unexplained
+    known = np.isfinite(left)
+    if not known.any():
+        return []
+    residual = np.std(log.rows.u - log.fit.predicted, axis=0)
+    told = ", ".join(f"{evidence.names[k]} {residual[k]:.2g} ({100.0 * left[k]:.2g} %)" for k in np.flatnonzero(known))
+    bad = np.flatnonzero(known & (left > UNEXPLAINED))
+    numbers = {"joints": list(evidence.names), "residual": plain(residual)}
+    numbers |= {"unexplained": plain(left), "factor": plain(log.fit.factor)}
+    what = f"inverse dynamics with a factor and friction leaves of the torque, in Nm or N rms (of its variance): {told}"
+    if not len(bad):
+        return [Finding(severity="ok", subject="torque", seen=f"{what}.", numbers=numbers)]
+    shares = ", ".join(f"{evidence.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
+    return [
+        Finding(
+            severity="look",
+            subject="torque",
+            seen=f"{what}. Of the variance of some joints most remains: {shares}.",
+            remedy="The robot does not explain these torques: their channel, unit or zero may be wrong, the joint may "
+            "be "
+            "held or touch something, or its torque is nearly all friction or noise.",
+            joints=tuple(evidence.names[joint] for joint in bad),
+            numbers=numbers,
+        )
+    ]
+
+
+def _delays(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+    assert evidence.compared is not None
+    data = log.correction.applied(evidence.compared)
+    try:
+        delay = estimate_delay(data, log.robot)
+    except DatasetError:
+        return []  # too short
+    step = float(np.median(np.diff(evidence.even.time)))
+    found = []
+    if delay.significant and abs(delay.common) > LEAST_DELAY * step:
+        found.append(_delay(evidence.names, delay, delay.common, delay.common_std, delay.remains))
+    for joint, name in enumerate(evidence.names):
+        own, std = float(delay.seconds[joint]), float(delay.std[joint])
+        remains = float(delay.residual[1, joint] / max(delay.residual[0, joint], 1e-12))
+        differs = abs(own - delay.significant) > max(SIGNIFICANT * std, 2.0 * step, 2e-3)
+        worth = remains < min(WORTH, MUCH) and delay.residual[0, joint] > 1e-4
+        if np.isfinite(own) and differs and worth and abs(own) > SIGNIFICANT * std:
+            found.append(_delay((name,), delay, own, std, remains))
+    return found
+
+
+def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, remains: float) -> Finding:
+    one = len(names) == 1
+    numbers: dict[str, Any] = {"delay": seconds, "std": std, "remains": remains}
+    numbers["per_joint"] = plain(delay.seconds)
+    late = "later" if seconds > 0.0 else "earlier"
+    friction = " In a joint with much friction this can also be the friction's own lag." if one else ""
+    return Finding(
+        severity="wrong" if remains < MUCH and not one else "look",
+        subject="delay",
+        seen=f"the torque of {names[0] if one else 'all joints'} is logged {1e3 * abs(seconds):.1f} ms ± "
+        f"{1e3 * std:.1f} ms "
+        f"{late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained remains.{friction}",
+        remedy="If the other joints show none, leave it: shifting one joint can hide friction."
+        if one
+        else "forcegp prepare --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
+        joints=names,
+        numbers=numbers,
+    )
+
+
+def _unit(evidence: Evidence, joint: int) -> str:
+    return "Nm" if evidence.rotates[joint] else "N"
+
+
+def not_compared(evidence: Evidence) -> Finding:
+    """What is said where torques cannot be compared."""
+    why = "the robot touches something" if evidence.contacts else "no robot was given"
+    return Finding(
+        severity="look",
+        subject="torque",
+        seen=f"torques were not compared with inverse dynamics: {why}.",
+        remedy="The forces of contacts are not known; check a log of free motion, too."
+        if evidence.contacts
+        else "Add --robot ARM.urdf.",
+        joints=(),
+    )

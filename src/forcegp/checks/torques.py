@@ -1,0 +1,142 @@
+"""Measured torques against inverse dynamics: how much of each the robot explains, and by what factor.
+
+For every joint, `u = s tau(q, v, a) + I a + d v + c tanh(v / w) + o` with tau the inverse dynamics of the URDF and
+s, I, d, c >= 0, by non-negative least squares (Lawson & Hanson 1974): friction always brakes, and a robot that needs a
+negative factor was logged with a wrong sign.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.optimize import nnls
+
+from forcegp.data import Dataset
+from forcegp.robots import Robot
+
+CONSTANT = 1e-24
+"""Variance relative to the square below which a torque is constant: rounding."""
+
+SLOW = 0.1
+"""Of the root mean square velocity: where dry friction turns over."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Correction:
+    """Which column, by which factor, each joint's motion (q, v, a) and torque is to be taken from: (nv,) each."""
+
+    motion_from: Int[np.ndarray, " nv"]
+    motion_factor: Float[np.ndarray, " nv"]
+    torque_from: Int[np.ndarray, " nv"]
+    torque_factor: Float[np.ndarray, " nv"]
+
+    @classmethod
+    def none(cls, nv: int) -> Correction:
+        """Everything stays."""
+        return cls(
+            motion_from=np.arange(nv), motion_factor=np.ones(nv), torque_from=np.arange(nv), torque_factor=np.ones(nv)
+        )
+
+    def motion(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> Correction:
+        """Then motions in another order, by further factors."""
+        return replace(self, motion_from=self.motion_from[order], motion_factor=self.motion_factor[order] * factor)
+
+    def torque(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> Correction:
+        """Then torques in another order, by further factors."""
+        return replace(self, torque_from=self.torque_from[order], torque_factor=self.torque_factor[order] * factor)
+
+    def applied(self, dataset: Dataset) -> Dataset:
+        """The corrected log, without robot, truth and metadata, which belong to it as it was."""
+        moved = {name: getattr(dataset, name)[:, self.motion_from] * self.motion_factor for name in ("q", "v", "a")}
+        u = dataset.u[:, self.torque_from] * self.torque_factor
+        return replace(dataset, **moved, u=u, system=None, noise_std=None, truth={}, metadata={})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TorqueFit:
+    """What the robot explains of the torque of each joint.
+
+    `unexplained` (nv,) is the share of the torque's variance that is left, NaN for a torque that never changes;
+    `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque. `friction` (nv,) is the share
+    that is left without inverse dynamics and armature, `plain` (nv,) that without armature, whose s is `factor` (nv,):
+    where tau is nearly proportional to a, s and I are not to be told apart.
+    """
+
+    unexplained: Float[np.ndarray, " nv"]
+    friction: Float[np.ndarray, " nv"]
+    plain: Float[np.ndarray, " nv"]
+    factor: Float[np.ndarray, " nv"]
+    coefficients: Float[np.ndarray, "nv 5"]
+    predicted: Float[np.ndarray, "rows nv"]
+
+
+def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
+    """Torques of the rigid bodies [Nm or N]."""
+    with torch.no_grad():
+        q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+        return robot.inverse_dynamics(q, v, a).cpu().numpy()
+
+
+def fit_torques(
+    tau: Float[np.ndarray, "rows nv"], rows: Dataset, u: Float[np.ndarray, "rows nv"] | None = None
+) -> TorqueFit:
+    """Fit the torques of these rows, or others, to inverse dynamics tau of their motion."""
+    u = rows.u if u is None else u
+    fits = [_JointFit(tau[:, joint], rows.v[:, joint], rows.a[:, joint], u[:, joint]) for joint in range(rows.nv)]
+    every, plain, friction = ([fit.solved(columns) for fit in fits] for columns in ((0, 1, 2, 3), (0, 2, 3), (2, 3)))
+    return TorqueFit(
+        unexplained=np.array([share for _, share in every]),
+        friction=np.array([share for _, share in friction]),
+        plain=np.array([share for _, share in plain]),
+        factor=np.array([solution[0] for solution, _ in plain]),
+        coefficients=np.stack([solution for solution, _ in every]),
+        predicted=np.stack([fit.predicted(solution) for fit, (solution, _) in zip(fits, every, strict=True)], axis=1),
+    )
+
+
+def unexplained_share(
+    tau: Float[np.ndarray, " rows"],
+    v: Float[np.ndarray, " rows"],
+    a: Float[np.ndarray, " rows"],
+    u: Float[np.ndarray, " rows"],
+) -> float:
+    """Share of the variance of one torque that one joint's inverse dynamics and motion leave; NaN if u is constant."""
+    return _JointFit(tau, v, a, u).solved((0, 1, 2, 3))[1]
+
+
+class _JointFit:
+    """One joint's torque and what may explain it; a free constant takes the means out of both sides."""
+
+    def __init__(self, tau: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> None:
+        slow = SLOW * float(np.sqrt(np.square(v).mean())) + 1e-12
+        self.columns = np.stack([tau, a, v, np.tanh(v / slow)], axis=1)
+        self.centered = self.columns - self.columns.mean(axis=0)
+        self.size = np.linalg.norm(self.centered, axis=0)
+        self.mean = float(u.mean())
+        self.target = u - self.mean
+        self.spread = float(np.square(self.target).sum())
+        self.constant = not self.spread > CONSTANT * max(float(np.square(u).sum()), 1e-300)
+
+    def solved(self, chosen: tuple[int, ...]) -> tuple[np.ndarray, float]:
+        """Coefficients (5,), the constant last, and the unexplained share with some of the columns."""
+        solution = np.zeros(5)
+        solution[4] = self.mean
+        if self.constant:
+            return solution, np.nan
+        used = [column for column in chosen if self.size[column] > 1e-9 * max(float(self.size.max()), 1e-300)]
+        if not used:
+            return solution, 1.0
+        basis, triangle = np.linalg.qr(self.centered[:, used] / self.size[used])
+        right = basis.T @ self.target
+        factors, left = nnls(triangle, right)
+        outside = float(np.square(self.target - basis @ right).sum())
+        solution[used] = factors / self.size[used]
+        solution[4] = self.mean - float(self.columns.mean(axis=0) @ solution[:4])
+        return solution, float((left**2 + outside) / self.spread)
+
+    def predicted(self, solution: np.ndarray) -> np.ndarray:
+        """The torque (rows,) with these coefficients."""
+        return self.columns @ solution[:4] + solution[4]

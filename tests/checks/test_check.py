@@ -1,0 +1,182 @@
+"""Every planted defect is found and named, and a clean log stays clean."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.checks.logs import arm, clean, column, exchanged, late, pendulum
+
+from forcegp.checks import CheckReport, check
+from forcegp.data import Dataset, Preparation
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import MechanicalSystem
+from forcegp.robots import Robot
+
+DEGREES = 180.0 / np.pi
+SYSTEMS = {"arm": arm, "pendulum": pendulum}
+
+
+def told(report: CheckReport) -> str:
+    seen = [f"[{item.severity}] {item.subject}: {item.seen}" for item in report.findings if item.severity != "ok"]
+    return "\n".join(seen)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (1, 1.0), (2, 1.0), (3, 1.0)])
+def test_a_clean_log_raises_no_alarm(system, seed, noise):
+    report = check(clean(seed, SYSTEMS[system](), noise=noise))
+    assert report.severity == "ok", told(report)
+    assert {item.subject for item in report.findings} >= {"sampling", "velocity", "torque", "excitation", "noise"}
+
+
+def all_motion(data: Dataset, sign: list[float], names: str = "qva") -> Dataset:
+    return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
+
+
+def held(start: int, stop: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda x: np.where((np.arange(len(x)) > start) & (np.arange(len(x)) < stop), x[start], x)
+
+
+def clipped(u: np.ndarray) -> np.ndarray:
+    return np.clip(u, *np.quantile(u, [0.1, 0.9]))
+
+
+ALL, LAST_TWO = ("pan", "lift", "bend"), ("lift", "bend")
+DEFECTS: dict[str, tuple[Callable[[Dataset], Dataset], str, str, tuple[str, ...]]] = {
+    "torque sign of one": (lambda d: column(d, "u", 1, np.negative), "wrong", "torque sign", ("lift",)),
+    "torque sign of all": (lambda d: replace(d, u=-d.u), "wrong", "torque sign", ALL),
+    "torques exchanged": (lambda d: exchanged(d, "u", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
+    "torques turned around": (lambda d: exchanged(d, "u", [1, 2, 0]), "wrong", "joints exchanged", ALL),
+    "motions exchanged": (lambda d: exchanged(d, "qva", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
+    "joints exchanged": (lambda d: exchanged(d, "qvau", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
+    "motion sign": (lambda d: all_motion(d, [1, -1, 1]), "wrong", "motion sign", ("lift",)),
+    "degrees": (lambda d: all_motion(d, [DEGREES] * 3), "wrong", "degrees", ALL),
+    "positions in degrees": (lambda d: all_motion(d, [DEGREES] * 3, "q"), "wrong", "velocity", ALL),
+    "velocities in degrees": (lambda d: all_motion(d, [DEGREES] * 3, "va"), "wrong", "velocity", ALL),
+    "velocity sign": (lambda d: column(d, "v", 0, np.negative), "wrong", "velocity", ("pan",)),
+    "velocities late": (lambda d: replace(d, v=np.roll(d.v, 4, axis=0)), "look", "velocity", ALL),
+    "torques in mNm": (lambda d: replace(d, u=1000 * d.u), "wrong", "torque unit", ("lift",)),
+    "torque before a gear": (lambda d: column(d, "u", 1, lambda x: x / 50), "wrong", "torque unit", ("lift",)),
+    "torques 20 ms late": (lambda d: late(d, 0.02), "look", "delay", ALL),
+    "one torque late": (lambda d: late(d, 0.02, slice(1, 2)), "look", "delay", ("lift",)),
+    "dead torque": (lambda d: column(d, "u", 1, lambda x: 0 * x), "wrong", "dead torque", ("lift",)),
+    "dead position": (lambda d: column(d, "q", 1, lambda x: 0 * x + 0.3), "wrong", "constant channel", ("lift",)),
+    "frozen position": (lambda d: column(d, "q", 1, held(500, 560)), "wrong", "frozen channel", ("lift",)),
+    "frozen torque": (lambda d: column(d, "u", 2, held(500, 560)), "wrong", "frozen channel", ("bend",)),
+    "saturation": (lambda d: column(d, "u", 1, clipped), "wrong", "saturation", ("lift",)),
+    "coarse positions": (lambda d: column(d, "q", 0, lambda x: x.round(2)), "look", "resolution", ("pan",)),
+    "beyond a limit": (lambda d: column(d, "q", 2, lambda x: x + 4.0), "look", "limits", ("bend",)),
+    "a joint that stays": (lambda d: all_motion(d, [1e-3, 1, 1]), "look", "excitation", ("pan",)),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_planted_defect_is_found(name):
+    plant, severity, subject, joints = DEFECTS[name]
+    report = check(plant(clean(4)))
+    found = [item for item in report.of(subject) if item.severity != "ok"]
+    assert found, told(report)
+    assert found[0].severity in (severity, "wrong")
+    assert set(found[0].joints) == set(joints), told(report)
+    assert found[0].remedy
+
+
+def test_a_delay_is_measured():
+    report = check(late(clean(5), 0.02))
+    assert report.of("delay")[0].numbers["delay"] == pytest.approx(0.02, abs=0.004)
+
+
+def test_lost_samples_are_counted():
+    data = clean(6)
+    chosen = np.sort(np.random.default_rng(0).choice(len(data), 1300, replace=False))
+    report = check(data.rows(chosen))
+    (lost,) = report.of("lost samples")
+    assert lost.severity == "wrong"
+    steps = np.diff(chosen)
+    assert lost.numbers["count"] == (steps > 1).sum()
+    assert lost.numbers["share"] == pytest.approx((steps - 1)[steps > 1].sum() / steps.sum())
+    assert f"after row {lost.numbers['row']}" in lost.seen
+
+
+def test_a_gap_is_not_differentiated_across():
+    report = check(clean(6).rows(np.r_[0:700, 780:1400]))
+    (lost,) = report.of("lost samples")
+    assert lost.numbers["gaps"] == 1
+    assert len(report.evidence.even.episodes) == 2
+    assert not report.of("torque sign")
+    assert report.of("torque")[0].severity == "ok"
+
+
+def test_repeated_rows_are_told():
+    data = clean(7)
+    kept = np.arange(len(data)) // 4 * 4
+    repeated = replace(data, q=data.q[kept], v=data.v[kept], u=data.u[kept])
+    (found,) = check(repeated).of("repeated rows")
+    assert found.numbers["share"] == pytest.approx(0.75, abs=0.02)
+
+
+def test_gravity_of_a_base_that_hangs_is_named():
+    data = clean(8, pendulum())
+    wall = Robot.from_urdf_text(pendulum().robot.urdf_text, gravity=(0.0, 0.0, 9.81))
+    report = check(replace(data, system=None), MechanicalSystem(wall))
+    (found,) = report.of("gravity")
+    np.testing.assert_allclose(found.numbers["gravity"], [0, 0, -9.81], atol=0.5)
+    assert "--gravity=0,0,-9.81" in found.remedy or found.numbers["degrees"] > 170
+
+
+def test_two_mistakes_are_told_apart():
+    report = check(column(exchanged(clean(9), "u", [0, 2, 1]), "u", 0, np.negative))
+    assert {item.joints for item in report.of("torque sign")} == {("pan",)}
+    assert set(report.of("joints exchanged")[0].joints) == {"lift", "bend"}
+    assert report.comparison is not None
+    assert np.nanmax(report.comparison.fit.unexplained) < 0.05
+
+
+def test_an_angle_that_wraps_is_told_and_unwrapped():
+    data = clean(3, pendulum())
+    wrapped = column(data, "q", 0, lambda x: (x + 2 * np.pi * data.time / 3 + np.pi) % (2 * np.pi) - np.pi)
+    report = check(replace(wrapped, v=data.v + np.array([2 * np.pi / 3, 0.0])))
+    (found,) = report.of("jumps")
+    assert found.severity == "wrong"
+    assert "by a turn: the angle wraps" in found.seen
+    assert not [item for item in report.of("velocity") if item.severity != "ok"], told(report)
+
+
+def test_positions_that_jump_otherwise_end_the_check_of_motion():
+    report = check(column(clean(3), "q", 1, lambda x: x + 5.0 * (np.arange(len(x)) > 700)))
+    (found,) = report.of("jumps")
+    assert found.numbers["row"] == 700
+    assert report.evidence.prepared is None
+    assert report.comparison is None
+
+
+def test_without_a_robot_it_says_what_was_not_compared():
+    report = check(replace(clean(1), system=None))
+    assert [item.remedy for item in report.of("torque")] == ["Add --robot ARM.urdf."]
+
+
+def test_the_report_is_json_and_sorted_by_severity():
+    report = check(column(clean(2), "u", 1, np.negative))
+    content = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    assert content["severity"] == "wrong"
+    assert content["findings"][0]["subject"] == "torque sign"
+    assert sum(content["counts"].values()) == len(content["findings"])
+
+
+def test_a_check_changes_with_its_filter():
+    given = check(clean(1), preparation=Preparation(cutoff=9.0))
+    assert given.evidence.prepared is not None
+    assert given.evidence.prepared.preparation.cutoff == 9.0
+    assert "as asked for" in given.of("noise")[0].seen
+
+
+def test_what_cannot_be_checked_is_refused():
+    data = clean(1)
+    with pytest.raises(InvalidInput, match="no stretch of 64 rows without a gap"):
+        check(data.rows(slice(0, 40)))
+    with pytest.raises(InvalidInput, match="not in order of time"):
+        check(data.rows([5, 3, 1]))
+    with pytest.raises(InvalidInput, match="pendulum has joints shoulder, elbow; the dataset has pan, lift, bend"):
+        check(data, pendulum())
