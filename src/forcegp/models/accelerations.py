@@ -71,11 +71,11 @@ class StructuredAccelerations(AccelerationModel):
 
     def _through(self, functions: Callable[[list[Tensor]], Tensor]) -> AccelerationFunction:
         model, standardize = self.posterior.model, self.posterior.likelihood.standardization
-        known = model.mean == "analytical"
 
         def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
             dynamics = self.system.dynamics(q, v, u, self._inertials)
-            affine, mixing = dynamics.acceleration_map(known), model.prior.mixing(dynamics)
+            affine, _ = self.posterior.acceleration_map(dynamics)
+            mixing = model.prior.mixing(dynamics)
             if not mixing.shape[-1]:
                 return affine.offset
             latents = functions(standardize(model.prior.features(dynamics)))

@@ -28,6 +28,10 @@ class Noise:
 
     where the factor is 1, or, for data that state the noise of every row, that noise over its root mean square: then
     `acceleration` is the level, and which rows are noisier is as stated.
+
+    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions know that their u
+    is as noisy, and shrink accelerations that only its noise explains (`models/measured_torque.py`). Leave it False
+    where u is a command, as in model-predictive control.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -36,12 +40,17 @@ class Noise:
     acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None
     learn: bool = False
+    measured_torque: bool = False
 
     def __post_init__(self) -> None:
         if self.acceleration is not None:
             object.__setattr__(self, "acceleration", _positive("acceleration", self.acceleration))
         if self.force is not None:
             object.__setattr__(self, "force", _positive("force", self.force))
+        elif self.measured_torque:
+            raise InvalidInput(
+                "Noise(measured_torque=True) needs the noise of the torque sensor; give force=SIGMA in Nm or N."
+            )
 
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint.
@@ -97,6 +106,7 @@ class Noise:
             "acceleration": list(self.acceleration) if isinstance(self.acceleration, tuple) else self.acceleration,
             "force": list(self.force) if isinstance(self.force, tuple) else self.force,
             "learn": self.learn,
+            "measured_torque": self.measured_torque,
         }
 
     @classmethod
@@ -107,6 +117,7 @@ class Noise:
             tuple(stored["acceleration"]) if isinstance(stored["acceleration"], list) else stored["acceleration"],
             tuple(force) if isinstance(force, list) else force,
             bool(stored["learn"]),
+            bool(stored.get("measured_torque", False)),
         )
 
 

@@ -190,6 +190,11 @@ def make_predictor(
             f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
             "0.01, and an integer from 1."
         )
+    if posterior.model.noise is not None and posterior.model.noise.measured_torque:
+        raise InvalidInput(
+            "a predictor is for commanded torques, and this model was told that u comes from a noisy sensor; call "
+            "predict, or fit with Noise(..., measured_torque=False)."
+        )
     begin = time.perf_counter()
     latent, nv = posterior.latent, posterior.system.robot.nv
     if covariance == "auto":

@@ -38,6 +38,8 @@ UPDATED = 3
 """
 WINDOWED = 4
 """Format of a model that learned from windows: programs that only know 1 to 3 would take their nodes for rows."""
+MEASURED = 5
+"""Format of a model of measured torques: programs that only know 1 to 4 would predict as if torques were exact."""
 STATES = ("q", "v", "u", "a")
 NOISE, WEIGHTS = "noise_std", "weights"
 SOLUTION = "latent.solution"
@@ -137,7 +139,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         if moved_to is not None:
             target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
         training = _rows(TRAINING, tensors)
-        if document["format_version"] == UPDATED:
+        if any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
@@ -178,6 +180,8 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
 
 
 def _version(posterior: Posterior) -> int:
+    if getattr(posterior.model.noise, "measured_torque", False):
+        return MEASURED
     if posterior.training.weights is not None:
         return WINDOWED
     if posterior.training.reference is not None:
@@ -243,9 +247,9 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in KINDS:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in (FORMAT_VERSION, TRANSFERRED, UPDATED, WINDOWED):
+    if version not in range(FORMAT_VERSION, MEASURED + 1):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} to {WINDOWED}; "
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} to {MEASURED}; "
             f"use the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document

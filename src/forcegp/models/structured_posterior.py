@@ -32,7 +32,8 @@ from forcegp.models.accelerations import AccelerationModel, StructuredAccelerati
 from forcegp.models.components import Components, Curve, Latents, components_of, term_slices
 from forcegp.models.identification import Identification
 from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData, inertials_of
-from forcegp.models.noise import ACCELERATION, Noise
+from forcegp.models.measured_torque import plus, second_moments, shrunk, without_force_noise
+from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.predictor import Predictor, make_predictor
@@ -125,15 +126,25 @@ class StructuredPosterior(Posterior):
         def through(affine: AffineMap) -> Gaussian:
             return latents.through(affine.matrix @ B, affine.offset)
 
-        acceleration = through(dynamics.acceleration_map(known))
+        acceleration, torque_noise = self.acceleration_map(dynamics)
+        predicted = through(acceleration)
+        noise = self.parameters if torque_noise is None else without_force_noise(self.parameters)
         return Prediction(
-            acceleration.mean,
-            acceleration.covariance,
+            predicted.mean,
+            predicted.covariance if torque_noise is None else plus(predicted.covariance, torque_noise),
             multiplier=through(dynamics.multiplier_map(known)),
             contact_force=through(dynamics.contact_force_map(known)),
             unknown_force=latents.through(B),
-            noise_covariance=_noise_covariance(self.parameters, dynamics),
+            noise_covariance=_noise_covariance(noise, dynamics),
         )
+
+    def acceleration_map(self, dynamics: ConstrainedDynamics) -> tuple[AffineMap, Tensor | None]:
+        """Acceleration as a function of the unknown force, and what u's own noise leaves open; None for exact u."""
+        affine = dynamics.acceleration_map(self.model.mean == "analytical")
+        noise = self.model.noise
+        if noise is None or not noise.measured_torque:
+            return affine, None
+        return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
     def _latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
         """All processes at a batch of states."""
