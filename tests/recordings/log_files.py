@@ -109,14 +109,19 @@ def write_bag1(path: Path, data: dict[str, np.ndarray]) -> Path:
     return path
 
 
-def write_bag2(path: Path, data: dict[str, np.ndarray], storage: str = "mcap", gripper: bool = False) -> Path:
+def write_bag2(
+    path: Path, data: dict[str, np.ndarray], storage: str = "mcap", gripper: bool = False, compressed: bool = False
+) -> Path:
     """A folder; with `gripper`, another publisher on the same topic now and then."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as bag:
+    bag = Writer(path, version=9, storage_plugin=plugin)
+    if compressed:
+        bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag:
         connection = bag.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
         wrench = bag.add_connection("/wrench", "geometry_msgs/msg/WrenchStamped", typestore=store)
         for row, (stamp, message) in enumerate(joint_states(data, store, ros1=False)):

@@ -195,6 +195,11 @@ class TestBareSqlite(Bags):
         return next(write_bag2(folder / "log", motion(), "sqlite3").glob("*.db3"))
 
 
+class TestCompressedMcap(TestRos2Folder):
+    def write(self, folder):
+        return write_bag2(folder / "log", motion(), compressed=True)
+
+
 class TestTopicWithTwoPublishers(TestRos2Folder):
     def write(self, folder):
         return write_bag2(folder / "log", motion(), gripper=True)

@@ -1,0 +1,97 @@
+"""`forcegp import` through the real executable: what it makes, what it says, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.recordings.broken_logs import BROKEN, urdf
+from tests.recordings.log_files import JOINTS, motion, table, write_bag2, write_text
+
+from forcegp import Dataset
+
+FLAGS = ("--time", "time", "--q", "q_{joints}", "--v", "v_{joints}", "--u", "u_{joints}", "--joints", ",".join(JOINTS))
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_cannot_be_imported_is_one_line_and_leaves_nothing(forcegp, tmp_path, name):
+    broken = BROKEN[name]
+    if "bag" in name or "mcap" in name or "topic" in name or "unknown compression" in name:
+        pytest.importorskip("rosbags")
+    log = broken.make(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    done = forcegp("import", log.relative_to(tmp_path), *broken.words.split(), "--out", "log_out.h5", folder=tmp_path)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("the columns are mapped by")]
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("forcegp: ")
+    assert broken.told in lines[0]
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_robot_orders_the_joints_and_the_dataset_carries_it(forcegp, tmp_path):
+    (tmp_path / "arm.urdf").write_text(urdf("elbow", "shoulder"))
+    write_text(tmp_path / "log.csv", table(motion()))
+    done = forcegp("import", "log.csv", "--robot", "arm.urdf", "--out", "log.h5", "--json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    data = Dataset.load(tmp_path / "log.h5")
+    assert data.joint_names == ("elbow", "shoulder")
+    assert data.system is not None
+    assert data.system.robot.joint_names == data.joint_names
+    np.testing.assert_array_equal(data.q, motion()["q"][:, ::-1])
+    np.testing.assert_array_equal(data.u, motion()["u"][:, ::-1])
+    assert "found by name: q = q_elbow, q_shoulder" in done.stderr
+    assert json.loads(done.stdout)["rows"] == len(data) == 200
+    assert data.metadata["import"]["files"][0]["bytes"] == (tmp_path / "log.csv").stat().st_size
+
+
+def test_a_mapping_is_written_found_again_and_changed_by_flags(forcegp, tmp_path):
+    write_text(tmp_path / "log.csv", table(motion()))
+    written = forcegp("import", "log.csv", *FLAGS, "--out", "a.h5", "--write-mapping", "log.yaml", folder=tmp_path)
+    assert written.returncode == 0, written.stderr
+    again = forcegp("import", "log.csv", "--out", "b.h5", folder=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "the columns are mapped by log.yaml" in again.stderr
+    other = forcegp("import", "log.csv", "--sign=u=-1", "--unit", "q=deg", "--out", "c.h5", folder=tmp_path)
+    assert other.returncode == 0, other.stderr
+    a, b, c = (Dataset.load(tmp_path / f"{name}.h5") for name in "abc")
+    for name in ("q", "v", "u", "a", "time", "episode"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    np.testing.assert_array_equal(c.u, -a.u)
+    np.testing.assert_allclose(c.q, np.deg2rad(a.q), rtol=1e-15)
+
+
+def test_an_existing_file_is_kept_unless_told_otherwise(forcegp, tmp_path):
+    write_text(tmp_path / "log.csv", table(motion()))
+    (tmp_path / "log.h5").write_text("years of work")
+    refused = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", folder=tmp_path)
+    assert refused.returncode == 2
+    assert "add --overwrite" in refused.stderr
+    assert (tmp_path / "log.h5").read_text() == "years of work"
+    done = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(Dataset.load(tmp_path / "log.h5")) == 200
+
+
+def test_what_was_repaired_is_said(forcegp, tmp_path):
+    columns = {name: values.copy() for name, values in table(motion()).items()}
+    columns["time"][100:] += 0.5
+    columns["time"][150] = columns["time"][149]
+    columns["time"][20] += 2e-4
+    write_text(tmp_path / "log.csv", columns)
+    done = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "1 rows with a repeated time stamp dropped" in done.stderr
+    assert "1 gaps of up to 0.502 s begin new episodes" in done.stderr
+    assert "resampled to 512 Hz: steps deviate by up to" in done.stderr
+    assert "in 2 episodes" in done.stdout
+
+
+def test_messages_of_another_publisher_are_left_out_and_said(forcegp, tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag2(tmp_path / "log", motion(), gripper=True)
+    columns = ("--q", "/joint_states:position.{joints}", "--u", "/joint_states:effort.{joints}")
+    done = forcegp("import", "log", *columns, "--joints", "shoulder,elbow", "--out", "log.h5", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "67 messages without all of the columns left out" in done.stderr
+    assert len(Dataset.load(tmp_path / "log.h5")) == 200

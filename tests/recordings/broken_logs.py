@@ -1,0 +1,325 @@
+"""Logs that cannot be imported: each is a file or folder, the flags it is given with, and the words of the refusal."""
+
+import gzip
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import scipy.io
+from numpy.lib import format as npy
+from tests.recordings.log_files import (
+    motion,
+    table,
+    write_bag2,
+    write_hdf5,
+    write_lerobot,
+    write_matlab5,
+    write_parquet,
+    write_text,
+)
+
+FLAGS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --joints shoulder,elbow"
+ARRAYS = "--time time --q q --v v --u u --joints shoulder,elbow"
+TOPIC = "--q /joint_states:position --u /joint_states:effort --joints shoulder,elbow"
+LEROBOT = "--q observation.state.q_{joints} --u observation.effort --joints shoulder,elbow"
+
+URDF = """<robot name="pendulum"><link name="base"/>
+{links}
+</robot>"""
+LINK = """<link name="{name}_link"><inertial><origin xyz="0 0 -0.1"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{name}_link"/><axis xyz="0 1 0"/>
+<limit lower="-1.5" upper="1.5" effort="100" velocity="20"/></joint>"""
+
+
+def urdf(*joints: str) -> str:
+    """A chain of links of 1 kg."""
+    parents = ["base", *(f"{joint}_link" for joint in joints)]
+    links = [LINK.format(name=joint, parent=parent) for joint, parent in zip(joints, parents, strict=False)]
+    return URDF.format(links="\n".join(links))
+
+
+@dataclass(frozen=True)
+class Broken:
+    """`make` writes the log below a folder; `words` follow `forcegp import`; `told` stands in the refusal."""
+
+    make: Callable[[Path], Path]
+    told: str
+    words: str = FLAGS
+
+
+def csv(change: Callable[[dict[str, np.ndarray]], None], name: str = "log.csv") -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        columns = {key: values.copy() for key, values in table(motion()).items()}
+        change(columns)
+        return write_text(folder / name, columns)
+
+    return make
+
+
+def text(edit: Callable[[str], str], name: str = "log.csv") -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        path = csv(lambda columns: None, name)(folder)
+        path.write_text(edit(path.read_text()))
+        return path
+
+    return make
+
+
+def cut(write: Callable[[Path], Path], share: float = 0.6) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        path = write(folder)
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+        return path
+
+    return make
+
+
+def setting(name: str, row: int, value: float) -> Callable[[Path], Path]:
+    def change(columns: dict[str, np.ndarray]) -> None:
+        columns[name][row] = value
+
+    return csv(change)
+
+
+def scaled(factor: float, *names: str) -> Callable[[Path], Path]:
+    def change(columns: dict[str, np.ndarray]) -> None:
+        for name in names:
+            columns[name] *= factor
+
+    return csv(change)
+
+
+def swapped(columns: dict[str, np.ndarray]) -> None:
+    columns["time"][[50, 51]] = columns["time"][[51, 50]]
+
+
+def constant_time(columns: dict[str, np.ndarray]) -> None:
+    columns["time"][:] = 3.0
+
+
+def wrapping(columns: dict[str, np.ndarray]) -> None:
+    columns["q_elbow"] = (np.linspace(0, 9, len(columns["time"])) + np.pi) % (2 * np.pi) - np.pi
+
+
+def archive(folder: Path, **arrays: object) -> Path:
+    np.savez_compressed(folder / "log.npz", **{**motion(), **arrays})
+    return folder / "log.npz"
+
+
+def member(folder: Path, content: bytes, mode: int = zipfile.ZIP_DEFLATED) -> Path:
+    """The usual archive, with other bytes for q."""
+    with zipfile.ZipFile(folder / "log.npz", "w", mode) as file:
+        for name, values in motion().items():
+            buffer = io.BytesIO()
+            np.save(buffer, values)
+            file.writestr(f"{name}.npy", content if name == "q" else buffer.getvalue())
+    return folder / "log.npz"
+
+
+def claiming(shape: tuple[int, ...]) -> bytes:
+    """An array of that shape, of which nothing but the header is there."""
+    buffer = io.BytesIO()
+    npy.write_array_header_1_0(buffer, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return buffer.getvalue()
+
+
+def encrypted(folder: Path) -> Path:
+    path = archive(folder)
+    content = bytearray(path.read_bytes())
+    for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        place = content.find(mark)
+        while place >= 0:
+            content[place + flags] |= 1
+            place = content.find(mark, place + 4)
+    path.write_bytes(content)
+    return path
+
+
+def bomb_of_gzip(folder: Path) -> Path:
+    (folder / "log.csv.gz").write_bytes(gzip.compress(b"time,q\n" + b"0,0\n" * (40 * 2**20), 9))
+    return folder / "log.csv.gz"
+
+
+def cells(folder: Path) -> Path:
+    made = np.empty(2, object)
+    made[:] = [np.ones(3), np.ones(4)]
+    scipy.io.savemat(folder / "log.mat", {"q": made})
+    return folder / "log.mat"
+
+
+def linked(folder: Path) -> Path:
+    write_hdf5(folder / "other.h5", motion())
+    with h5py.File(folder / "log.h5", "w") as file:
+        file["time"] = motion()["time"]
+        file["q"] = h5py.ExternalLink("other.h5", "/log/q")
+    return folder / "log.h5"
+
+
+def hollow(folder: Path) -> Path:
+    with h5py.File(folder / "log.h5", "w") as file:
+        file.create_dataset("q", shape=(10**10, 2), chunks=(1000, 2), dtype="f8")
+    return folder / "log.h5"
+
+
+def empty_bag(folder: Path) -> Path:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(folder / "log", version=9, storage_plugin=StoragePlugin.MCAP):
+        pass
+    return folder / "log"
+
+
+def mcap(folder: Path) -> Path:
+    return next(write_bag2(folder / "log", motion()).glob("*.mcap"))
+
+
+def unknown_compression(folder: Path) -> Path:
+    path = next(write_bag2(folder / "log", motion(), compressed=True).glob("*.mcap"))
+    content = path.read_bytes()
+    assert b"zstd" in content
+    path.write_bytes(content.replace(b"zstd", b"brot"))
+    return path
+
+
+def lerobot(change: Callable[[dict], None]) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        path = write_lerobot(folder / "log", motion())
+        info = json.loads((path / "meta" / "info.json").read_text())
+        change(info)
+        (path / "meta" / "info.json").write_text(json.dumps(info))
+        return path
+
+    return make
+
+
+def episode_again(folder: Path) -> Path:
+    path = write_lerobot(folder / "log", motion())
+    first, second = sorted(path.rglob("*.parquet"))
+    content = second.read_bytes()
+    (first.parent / "file-002.parquet").write_bytes(first.read_bytes())
+    second.write_bytes(content)
+    info = json.loads((path / "meta" / "info.json").read_text())
+    (path / "meta" / "info.json").write_text(json.dumps(info | {"total_frames": 300}))
+    return path
+
+
+def with_mapping(content: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / "log.yaml").write_text(content)
+        return csv(lambda columns: None)(folder)
+
+    return make
+
+
+def with_urdf(make: Callable[[Path], Path], *joints: str) -> Callable[[Path], Path]:
+    def both(folder: Path) -> Path:
+        (folder / "arm.urdf").write_text(urdf(*joints))
+        return make(folder)
+
+    return both
+
+
+def written(name: str, content: bytes) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return make
+
+
+def folder_of_logs(folder: Path) -> Path:
+    (folder / "logs").mkdir()
+    return folder / "logs"
+
+
+GOOD = csv(lambda columns: None)
+ROBOT = FLAGS.replace("--joints shoulder,elbow", "--robot arm.urdf")
+
+BROKEN = {
+    "no such file": Broken(lambda folder: folder / "log.csv", "log.csv does not exist"),
+    "missing column": Broken(GOOD, "no column 'p_shoulder'", FLAGS.replace("q_{", "p_{")),
+    "nothing mapped": Broken(GOOD, "no columns for q (positions)", "--time time"),
+    "joints without names": Broken(GOOD, "add --joints", "--time time --q q_shoulder,q_elbow --u 0"),
+    "NaN": Broken(setting("v_elbow", 7, np.nan), "'v_elbow' (v of joint 'elbow') is missing (empty or NaN) at row 7"),
+    "inf": Broken(setting("u_elbow", 190, np.inf), "'u_elbow' (u of joint 'elbow') is inf at row 190 (line 192)"),
+    "time NaN": Broken(setting("time", 3, np.nan), "column 'time', the time, is missing"),
+    "empty field": Broken(text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "", 1)), "at row 4 (line 6)"),
+    "text": Broken(
+        text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "stop", 1)), "'q_elbow' holds 'stop' at row 4"
+    ),
+    "ragged": Broken(text(lambda t: t + "1.0,2.0\n"), "row 200 (line 202) has 2 fields instead of 7"),
+    "cut line": Broken(text(lambda t: t[:-40]), "fields instead of 7"),
+    "duplicate names": Broken(text(lambda t: t.replace("v_elbow", "q_elbow")), "'q_elbow' stands over columns 3, 5"),
+    "no header": Broken(text(lambda t: t[t.index("\n") + 1 :]), "add --headerless 7"),
+    "header only": Broken(text(lambda t: t[: t.index("\n") + 1]), "has a header but no rows"),
+    "empty": Broken(written("log.csv", b""), "is empty"),
+    "binary": Broken(written("log.csv", bytes(range(256)) * 9), "holds binary data"),
+    "latin-1": Broken(written("log.csv", "time,q_größe\n0,1\n".encode("latin-1")), "not UTF-8 text"),
+    "unknown extension": Broken(written("log.xlsx", b"PK"), "the extension '.xlsx' is not known"),
+    "pickle": Broken(written("log.pkl", pickle.dumps([1])), "reading those runs code"),
+    "folder": Broken(folder_of_logs, "neither a ROS 2 bag (metadata.yaml) nor a LeRobot"),
+    "not gzip": Broken(written("log.csv.gz", b"time,q\n0,1\n"), "is not compressed with gzip"),
+    "cut gzip": Broken(cut(csv(lambda columns: None, "log.csv.gz")), "truncated"),
+    "gzip bomb": Broken(bomb_of_gzip, "no log of sensors shrinks so far"),
+    "time backwards": Broken(csv(swapped), "time runs backwards by 0.00195312 s at row 51 (line 53)"),
+    "time stands still": Broken(csv(constant_time), "all rows have the same time stamp"),
+    "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
+    "s given as ns": Broken(GOOD, "no rate of a robot's log", f"{FLAGS} --unit time=ns"),
+    "unknown unit": Broken(GOOD, "q has no unit 'degrees'; did you mean", f"{FLAGS} --unit q=degrees"),
+    "unit of another": Broken(GOOD, "u has no unit 'deg'", f"{FLAGS} --unit u=deg"),
+    "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
+    "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Say --unit q=deg if it is in degrees"),
+    "degrees beyond limits": Broken(
+        with_urdf(scaled(57.3, "q_shoulder", "q_elbow"), "shoulder", "elbow"), "Then add --unit q=deg", ROBOT
+    ),
+    "beyond limits": Broken(
+        with_urdf(scaled(3.0, "q_elbow"), "shoulder", "elbow"), "beyond its limits -1.5 to 1.5 in the URDF", ROBOT
+    ),
+    "another robot": Broken(
+        with_urdf(GOOD, "shoulder", "wrist"), "'pendulum' has shoulder, wrist", f"{FLAGS} --robot arm.urdf"
+    ),
+    "columns of another robot": Broken(with_urdf(GOOD, "shoulder", "elbow", "wrist"), "no column 'q_wrist'", ROBOT),
+    "too few columns": Broken(GOOD, "u has 1 columns for 2 joints", FLAGS.replace("u_{joints}", "u_elbow")),
+    "not linear": Broken(GOOD, "is not linear", FLAGS.replace("--q q_{joints}", "--q q_shoulder*q_elbow,q_elbow")),
+    "too many rows": Broken(GOOD, "more than 100 rows", f"{FLAGS} --max-rows 100"),
+    "nothing between": Broken(GOOD, "no row lies between", f"{FLAGS} --start 5"),
+    "unknown key": Broken(with_mapping("qq: a\n"), "log.yaml: key 'qq' is not known", ""),
+    "key twice": Broken(with_mapping("q: a\nq: b\n"), "'q' stands twice", ""),
+    "code in YAML": Broken(with_mapping("q: !!python/object/apply:os.getcwd []\n"), "cannot be read as YAML", ""),
+    "cut npz": Broken(cut(archive), "log.npz cannot be read as a NumPy archive", ARRAYS),
+    "cut member": Broken(lambda f: member(f, claiming((200, 2))), "claims the shape (200, 2)", ARRAYS),
+    "npz bomb": Broken(lambda f: member(f, claiming((10**8, 2)) + bytes(2 * 10**8)), "shrinks so far", ARRAYS),
+    "encrypted npz": Broken(encrypted, "encrypted", ARRAYS),
+    "Python objects": Broken(lambda f: archive(f, q=np.array([{}], object)), "reading them runs code", ARRAYS),
+    "other lengths": Broken(lambda f: archive(f, u=np.ones((7, 2))), "different numbers of rows", ARRAYS),
+    "no such group": Broken(archive, "no array or group", f"{ARRAYS} --episodes run*"),
+    "cells": Broken(cells, "'q' is a cell", ARRAYS),
+    "cut mat": Broken(cut(lambda f: write_matlab5(f / "log.mat", motion())), "log.mat", ARRAYS),
+    "cut parquet": Broken(cut(lambda f: write_parquet(f / "log.parquet", table(motion()))), "a Parquet file"),
+    "cut HDF5": Broken(cut(lambda f: write_hdf5(f / "log.h5", motion())), "an HDF5 file", ARRAYS),
+    "external link": Broken(linked, "links to other files are not followed", ARRAYS),
+    "hollow HDF5": Broken(hollow, "shrinks so far", ARRAYS),
+    "empty bag": Broken(empty_bag, "holds no messages", TOPIC),
+    "cut mcap": Broken(cut(mcap), "cannot be read as a bag", TOPIC),
+    "cut bag": Broken(cut(mcap, 0.0), "is empty", TOPIC),
+    "unknown compression": Broken(unknown_compression, "'brot'", TOPIC),
+    "two topics": Broken(
+        mcap,
+        "map columns of one topic",
+        "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --joints shoulder,elbow",
+    ),
+    "fewer frames": Broken(lerobot(lambda info: info.update(total_frames=7)), "says 7 frames", LEROBOT),
+    "another version": Broken(lerobot(lambda info: info.update(codebase_version="v1.6")), "'v1.6'", LEROBOT),
+    "another shape": Broken(
+        lerobot(lambda info: info["features"]["observation.effort"].update(shape=[3])), "has the shape [3]", LEROBOT
+    ),
+    "episode again": Broken(episode_again, "episode 0 begins again at row 200", LEROBOT),
+}
