@@ -4,6 +4,7 @@ from forcegp.analytical.base_parameters import BaseParameters, base_parameters, 
 from forcegp.analytical.identification import identify_analytical
 from forcegp.analytical.regressor import body_names, parameter_names, standard_parameters, torque_regressor
 from forcegp.analytical.result import AnalyticalIdentification
+from forcegp.analytical.scores import motion_residuals, residual_scores
 
 __all__ = [
     "AnalyticalIdentification",
@@ -12,7 +13,9 @@ __all__ = [
     "body_names",
     "excitation",
     "identify_analytical",
+    "motion_residuals",
     "parameter_names",
+    "residual_scores",
     "standard_parameters",
     "torque_regressor",
 ]

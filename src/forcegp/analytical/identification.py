@@ -44,7 +44,8 @@ def identify_analytical(
     ----------
     system: start and prior: the robot, friction it lists, and forces that are given. In no contact.
     dataset: q, v, u and a, filtered alike (`forcegp.data.Preparation`); rows need not be in order of time.
-    friction: out of "viscous", "coulomb" or "stribeck", "offset". Velocity scales are estimated, too.
+    friction: out of "viscous", "coulomb" or "stribeck", "load" (in proportion to |u|) and "offset". Velocity scales are
+        estimated, too.
     rotors: "armature": one inertia per joint. "rotor": those of the system's RotorInertia. None: as listed.
     inertias: "consistent": every estimate belongs to a body (log-Cholesky coordinates, Rucker & Wensing 2022). "free":
         any numbers, that is, ordinary least squares of base parameters, which often give no robot.

@@ -7,7 +7,7 @@ system (which has the opposite sign). A new friction law is one entry in `LAWS`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from forcegp.mechanics import (
     ConstantJointForce,
     CoulombJointFriction,
     KnownForce,
+    LoadJointFriction,
     MechanicalSystem,
     RotorInertia,
     StribeckJointFriction,
@@ -49,31 +50,37 @@ class Field:
 class Law:
     """A joint force as a function of velocity, with its parameters, derivatives, and the known force it becomes.
 
-    `torque(values, v)` gives f (rows, nv) and df (fields, rows, nv), where values[name] has shape (nv,).
+    `torque(values, v, |u|)` gives f (rows, nv) and df (fields, rows, nv), where values[name] has shape (nv,).
     """
 
     kind: type[KnownForce]
     fields: tuple[Field, ...]
-    torque: Callable[[Arrays, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    torque: Callable[[Arrays, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
     known: Callable[[Arrays], KnownForce]
     read: Reader
 
 
-def _viscous(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _viscous(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return p["viscous"] * v, v[None]
 
 
-def _offset(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _offset(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(-p["offset"], v.shape), -np.ones((1, *v.shape))
 
 
-def _coulomb(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _coulomb(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scale = p["velocity_scale"]
     sign = np.tanh(v / scale)
     return p["coulomb"] * sign, np.stack([sign, -p["coulomb"] * (1.0 - sign**2) * v / scale**2])
 
 
-def _stribeck(p: Arrays, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _load(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale = p["load_velocity_scale"]
+    sign = np.tanh(v / scale)
+    return p["load"] * load * sign, load * np.stack([sign, -p["load"] * (1.0 - sign**2) * v / scale**2])
+
+
+def _stribeck(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scale, fall = p["velocity_scale"], p["stribeck_velocity"]
     sign, bump = np.tanh(v / scale), np.exp(-((v / fall) ** 2))
     level = p["coulomb"] + p["breakaway"] * bump
@@ -124,6 +131,13 @@ LAWS: dict[str, Law] = {
             torch.tensor(p["velocity_scale"]),
         ),
         _read_stribeck,
+    ),
+    "load": Law(
+        LoadJointFriction,
+        (Field("load", "1", (0, 0, 0.1)), replace(VELOCITY_SCALE, name="load_velocity_scale")),
+        _load,
+        lambda p: LoadJointFriction(torch.tensor(p["load"]), torch.tensor(p["load_velocity_scale"])),
+        lambda force: _numbers(force, load="coefficients", load_velocity_scale="velocity_scale"),
     ),
     "offset": Law(
         ConstantJointForce,
@@ -238,16 +252,20 @@ class JointTerms:
         return np.where(self._logarithms, self.values(x), self._sizes)
 
     def torque(
-        self, x: Float[np.ndarray, " k"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
+        self,
+        x: Float[np.ndarray, " k"],
+        v: Float[np.ndarray, "rows nv"],
+        a: Float[np.ndarray, "rows nv"],
+        load: Float[np.ndarray, "rows nv"],
     ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv k"]]:
-        """What the terms add to the torque at velocities v and accelerations a, and its derivatives in x."""
+        """What the terms add to the torque at v and a under actuators of torque `load` = |u|, and derivatives in x."""
         values, slopes = self.values(x), self.slopes(x)
         total, nv, row = np.zeros_like(v), len(self.joints), 0
         jacobian = np.zeros((*v.shape, len(self.fields), nv))
         diagonal = np.arange(nv)
         for law in self.laws:
             named = {field.name: values[row + k] for k, field in enumerate(law.fields)}
-            added, derivatives = law.torque(named, v)
+            added, derivatives = law.torque(named, v, load)
             total = total + added
             for k in range(len(law.fields)):
                 jacobian[:, diagonal, row + k, diagonal] = derivatives[k] * slopes[row + k]

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 ROUNDS = 12
 """Most rounds of reweighting."""
@@ -158,7 +158,7 @@ def _noise(r: np.ndarray, robust: bool) -> np.ndarray:
     return np.maximum(scale, 1e-12)
 
 
-def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Float[np.ndarray, " rows"]) -> np.ndarray:
+def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.ndarray, " rows"]) -> np.ndarray:
     """Rows that one independent residual is worth, per joint: 1 + 2 sum of autocorrelations until they turn negative.
 
     Filtered signals have residuals that resemble their neighbours; without this factor standard errors are too small.

@@ -38,6 +38,7 @@ class RecordedRows:
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
         state = State.of(robot, at_q, at_v, at_u)
         self.kinematics, self.terms, self.v = state.kinematics, terms, np.array(v)
+        self.load = abs(np.array(u))
         given = kept_forces(system, terms)
         self.force = np.zeros_like(self.v)
         self.inertia = np.zeros((robot.nv, robot.nv))
@@ -57,7 +58,7 @@ class RecordedRows:
     ) -> np.ndarray:
         """The force Q (rows, nv) under which the model accelerates by a."""
         Y = self.regressor(a) if regressor is None else regressor
-        torque, _ = self.terms.torque(x, self.v, a)
+        torque, _ = self.terms.torque(x, self.v, a, self.load)
         return np.einsum("nibp,bp->ni", Y, parameters) + a @ (self.inertia + self._armature) + torque
 
     def acceleration(self, parameters: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +66,7 @@ class RecordedRows:
         given = torch.as_tensor(parameters, device=self.kinematics.robot.device)
         M, bias = (part.cpu().numpy() for part in self.kinematics.dynamics_of_bodies(given))
         M = M + self.inertia + self.terms.added_inertia(x)
-        torque, _ = self.terms.torque(x, self.v, np.zeros_like(self.v))
+        torque, _ = self.terms.torque(x, self.v, np.zeros_like(self.v), self.load)
         try:
             return np.linalg.solve(M, (self.force - bias - torque)[..., None])[..., 0], M
         except np.linalg.LinAlgError:
@@ -77,7 +78,7 @@ class RecordedRows:
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual (rows, nv) and its derivatives in the parameters (rows, nv, bodies, 10) and in x (rows, nv, k)."""
-        _, in_x = self.terms.torque(x, self.v, a)
+        _, in_x = self.terms.torque(x, self.v, a, self.load)
         return self.needed_torque(parameters, x, a, regressor) - self.force, regressor, in_x
 
     def in_acceleration(
@@ -86,7 +87,7 @@ class RecordedRows:
         """As `in_torque`, of a - a^."""
         predicted, M = self.acceleration(parameters, x)
         Y = self.regressor(predicted)
-        _, in_x = self.terms.torque(x, self.v, predicted)
+        _, in_x = self.terms.torque(x, self.v, predicted, self.load)
         rows, nv = predicted.shape
         solved = np.linalg.solve(M, np.concatenate([Y.reshape(rows, nv, -1), in_x], axis=-1))
         return a - predicted, solved[..., : 10 * nv].reshape(Y.shape), solved[..., 10 * nv :]

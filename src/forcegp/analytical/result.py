@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from forcegp.analytical.base_parameters import BaseParameters
-from forcegp.analytical.bodies import BodyCoordinates
+from forcegp.analytical.bodies import BodyCoordinates, FreeBodies
 from forcegp.analytical.identified_robot import with_bodies, with_joint_dynamics
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import Fit, correlation_time
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.regressor import UNITS, body_names, parameter_names
+from forcegp.analytical.scores import residual_scores
 from forcegp.data import Dataset
 from forcegp.mechanics import CoulombJointFriction, MechanicalSystem, StribeckJointFriction, ViscousJointFriction
 
@@ -33,7 +34,7 @@ class AnalyticalIdentification:
     fit: Fit
     likelihood: str
     prior_strength: float
-    episode: Float[np.ndarray, " rows"]
+    episode: Int[np.ndarray, " rows"]
     regressor: Float[np.ndarray, "rows nv bodies 10"]
     thickened: tuple[str, ...]
 
@@ -141,31 +142,22 @@ class AnalyticalIdentification:
         """Accelerations under the forces u, also of free inertias. Raises NumericalError for a singular M."""
         return self._recorded(q, v, u).acceleration(self.parameters, self._in_terms)[0]
 
-    def torques(self, q: Rows, v: Rows, a: Rows) -> Rows:
-        """The joint forces u under which it moves so: inverse dynamics, friction included."""
-        rows = self._recorded(q, v, np.zeros_like(v))
-        return rows.needed_torque(self.parameters, self._in_terms, a) - rows.force
-
     def torque_residual(self, dataset: Dataset) -> Rows:
-        """Measured less predicted u."""
-        return dataset.u - self.torques(dataset.q, dataset.v, dataset.a)
+        """Measured u less the joint forces under which the model moves so (Nm or N)."""
+        rows = self._recorded(dataset.q, dataset.v, dataset.u)
+        return rows.force - rows.needed_torque(self.parameters, self._in_terms, np.array(dataset.a))
 
     def scores(self, dataset: Dataset) -> dict[str, list[float]]:
-        """Per joint: rms of the torque residual (Nm or N), rms and nRMSE of the acceleration (rad/s^2 or m/s^2)."""
-        error = dataset.a - self.accelerations(dataset.q, dataset.v, dataset.u)
-        rms = np.sqrt((error**2).mean(0))
-        return {
-            "torque_rms": np.sqrt((self.torque_residual(dataset) ** 2).mean(0)).tolist(),
-            "acceleration_rms": rms.tolist(),
-            "acceleration_nrmse": (rms / dataset.a.std(0)).tolist(),
-        }
+        """As `residual_scores`: rms of force and acceleration residuals of `dataset`, and nRMSE, per joint."""
+        acceleration = dataset.a - self.accelerations(dataset.q, dataset.v, dataset.u)
+        return residual_scores(self.torque_residual(dataset), acceleration, dataset)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON values."""
         values, start, errors, units = self.values, self.start, self.standard_errors, self.units
         return {
             "likelihood": self.likelihood,
-            "inertias": "consistent" if type(self.bodies).__name__ == "ConsistentBodies" else "free",
+            "inertias": "free" if isinstance(self.bodies, FreeBodies) else "consistent",
             "prior_strength": self.prior_strength,
             "parameters": {
                 name: {
@@ -202,4 +194,4 @@ class AnalyticalIdentification:
 
 def _unit(kind: str, prismatic: bool) -> str:
     force, speed, inertia = ("N", "m/s", "kg") if prismatic else ("Nm", "rad/s", "kg m^2")
-    return {"force": force, "force s": f"{force} s/{speed[:-2]}", "1/s": speed, "inertia": inertia}[kind]
+    return {"force": force, "force s": f"{force} s/{speed[:-2]}", "1/s": speed, "inertia": inertia, "1": "1"}[kind]

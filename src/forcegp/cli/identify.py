@@ -7,12 +7,14 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit import FitOptions, fit, fit_summary
+from forcegp.cli.identify_regression import INERTIAS, identify_by_regression
 from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
 from forcegp.cli.model_choice import resolved_noise
 from forcegp.cli.terminal import Terminal
@@ -36,22 +38,39 @@ COEFFICIENT_NAMES = (
 class Identify(FitOptions):
     """Estimate physical parameters of the robot along with the unknown forces, and say how sure they are.
 
-    The estimates start from the URDF and always belong to a body that can exist. The folder holds the model as
-    `forcegp fit` writes it, identified.urdf and identification.json.
+    The estimates start from the URDF and always belong to a body that can exist (but those of least-squares). The
+    folder holds identified.urdf, identification.json, and the model as `forcegp fit` writes it, or system.json for
+    --identified.
 
     For instance:
+      forcegp identify log.h5 --robot arm.urdf --model consistent --friction viscous,coulomb,offset --out identified
       forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
       forcegp identify log.h5 --robot arm.urdf --learn tool:mass,com,inertia --learn viscous-joint-friction=0.1
         --noise learned --out identified
     """
 
-    learn: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LINK:PARTS|FORCE", help_behavior_hint="")]
+    learn: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LINK:PARTS|FORCE", help_behavior_hint="")] = ()
     """What to estimate (repeatable): LINK:PARTS with parts out of mass, com (centre of mass) and inertia, or
     viscous-joint-friction, coulomb-joint-friction, armature: of all joints, or of FORCE:JOINT,JOINT; from the URDF's
-    coefficients, or from FORCE=START."""
-    model: Literal["structured", "analytical"] = "structured"
-    """structured: Gaussian processes carry the forces that nobody knows. analytical: there are none but noise."""
-    prior_strength: Annotated[float, arg(metavar="W", help_behavior_hint="(default: 0, no prior)")] = 0.0
+    coefficients, or from FORCE=START. The next two models estimate all of it instead."""
+    model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
+    """structured: Gaussian processes carry the forces that nobody knows. analytical: there are none but noise.
+    least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
+    """
+    friction: Annotated[str, arg(metavar="NAME,NAME")] = "viscous,coulomb"
+    """With the last two models: out of viscous, coulomb or stribeck, load, offset; none for no friction."""
+    rotors: Literal["armature", "rotor", "none"] = "armature"
+    """With the last two models: armature: one rotor inertia per joint. rotor: those of the system's coupled rotors."""
+    likelihood: Literal["torque", "acceleration"] = "torque"
+    """With the last two models: torque: residuals of inverse dynamics, where torque sensors are good. acceleration: of
+    forward dynamics, where arms are light."""
+    robust: Annotated[bool, arg(help_behavior_hint="")] = False
+    """With the last two models: count outliers by their absolute value."""
+    test: Annotated[Path | None, arg(metavar="TEST.h5", constructor=Path, help_behavior_hint="(default: none)")] = None
+    """With the last two models: score on this recording, too."""
+    prior_strength: Annotated[
+        float | None, arg(metavar="W", constructor=float, help_behavior_hint="(default: 0; 1 for the last two models)")
+    ] = None
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
     points: Annotated[int, arg(metavar="N")] = 200
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
@@ -74,6 +93,8 @@ class Identify(FitOptions):
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         if self.model == "analytical" and self.mean == "zero":
             raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
+        if self.model in INERTIAS:
+            return identify_by_regression(self, terminal, KIND)
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
         learn = parse_learn(self.learn)
         from forcegp.data import Dataset
@@ -99,7 +120,7 @@ class Identify(FitOptions):
             hyperprior=self.hyperprior,
             options=OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
             learn=learn,
-            prior_strength=self.prior_strength,
+            prior_strength=self.prior_strength or 0.0,
             learning_points=self.learning_points,
         )
         assert posterior.identification is not None

@@ -1,0 +1,36 @@
+"""How well a system explains recorded motions, in joint forces and in accelerations."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.data import Dataset
+from forcegp.mechanics import MechanicalSystem
+
+
+def motion_residuals(
+    system: MechanicalSystem, dataset: Dataset
+) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
+    """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
+
+    Under contacts the force residual holds the contact forces as well.
+    """
+    q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=system.robot.device) for x in ("q", "v", "u", "a"))
+    dynamics = system.dynamics(q, v, u)
+    force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]
+    return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
+
+
+def residual_scores(
+    force: Float[np.ndarray, "rows nv"], acceleration: Float[np.ndarray, "rows nv"], dataset: Dataset
+) -> dict[str, list[float]]:
+    """Per joint: rms of both residuals, and that of the acceleration over its standard deviation (nRMSE)."""
+    rms = np.sqrt((acceleration**2).mean(0))
+    spread = dataset.a.std(0)
+    return {
+        "force_rms": np.sqrt((force**2).mean(0)).tolist(),
+        "acceleration_rms": rms.tolist(),
+        "acceleration_nrmse": np.divide(rms, spread, out=np.full_like(rms, np.nan), where=spread > 0.0).tolist(),
+    }

@@ -1,0 +1,128 @@
+"""`forcegp identify --model least-squares|consistent`: regression instead of Gaussian processes."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+from forcegp.cli.robot_choice import SYSTEM_FILE
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
+from forcegp.errors import InvalidInput, NonPhysicalInertia
+
+if TYPE_CHECKING:
+    from forcegp.analytical import AnalyticalIdentification
+    from forcegp.cli.identify import Identify
+    from forcegp.mechanics import MechanicalSystem
+
+INERTIAS = {"least-squares": "free", "consistent": "consistent"}
+"""Names of models on the command line, and what `identify_analytical` calls their inertias."""
+
+
+def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> Mapping[str, Any]:
+    """Identify, write the folder, and show how far the residuals fell."""
+    _refuse_what_does_nothing(command)
+    friction = tuple(word for word in command.friction.split(",") if word and word != "none")
+    require_free_folder(command.out, kind=kind, overwrite=command.overwrite)
+    from forcegp.analytical import identify_analytical, motion_residuals, residual_scores
+    from forcegp.analytical.least_squares import ROUNDS
+    from forcegp.data import Dataset
+
+    begin = time.process_time()
+    dataset = Dataset.load(command.data)
+    test = None if command.test is None else Dataset.load(command.test)
+    system = command._system(dataset)
+    with terminal.progress("identifying", may_end_early=True) as report:
+        found = identify_analytical(
+            system,
+            dataset,
+            friction=friction,
+            rotors=None if command.rotors == "none" else cast(Any, command.rotors),
+            inertias=cast(Any, INERTIAS[command.model]),
+            likelihood=command.likelihood,
+            prior_strength=1.0 if command.prior_strength is None else command.prior_strength,
+            robust=command.robust,
+            progress=lambda done, rms: report(min(done, ROUNDS), ROUNDS, f"rms of the residual {rms:.3g}"),
+        )
+    content = {"model": command.model, **found.to_dict(), "cpu_seconds": time.process_time() - begin}
+    for name, rows in (("training", dataset), ("test", test)):
+        if rows is not None:
+            before = residual_scores(*motion_residuals(system, rows), rows)
+            content[name] = {"before": before, "after": found.scores(rows)}
+    try:
+        identified, why_not = found.system, None
+    except NonPhysicalInertia as error:
+        identified, why_not = None, str(error)
+    content["robot"] = "no" if identified is None else "yes"
+    with folder_written_whole(command.out) as folder:
+        folder.mkdir()
+        (folder / "identification.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        if identified is not None:
+            (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
+            (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))
+        write_config(folder, kind, command._given())
+    if why_not is not None:
+        terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
+    terminal.say(*_report(command, found, content, identified))
+    return {"run": str(command.out), "data": str(command.data), **content}
+
+
+def _refuse_what_does_nothing(command: Identify) -> None:
+    """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
+    given = {"learn": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
+    changed = [name for name, default in given.items() if getattr(command, name) != default]
+    if changed:
+        option = changed[0].replace("_", "-")
+        raise InvalidInput(
+            f"--{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
+            "rows; leave it out, or use --model structured."
+        )
+
+
+def _report(
+    command: Identify, found: AnalyticalIdentification, content: Mapping[str, Any], identified: MechanicalSystem | None
+) -> list[Any]:
+    from rich.text import Text
+
+    from forcegp.cli.tables import columns
+
+    joints = found.given.robot.joint_names
+    tables: list[Any] = []
+    for name in ("training", "test"):
+        if name not in content:
+            continue
+        before, after = content[name]["before"], content[name]["after"]
+        rows = [
+            [
+                joint,
+                *(f"{scores['force_rms'][k]:.4g}" for scores in (before, after)),
+                *(f"{scores['acceleration_nrmse'][k]:.3g}" for scores in (before, after)),
+            ]
+            for k, joint in enumerate(joints)
+        ]
+        header = ["joint", "force rms\nbefore [Nm]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
+        tables.append(columns(f"{command.out}: residuals of the {name} data", header, rows))
+    errors, values, units = found.standard_errors, found.values, found.units
+    fields = list(dict.fromkeys(name.partition(".")[0] for name in found.terms.names))
+    if fields:
+        rows = [
+            [joint, *(f"{values[f'{field}.{joint}']:.3g} ± {errors[f'{field}.{joint}']:.1g}" for field in fields)]
+            for joint in joints
+        ]
+        header = ["joint", *(f"{field.replace('_', ' ')}\n[{units[f'{field}.{joints[0]}']}]" for field in fields)]
+        tables.append(columns("friction and rotors, ± standard error", header, rows))
+    base = found.base
+    told = (
+        f"{base.rank} base parameters, condition number {base.condition:.3g}; "
+        f"{content['rows']} rows, {content['cpu_seconds']:.1f} s CPU"
+        f"{'' if content['converged'] else ', not converged'}."
+    )
+    weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
+    lines = [told, f"Directions that the prior decides, not the data: {weak or 'none'}."]
+    if found.thickened:
+        lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(found.thickened)}.")
+    if identified is not None:
+        lines.append(f"Wrote {command.out / 'identified.urdf'}. Next: forcegp fit LOG.h5 --identified {command.out}")
+    return [*tables, *(Text(line) for line in lines)]

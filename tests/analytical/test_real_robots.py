@@ -1,0 +1,46 @@
+"""Published and required numbers on recordings of real robots (see tests/analytical/realdata.py)."""
+
+import numpy as np
+import pytest
+from tests.analytical.realdata import dfki, dfki_system, multiarm, multiarm_system, panda, panda_system
+
+from forcegp.analytical import identify_analytical, motion_residuals
+from forcegp.mechanics import ViscousJointFriction
+
+
+def test_published_numbers_of_a_pendulum_predict_its_motion(shared):
+    """nRMSE .0085 and .0094 of the absolute angles' accelerations, from URDF and friction objects alone."""
+    folder = shared("realdata")
+    system = multiarm_system(ViscousJointFriction([2.37142783e-4, 1.00000019e-5]))
+    data = multiarm(folder, system)
+    _, residual = motion_residuals(system, data)
+    absolute = [x.cumsum(axis=1) for x in (residual, data.a)]
+    nrmse = np.sqrt((absolute[0] ** 2).mean(0)) / absolute[1].std(0)
+    np.testing.assert_allclose(nrmse, [0.0085, 0.0094], rtol=0.03)
+
+
+def test_eleven_parameters_of_a_driven_pendulum_from_accelerations(shared):
+    """As good on other runs as analytical parameters that were fitted by hand: nRMSE .156 and .111."""
+    folder = shared("realdata")
+    system = dfki_system(folder)
+    train = dfki(folder, system, 143524, 143601, 143704, 144115)
+    test = dfki(folder, system, 143339, 143747)
+    found = identify_analytical(system, train, rotors="rotor", likelihood="acceleration", rows=2000)
+    _, residual = motion_residuals(found.system, test)
+    nrmse = np.sqrt((residual**2).mean(0)) / test.a.std(0)
+    assert (nrmse < [0.159, 0.113]).all()
+
+
+@pytest.mark.parametrize("inertias", ["free", "consistent"])
+def test_least_squares_of_a_manipulator_on_held_out_blocks(shared, inertias):
+    """Held-out torque residuals of base parameters and friction [Nm], from the manufacturer's URDF."""
+    folder = shared("realdata")
+    system = panda_system(folder)
+    train, test = panda(folder, system)
+    found = identify_analytical(system, train, friction=("viscous", "coulomb", "offset"), inertias=inertias)
+    assert found.base.rank == 43
+    rms = np.array(found.scores(test)["force_rms"])
+    assert (rms < [0.16, 0.25, 0.22, 0.22, 0.09, 0.06, 0.06]).all()
+    if inertias == "consistent":  # a robot that can be written down predicts the same
+        force, _ = motion_residuals(found.system, test)
+        np.testing.assert_allclose(np.sqrt((force**2).mean(0)), rms, rtol=1e-9)
