@@ -18,8 +18,8 @@ ROWS_AT_A_TIME = 16384
 SPLINE_HALO = 64
 """Rows on either side that a piece of a spline is fitted with: the rest moves it by less than 0.27^64 of itself."""
 
-DIFFERENCE_HALO = 2
-"""Rows on either side that two central differences reach."""
+DIFFERENCE_HALO = 3
+"""Rows on either side that two differences reach: 2 where both are central, 3 where one is one-sided at an end."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class EpisodeRows:
 
         def rows(self, start: int, end: int) -> np.ndarray:
             numbers = self.numbers[start:end]
-            table = self.spool.read(self.first + numbers[0], self.first + numbers[-1] + 1)
+            table = self.spool.read(self.first + int(numbers[0]), self.first + int(numbers[-1]) + 1)
             return table if len(table) == len(numbers) else table[numbers - numbers[0]]
 
         def interpolated(self, time: np.ndarray) -> np.ndarray:

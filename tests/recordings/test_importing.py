@@ -1,0 +1,303 @@
+"""From files to a Dataset: the same in every format, in pieces as at once, and what stamps become."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from tests.recordings.log_files import (
+    JOINTS,
+    STEP,
+    motion,
+    table,
+    write_bag1,
+    write_bag2,
+    write_hdf5,
+    write_lerobot,
+    write_matlab5,
+    write_matlab73,
+    write_parquet,
+    write_text,
+)
+
+import forcegp.recordings.reading as reading
+from forcegp.data import Dataset, differentiate
+from forcegp.errors import DatasetError, DataWarning, InvalidInput
+from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
+from forcegp.recordings.episode_rows import EpisodeRows
+from forcegp.recordings.spool import Spool
+from forcegp.recordings.time_stamps import Stretch
+
+NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{joints}",), joints=JOINTS)
+ARRAYS = ColumnMapping(time="time", q=("q",), v=("v",), u=("u",), joints=JOINTS)
+TOPIC = ColumnMapping(
+    q=("/joint_states:position",), v=("/joint_states:velocity",), u=("/joint_states:effort",), joints=JOINTS
+)
+SIGNALS = ("q", "v", "u", "a", "time", "episode")
+
+
+def in_log(mapping):
+    return dataclasses.replace(mapping, time="log/time", **{name: (f"log/{name}",) for name in "qvu"})
+
+
+def archive(path, data):
+    np.savez_compressed(path, **data)
+    return path
+
+
+FORMATS = {
+    "csv": ("log.csv", lambda p, d: write_text(p, table(d)), NAMES),
+    "csv.gz": ("log.csv.gz", lambda p, d: write_text(p, table(d)), NAMES),
+    "tsv": ("log.tsv", lambda p, d: write_text(p, table(d), delimiter="\t"), NAMES),
+    "parquet": ("log.parquet", lambda p, d: write_parquet(p, d), ARRAYS),
+    "npz": ("log.npz", archive, ARRAYS),
+    "mat 5": ("log.mat", write_matlab5, in_log(ARRAYS)),
+    "mat 7.3": ("log.mat", write_matlab73, ARRAYS),
+    "hdf5": ("log.h5", write_hdf5, in_log(ARRAYS)),
+    "bag": ("log.bag", write_bag1, TOPIC),
+    "mcap": ("log", write_bag2, TOPIC),
+    "db3": ("log", lambda p, d: write_bag2(p, d, "sqlite3"), TOPIC),
+    "lerobot 3.0": (
+        "log",
+        lambda p, d: write_lerobot(p, d, episodes=1),
+        ColumnMapping(
+            q=("observation.state.q_{joints}",),
+            v=("observation.state.v_{joints}",),
+            u=("observation.effort",),
+            joints=JOINTS,
+        ),
+    ),
+}
+
+
+def imported(path, out, mapping, **options) -> Dataset:
+    import_recordings([path], out, mapping, options=ImportOptions(**options))
+    return Dataset.load(out)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_same_motion_is_the_same_dataset_in_every_format(tmp_path, name):
+    if name in ("bag", "mcap", "db3"):
+        pytest.importorskip("rosbags")
+    file, write, mapping = FORMATS[name]
+    data = motion()
+    found = imported(write(tmp_path / file, data), tmp_path / "out.h5", mapping)
+    for signal in "qvu":
+        np.testing.assert_array_equal(getattr(found, signal), data[signal])
+    np.testing.assert_array_equal(found.time, data["time"])
+    np.testing.assert_array_equal(found.a, differentiate(data["v"], data["time"]))
+    assert found.joint_names == JOINTS
+    assert found.episodes == (0,)
+    assert not list(tmp_path.glob(".*"))
+
+
+def uneven(rows=1000, seed=3):
+    """Motion at times that jitter by a fifth of a step."""
+    data = motion(rows)
+    time = data["time"] + STEP * np.random.default_rng(seed).uniform(-0.2, 0.2, rows)
+    smooth = {name: CubicSpline(data["time"], data[name], axis=0)(time) for name in "qvu"}
+    return {"time": time, **smooth}
+
+
+def test_reading_in_small_pieces_changes_nothing(tmp_path, monkeypatch):
+    path = write_text(tmp_path / "log.csv", table(uneven()))
+    whole = imported(path, tmp_path / "whole.h5", NAMES)
+    monkeypatch.setattr(reading, "ROWS_AT_A_TIME", 37)
+    pieces = imported(path, tmp_path / "pieces.h5", NAMES)
+    for name in SIGNALS:
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
+
+
+@pytest.mark.parametrize("logged", [("q", "u"), ("q", "v", "u")])
+@pytest.mark.parametrize("rows", [50, 333, 499, 997, 998])
+def test_pieces_of_an_episode_are_those_of_the_whole(tmp_path, rows, logged):
+    data = uneven()
+    signals = np.hstack([data[name] for name in logged])
+    recording = reading.RawRecording(
+        "log", None, 0, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), np.zeros(4), np.zeros(4), ()
+    )
+    episode = EpisodeRows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), logged, 2, STEP)
+    with Spool(tmp_path, signals.shape[1]) as spool:
+        spool.append(signals[:400])
+        spool.append(signals[400:])
+        found = list(episode.pieces(spool, rows))
+    joined = {name: np.concatenate([piece[name] for piece in found]) for name in found[0]}
+    # the oracle is another implementation of splines, fitted to everything at once
+    time = STEP * np.arange(len(joined["time"]))
+    expected = dict(zip(logged, np.split(CubicSpline(recording.time, signals)(time), len(logged), axis=1), strict=True))
+    expected.setdefault("v", differentiate(expected["q"], time))
+    expected["a"] = differentiate(expected["v"], time)
+    for name, values in expected.items():
+        rounding = 1e-13 if name in logged else 1e-13 / STEP**2
+        np.testing.assert_allclose(joined[name], values, rtol=0, atol=rounding * np.abs(values).max())
+    assert episode.count == len(time)
+
+
+def test_resampling_brings_uneven_rows_near_the_motion(tmp_path):
+    data = motion(1000)
+    found = imported(write_text(tmp_path / "log.csv", table(uneven())), tmp_path / "out.h5", NAMES)
+    inner = slice(5, len(found) - 5)
+    offset = uneven()["time"][0]
+    exact = CubicSpline(data["time"], data["q"])(found.time + offset)
+    assert np.abs(found.q - exact)[inner].max() < 1e-7
+    np.testing.assert_allclose(np.diff(found.time), found.time[1], rtol=1e-9)
+    assert found.time[1] == pytest.approx(STEP, rel=0.01)
+
+
+def test_every_stamp_is_kept_if_told_so(tmp_path):
+    data = uneven()
+    found = imported(write_text(tmp_path / "log.csv", table(data)), tmp_path / "out.h5", NAMES, resample="no")
+    np.testing.assert_array_equal(found.time, data["time"] - data["time"][0])
+    np.testing.assert_array_equal(found.q, data["q"])
+    np.testing.assert_array_equal(found.a, differentiate(data["v"], found.time))
+
+
+def test_a_rate_that_is_asked_for_is_the_rate(tmp_path):
+    path = write_text(tmp_path / "log.csv", table(motion()))
+    found = imported(path, tmp_path / "out.h5", NAMES, rate=1000.0)
+    np.testing.assert_allclose(np.diff(found.time), 1e-3, rtol=1e-9)
+    with pytest.warns(DataWarning, match="below the 512 Hz of the log"):
+        imported(path, tmp_path / "slow.h5", NAMES, rate=100.0)
+
+
+def test_gaps_split_and_repeated_stamps_are_dropped(tmp_path):
+    data = motion()
+    data["time"][100:] += 1.0
+    data["time"][11] = data["time"][10]
+    data["time"][197:] += 1.0  # three rows are no episode
+    found = imported(write_text(tmp_path / "log.csv", table(data)), tmp_path / "out.h5", NAMES, resample="no")
+    done = found.metadata["import"]["recordings"][0]
+    assert (done["repeated_stamps_dropped"], done["rows_in_stretches_too_short"]) == (1, 3)
+    assert len(done["gaps"]) == 2
+    kept = np.r_[0:11, 12:197]
+    np.testing.assert_array_equal(found.q, data["q"][kept])
+    np.testing.assert_array_equal(found.episode, np.where(kept < 100, 0, 1))
+    joined = imported(tmp_path / "log.csv", tmp_path / "joined.h5", NAMES, resample="no", gap=2.0)
+    assert joined.episodes == (0,)
+
+
+def test_a_single_gap_of_ten_steps_is_bridged_and_one_more_is_not(tmp_path):
+    for missing, episodes in ((9, 1), (10, 2)):
+        rows = np.r_[0:100, 100 + missing : 200]
+        data = {name: values[rows] for name, values in motion().items()}
+        found = imported(write_text(tmp_path / "log.csv", table(data)), tmp_path / f"{missing}.h5", NAMES)
+        assert len(found.episodes) == episodes
+
+
+def test_start_and_end_count_from_the_first_row_of_each_episode(tmp_path):
+    data = motion()
+    columns = table(data) | {"run": np.repeat([4.0, 7.0], 100)}
+    mapping = dataclasses.replace(NAMES, episode="run")
+    found = imported(
+        write_text(tmp_path / "log.csv", columns), tmp_path / "out.h5", mapping, start=10 * STEP, end=20 * STEP
+    )
+    kept = np.r_[10:21, 110:121]
+    np.testing.assert_array_equal(found.q, data["q"][kept])
+    assert [episode["number"] for episode in found.metadata["import"]["episodes"]] == [4, 7]
+
+
+def test_wrapped_angles_are_continued_if_told_so(tmp_path):
+    data = motion()
+    data["q"] = 9.0 * data["time"][:, None] / data["time"][-1] + np.array([0.0, 1.0])
+    wrapped = {**data, "q": (data["q"] + np.pi) % (2 * np.pi) - np.pi}
+    path = write_text(tmp_path / "log.csv", table(wrapped))
+    with pytest.raises(DatasetError, match="Add --unwrap"):
+        imported(path, tmp_path / "out.h5", NAMES)
+    found = imported(path, tmp_path / "out.h5", NAMES, unwrap=True)
+    np.testing.assert_allclose(found.q, data["q"], atol=1e-13)
+
+
+def test_coupled_angles_units_signs_and_constants(tmp_path):
+    data = motion()
+    columns = {
+        "t": 1e3 * data["time"],
+        "upper": np.rad2deg(data["q"][:, 0]),
+        "lower": np.rad2deg(data["q"].sum(axis=1)),
+    }
+    mapping = ColumnMapping(
+        time="t",
+        q=("upper", "lower - upper"),
+        u=("0",),
+        joints=JOINTS,
+        unit={"time": ("ms",), "q": ("deg",)},
+        sign={"q": (1.0, -1.0)},
+        offset={"q": (0.0, 0.5)},
+    )
+    found = imported(write_text(tmp_path / "log.csv", columns), tmp_path / "out.h5", mapping)
+    np.testing.assert_allclose(found.q[:, 0], data["q"][:, 0], atol=1e-14)
+    np.testing.assert_allclose(found.q[:, 1], 0.5 - data["q"][:, 1], atol=1e-14)
+    np.testing.assert_array_equal(found.u, 0.0)
+    np.testing.assert_allclose(found.time, data["time"], atol=1e-15)
+    np.testing.assert_array_equal(found.v, differentiate(found.q, found.time))
+
+
+def test_joints_that_slide_are_in_metres(tmp_path):
+    data = motion()
+    mapping = dataclasses.replace(NAMES, unit={"q": ("rad", "mm"), "v": ("rad/s", "mm/s"), "u": ("Nm", "N")})
+    found = imported(write_text(tmp_path / "log.csv", table(data)), tmp_path / "out.h5", mapping)
+    assert found.units["q"] == ("rad", "m")
+    np.testing.assert_array_equal(found.q[:, 1], data["q"][:, 1] / 1000)
+    with pytest.raises(InvalidInput, match=r"unit of v of joint 'elbow' is rad/s, but the joint slides"):
+        imported(
+            tmp_path / "log.csv",
+            tmp_path / "x.h5",
+            dataclasses.replace(mapping, unit={"q": ("rad", "mm")} | {"v": ("rad/s",)}),
+        )
+
+
+def test_files_side_by_side_are_one_recording(tmp_path):
+    data = motion()
+    for name, values in data.items():
+        text = "\n".join(repr(float(value)) for value in values.ravel()) + "\n"
+        (tmp_path / f"run_{name}.txt").write_text(text)
+    mapping = ColumnMapping(
+        time="run_time:c1",
+        q=("run_q:c{1..2}",),
+        v=("run_v",),
+        u=("run_u",),
+        joints=JOINTS,
+        headerless=(1, 2, 2, 2),
+        side_by_side=True,
+    )
+    paths = [tmp_path / f"run_{name}.txt" for name in data]
+    import_recordings(paths, tmp_path / "out.h5", mapping)
+    found = Dataset.load(tmp_path / "out.h5")
+    for signal in "qvu":
+        np.testing.assert_array_equal(getattr(found, signal), data[signal])
+    assert len(found.metadata["import"]["files"]) == 4
+    (tmp_path / "run_u.txt").write_text("1.0\n" * 20)
+    with pytest.raises(Exception, match=r"equally many rows; these have: run_time.txt 200, .*run_u.txt 10"):
+        import_recordings(paths, tmp_path / "x.h5", mapping)
+
+
+def test_arrays_and_files_are_episodes(tmp_path):
+    data = motion()
+    both = np.hstack([data["q"], data["v"]])
+    np.savez(tmp_path / "log.npz", piece2=both[:100], piece10=both[100:], dt=STEP)
+    mapping = ColumnMapping(step=STEP, q=("[{0..1}]",), v=("[2]", "[3]"), u=("0",), joints=JOINTS, episodes="piece*")
+    found = imported(tmp_path / "log.npz", tmp_path / "out.h5", mapping)
+    np.testing.assert_array_equal(found.q, data["q"])
+    np.testing.assert_array_equal(found.episode, np.repeat([0, 1], 100))
+    paths = [write_text(tmp_path / f"{name}.csv", table(data)) for name in ("one", "two")]
+    import_recordings(paths, tmp_path / "two.h5", NAMES)
+    assert Dataset.load(tmp_path / "two.h5").episodes == (0, 1)
+
+
+def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
+    data = motion()
+    stamps = 1_700_000_000_123_456_789 + np.round(data["time"] * 1e9).astype(np.int64)
+    lines = ["stamp,q,u", *(f"{stamp},{q!r},0" for stamp, q in zip(stamps, data["q"][:, 0].tolist(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    mapping = ColumnMapping(time="stamp", q=("q",), u=("u",), joints=("a",), unit={"time": ("ns",)})
+    found = imported(tmp_path / "log.csv", tmp_path / "out.h5", mapping)
+    np.testing.assert_array_equal(found.time, data["time"])
+
+
+def test_the_log_is_not_touched_and_its_digest_is_kept(tmp_path):
+    import hashlib
+
+    path = write_text(tmp_path / "log.csv", table(motion()))
+    before = path.read_bytes()
+    found = imported(path, tmp_path / "out.h5", NAMES)
+    assert path.read_bytes() == before
+    assert found.metadata["import"]["files"][0]["sha256"] == hashlib.sha256(before).hexdigest()
