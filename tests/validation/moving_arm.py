@@ -1,6 +1,13 @@
-"""A small arm that moves through time: heavier than its URDF says, and with friction that nobody told the model."""
+"""A small arm that moves through time: heavier than its URDF says, and with friction that nobody told the model.
+
+`python -m tests.validation.moving_arm FOLDER` writes what docs/validation.md shows: arm.urdf, and 20 s of an arm with
+Stribeck friction as log.h5.
+"""
 
 from __future__ import annotations
+
+import sys
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,6 +20,7 @@ from forcegp.mechanics import (
     CoulombJointFriction,
     MechanicalSystem,
     RigidBodyBias,
+    StribeckJointFriction,
     ViscousJointFriction,
 )
 from forcegp.robots import Robot
@@ -26,16 +34,17 @@ def given_system() -> MechanicalSystem:
     return MechanicalSystem(Robot.from_urdf_text(URDF))
 
 
-def true_system() -> MechanicalSystem:
-    """What really moves: other masses, dry and viscous friction."""
+def true_system(stribeck: bool = False) -> MechanicalSystem:
+    """What really moves: other masses, viscous and dry friction; with `stribeck` more of it near rest."""
     heavier = URDF.replace('mass value="1.2"', 'mass value="1.5"').replace('mass value="0.6"', 'mass value="0.8"')
-    friction = (ViscousJointFriction(0.3), CoulombJointFriction(0.5, 0.1))
+    dry = StribeckJointFriction(0.4, 1.0, 0.3, 0.03) if stribeck else CoulombJointFriction(0.5, 0.1)
+    friction = (ViscousJointFriction(0.3), dry)
     return MechanicalSystem(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodyBias(), *friction))
 
 
-def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0) -> Dataset:
+def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck: bool = False) -> Dataset:
     """Episodes of a controlled motion at 100 Hz; u[k] acts from row k to row k + 1, a has noise of known level."""
-    system, generator = true_system(), np.random.default_rng(seed)
+    system, generator = true_system(stribeck), np.random.default_rng(seed)
     rows = round(seconds / STEP)
     time = STEP * np.arange(rows)
     shape = (3, 1, episodes, 3)  # sines, times, episodes, joints
@@ -69,3 +78,10 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0) -> Datase
         system=given,
         noise_std=np.full(3, NOISE),
     )
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "arm.urdf").write_text(URDF, encoding="utf-8")
+    moving_arm(5.0, 4, stribeck=True).save(folder / "log.h5")

@@ -179,6 +179,8 @@ def test_wrong_arguments_are_refused_before_anything_is_written(data, tmp_path, 
         ({"starts": 0}, "number of starts"),
         ({"restarts": 0}, "restarts is 0"),
         ({"integrator": "euler"}, "euler"),
+        ({"measured_torque": True}, "give force=SIGMA"),
+        ({"force_noise": -1.0}, "force"),
         ({"identification": "guessing"}, "no identification is called 'guessing'"),
     ],
 )

@@ -74,6 +74,8 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
     ] = None
     """Models with physics learn a noise of the joint forces as well, beginning at this standard deviation in Nm."""
+    measured_torque: bool = False
+    """u was measured by sensors as noisy as that, and models with physics take it so when they predict."""
     jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: 1)")] = None
     """Pieces of work at once, each on one core."""
     overwrite: bool = False
@@ -133,6 +135,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             restarts=self.restarts,
             iterations=self.iterations,
             force_noise=self.force_noise,
+            measured_torque=self.measured_torque,
         )
 
     def _warn_of_memory(self, terminal: Terminal, cutoff: Any, order: int) -> None:

@@ -18,7 +18,7 @@ from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Posterior, StructuredGP
+from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, named_prior
 from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, learned_noise
 
@@ -44,6 +44,7 @@ class Training:
     seed: of the search and of random weights.
     restarts, iterations: of the search for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins [Nm or N]; None is none.
+    measured_torque: whether predictions know that their u is as noisy (`Noise`).
     """
 
     rows: Dataset
@@ -53,6 +54,12 @@ class Training:
     restarts: int | None = None
     iterations: int | None = None
     force_noise: float | None = None
+    measured_torque: bool = False
+
+    @property
+    def noise(self) -> Noise:
+        """What models with physics learn."""
+        return learned_noise(self.rows, self.force_noise, self.measured_torque)
 
     def system(self, mean: str) -> MechanicalSystem:
         """The system of this name: given, or an identification. Raises FitError where that has failed."""
@@ -99,16 +106,14 @@ class Candidate:
 
 
 def _fit_system(mean: str, training: Training) -> Posterior:
-    model = StructuredGP(
-        training.system(mean), NoForces(), "analytical", learned_noise(training.rows, training.force_noise)
-    )
+    model = StructuredGP(training.system(mean), NoForces(), "analytical", training.noise)
     return model.fit(training.rows, seed=training.seed, restarts=1)  # its starts would all be the same
 
 
 def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
     system = training.system(mean)
-    noise = learned_noise(training.rows, training.force_noise)
-    return StructuredGP(system, named_prior(prior, system), "analytical", noise).fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
+    model = StructuredGP(system, named_prior(prior, system), "analytical", training.noise)
+    return model.fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
 
 
 def _fit_independent(training: Training) -> Posterior:

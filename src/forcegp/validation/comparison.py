@@ -22,7 +22,7 @@ from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.validation.candidates import Candidate, Training
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions, motion_scores
-from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, Identification
+from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, Identification, learned_noise
 from forcegp.validation.kept_cells import KeptCells
 from forcegp.validation.scores import acceleration_scores, mass_matrices
 from forcegp.validation.splits import Split
@@ -46,6 +46,7 @@ class Comparison:
     identification: what `@identified` and the mass matrix of force errors take, a key of `IDENTIFICATIONS`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
+    measured_torque: whether predictions know that their u is as noisy (`Noise`); needs `force_noise`.
 
     Raises InvalidInput for parts that do not fit, and DatasetError for splits whose sides overlap.
     """
@@ -62,6 +63,7 @@ class Comparison:
     restarts: int | None = None
     iterations: int | None = None
     force_noise: float | None = None
+    measured_torque: bool = False
 
     def __post_init__(self) -> None:
         names = tuple(self.system.robot.joint_names)
@@ -74,6 +76,7 @@ class Comparison:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
+        learned_noise(self.rows, self.force_noise, self.measured_torque)
         integrator_named(self.integrator, self.system)
         if self.identification not in IDENTIFICATIONS:
             given, allowed = self.identification, ", ".join(IDENTIFICATIONS)
@@ -91,7 +94,16 @@ class Comparison:
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the numbers, as plain JSON values."""
-        options = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise")
+        options = (
+            "points",
+            "starts",
+            "integrator",
+            "identification",
+            "restarts",
+            "iterations",
+            "force_noise",
+            "measured_torque",
+        )
         return {
             "forcegp": __version__,
             "rows_sha256": fingerprint(self.rows),
@@ -207,6 +219,7 @@ def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any
         comparison.restarts,
         comparison.iterations,
         comparison.force_noise,
+        comparison.measured_torque,
     )
     start = time.process_time()
     posterior = cell.work.fit(training)

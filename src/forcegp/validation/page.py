@@ -58,6 +58,12 @@ def _done(document: Mapping[str, Any]) -> list[str]:
         "each joint's acceleration among the training rows; networks estimate their own. Intervals and densities are "
         "those of measurements."
     )
+    force_noise = document["configuration"]["force_noise"]
+    if force_noise is not None:
+        taken = ", and take the u of predictions to be as noisy" if document["configuration"]["measured_torque"] else ""
+        lines.append(
+            f"* Models with physics learn a noise of the joint forces as well, from {force_noise:g} on{taken}."
+        )
     whose = "; ".join(document["mass_matrix"]) or "none, since no model finished"
     lines.append(
         f"* Force-space error: M (predicted − measured acceleration) with one M for all models: of {whose}. Where M is "
