@@ -8,6 +8,7 @@ from tests.recordings.broken_logs import BROKEN, urdf
 from tests.recordings.log_files import JOINTS, motion, table, write_bag2, write_text
 
 from forcegp import Dataset
+from forcegp.data import Preparation
 
 FLAGS = ("--time", "time", "--q", "q_{joints}", "--v", "v_{joints}", "--u", "u_{joints}", "--joints", ",".join(JOINTS))
 
@@ -85,6 +86,23 @@ def test_what_was_repaired_is_said(forcegp, tmp_path):
     assert "1 gaps of up to 0.502 s begin new episodes" in done.stderr
     assert "resampled to 512 Hz: steps deviate by up to" in done.stderr
     assert "in 2 episodes" in done.stdout
+
+
+def test_preparation_while_importing_is_that_of_the_raw_dataset(forcegp, tmp_path):
+    write_text(tmp_path / "log.csv", table(motion(1000)))
+    flags = ("--cutoff", 30, "--delay", 0.01, "--every", 2, "--trim", 0.1)
+    for name, more in (("raw", ()), ("prepared", flags)):
+        done = forcegp("import", "log.csv", *FLAGS, *more, "--out", f"{name}.h5", folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert "prepared: cutoff 30.0" in done.stderr
+    raw, found = (Dataset.load(tmp_path / f"{name}.h5") for name in ("raw", "prepared"))
+    expected = Preparation(cutoff=30.0, delay=0.01, every=2, trim=0.1).apply(raw)
+    for name in ("q", "v", "u", "a", "time", "episode"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected.dataset, name))
+    assert found.metadata["preparation"] == expected.dataset.metadata["preparation"]
+    refused = forcegp("import", "log.csv", *FLAGS, "--cutoff", 300, "--out", "x.h5", folder=tmp_path)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert not (tmp_path / "x.h5").exists()
 
 
 def test_messages_of_another_publisher_are_left_out_and_said(forcegp, tmp_path):

@@ -10,14 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from forcegp.cli.command import Debug, Json
+from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_choice import RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import require_free_file
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from forcegp.data import Preparation
     from forcegp.mechanics import MechanicalSystem
     from forcegp.recordings import ColumnMapping
+
+COPIES = 10
+"""Times the size of its file that a dataset is taken to need while it is prepared: numbers hardly shrink in it."""
 
 Columns = Annotated[str | None, arg(metavar="COLUMNS", constructor=str, help_behavior_hint="(default: by the names)")]
 Text = Annotated[str | None, arg(metavar="TEXT", constructor=str, help_behavior_hint="(default: none)")]
@@ -25,12 +30,13 @@ Seconds = Annotated[float | None, arg(metavar="S", constructor=float, help_behav
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(RobotOptions):
+class Import(PreparationOptions, RobotOptions):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
     Say which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or in
     a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
-    pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered: forcegp prepare does that.
+    pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered unless
+    --cutoff and its sisters say so.
 
     For instance:
       forcegp import run.csv --time t --q pos{1..2} --u tau{1..2} --robot arm.urdf --out log.h5
@@ -52,7 +58,7 @@ class Import(RobotOptions):
     """Write what flags and --mapping said together."""
     time: Columns = None
     """Time stamps."""
-    step: Seconds = None
+    step: Annotated[float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: --time)")] = None
     """Seconds between two rows, for a log without time stamps."""
     q: Columns = None
     """Positions, one per joint."""
@@ -117,6 +123,7 @@ class Import(RobotOptions):
         require_free_file(self.out, overwrite=self.overwrite)
         if self.write_mapping is not None:
             require_free_file(self.write_mapping, overwrite=self.overwrite)
+        from forcegp.data.hdf5 import file_written_whole
         from forcegp.data.whole_files import write_text
         from forcegp.recordings import ImportOptions, import_recordings, mapping_text
 
@@ -131,10 +138,11 @@ class Import(RobotOptions):
             beyond_limits=self.beyond_limits,
             most_rows=self.max_rows,
         )
-        with terminal.progress("importing") as report:
-            done = import_recordings(
-                self.logs, self.out, mapping, system=self._system(), options=options, report=report
-            )
+        system, preparation = self._system(), self._preparation()
+        with file_written_whole(self.out) as temporary, terminal.progress("importing") as report:
+            done = import_recordings(self.logs, temporary, mapping, system=system, options=options, report=report)
+            if not preparation.changes_nothing:
+                done |= _prepared(temporary, preparation, done["rows"])
         if self.write_mapping is not None:
             write_text(self.write_mapping, mapping_text(mapping))
         _tell(terminal, self.out, done)
@@ -191,6 +199,24 @@ class Import(RobotOptions):
         return mapping_of(given)
 
 
+def _prepared(path: Path, preparation: Preparation, rows: int) -> dict[str, Any]:
+    """Prepare the dataset in a file, in its place, and return what to tell of it.
+
+    Raises NotEnoughMemory where the whole of it does not fit into memory, which filters need.
+    """
+    import torch
+
+    from forcegp.data import Dataset
+    from forcegp.inference.memory import require_memory
+
+    required = COPIES * path.stat().st_size
+    remedy = "import without --cutoff, --delay, --every and --trim, or fewer logs at once."
+    require_memory(required, f"preparing {rows} rows", remedy, torch.device("cpu"))
+    prepared = preparation.apply(Dataset.load(path))
+    prepared.dataset.save(path)
+    return {"rows": len(prepared.dataset), "preparation": prepared.report}
+
+
 def _list(paths: set[Path | None]) -> str:
     return ", ".join(sorted(str(path) for path in paths))
 
@@ -214,6 +240,15 @@ def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
         terminal.note(
             f"resampled to {1 / done['resampled_to_step']:.6g} Hz: steps deviate by up to {worst:.0%} from their median"
         )
+    if "preparation" in done:
+        report = done["preparation"]
+        for name in ("cutoff", "delay"):
+            if name in report["why"]:
+                terminal.note(f"{name}: {report['why'][name]}")
+        settings = ", ".join(f"{name} {report[name]}" for name in ("cutoff", "delay", "every", "trim"))
+        terminal.note(f"prepared: {settings}; {report['rows'][0]} rows became {report['rows'][1]}")
     how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
+    if done.get("preparation", {}).get("cutoff") is not None:
+        how = "filtered and differentiated anew"
     seconds = sum(recording["rows"] * recording["median_step"] for recording in done["recordings"])
     terminal.say(f"{out}: {done['rows']} rows in {len(done['episodes'])} episodes ({seconds:.4g} s); {how}")
