@@ -43,7 +43,7 @@ def test_the_minimum_is_that_of_scipy_at_the_same_weights(bounds, robust):
     assert fit.settled
     theirs = least_squares(
         lambda x: (residual(x)[0] / fit.noise).ravel(),
-        np.ones(3),
+        np.clip(TRUTH, *bounds) + 1e-3,
         bounds=bounds,
         loss="soft_l1" if robust else "linear",
         f_scale=BEND if robust else 1.0,

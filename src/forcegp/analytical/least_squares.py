@@ -14,12 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from forcegp.errors import NumericalError
+
 ROUNDS = 12
 """Most rounds of reweighting."""
 MOST_EVALUATIONS = 300
 """Of the residuals in one round."""
 CONTENT = 0.01
 """Two steps in a row that lower the objective by less than so many nats end a round."""
+LONGEST_STEP = 1.0
+"""Most that a coordinate may change at once: a mass by a factor of e^2."""
+LEAST_NOISE = 1e-6
+"""Noise that is this fraction of the residual at the start counts as none: the data are exact."""
 SETTLED = 1e-3
 """Relative change of the noise level that ends them."""
 BEND = 1.5
@@ -79,11 +85,12 @@ def weighted_least_squares(
     x = np.clip(start, low, high)
     r, jacobian = at(x)
     noise, evaluations, settled, converged = _noise(r, robust), 0, False, False
+    floor = np.maximum(LEAST_NOISE * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         x, nfev, converged = _minimized(at, prior, x, bounds, noise, robust)
         evaluations += nfev
         r, jacobian = at(x)
-        before, noise = noise, _noise(r, robust)
+        before, noise = noise, np.maximum(_noise(r, robust), floor)
         if progress is not None:
             progress(round_number, float(np.sqrt((r**2).mean())))
         settled = bool((abs(noise - before) <= SETTLED * before).all())
@@ -118,34 +125,43 @@ def _minimized(
         free = ~held
         curvature = here.curvature[np.ix_(free, free)]
         step = np.zeros_like(here.x)
-        step[free] = -np.linalg.solve(curvature + damping * np.diag(curvature.diagonal()), here.gradient[free])
+        diagonal = np.diag(curvature.diagonal() + 1e-12)
+        step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
+        step *= min(1.0, LONGEST_STEP / max(float(abs(step).max()), 1e-300))
         there = np.clip(here.x + step, low, high)
         moved = there - here.x
-        expected = -(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
+        expected = -float(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
         if abs(expected) <= 1e-3 * CONTENT or idle == 2:
             return here.x, evaluation, True
         trial = _point(at, prior, there, noise, robust)
+        gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
-            here, damping = trial, max(0.2 * damping, 1e-12)
+            here = trial
         elif damping > 1e12:  # rounding hides any descent
             return here.x, evaluation, True
-        else:
-            damping *= 10.0
+        # Marquardt's rule: trust the quadratic model more where it was right, less where it was wrong
+        damping = max(0.2 * damping, 1e-12) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
     return here.x, MOST_EVALUATIONS, False
 
 
 def _point(at: Residual, prior: Prior, x: np.ndarray, noise: np.ndarray, robust: bool) -> _Point:
-    (r, jacobian), (prior_r, prior_jacobian) = at(x), prior(x)
-    white = r / noise
-    if not (np.isfinite(white).all() and np.isfinite(jacobian).all()):
-        return _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
-    weight = _weights(white, robust)
-    cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
-    flat = (jacobian * (np.sqrt(weight) / noise)[..., None]).reshape(-1, len(x))
-    gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
-    curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
-    return _Point(x, float(cost + 0.5 * (prior_r**2).sum()), gradient, curvature)
+    bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
+    with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
+        try:
+            (r, jacobian), (prior_r, prior_jacobian) = at(x), prior(x)
+        except (np.linalg.LinAlgError, NumericalError):  # a mass matrix that rounding made singular
+            return bad
+        white = r / noise
+        weight = _weights(white, robust)
+        cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
+        flat = (jacobian * (np.sqrt(weight) / noise)[..., None]).reshape(-1, len(x))
+        gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
+        curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
+        cost = float(cost + 0.5 * (prior_r**2).sum())
+    if not (np.isfinite(cost) and np.isfinite(curvature).all()):
+        return bad
+    return _Point(x, cost, gradient, curvature)
 
 
 def _weights(white: np.ndarray, robust: bool) -> np.ndarray:
@@ -155,7 +171,7 @@ def _weights(white: np.ndarray, robust: bool) -> np.ndarray:
 
 def _noise(r: np.ndarray, robust: bool) -> np.ndarray:
     scale = MAD * np.median(abs(r), axis=0) if robust else np.sqrt((r**2).mean(axis=0))
-    return np.maximum(scale, 1e-12)
+    return np.maximum(scale, 1e-12)  # data that the start explains exactly
 
 
 def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.ndarray, " rows"]) -> np.ndarray:
