@@ -31,9 +31,7 @@ def test_an_analytical_model_is_bayes_rule():
     posterior, rows = fitted(NoForces())
     prediction = predicted(posterior, rows)
     dynamics = posterior.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u)))
-    a = posterior.training.a
-    S = a.mT @ a / len(a)
-    S = S + torch.diag(1e-3 * S.diagonal() + 1e-12 * S.diagonal().sum())
+    S = torch.diag(posterior.training.a.square().mean(0))
     F = torch.diag(torch.tensor(FORCE, dtype=torch.float64) ** 2)
     covariance = torch.linalg.inv(dynamics.M @ torch.linalg.inv(F) @ dynamics.M + torch.linalg.inv(S))
     mean = (covariance @ dynamics.M @ torch.linalg.inv(F) @ dynamics.Q_K[..., None])[..., 0]
@@ -48,9 +46,7 @@ def test_what_shrinks_is_the_prediction_under_exact_torques():
     here, there = predicted(shrunk, rows), predicted(exact, rows)
     H = shrunk.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u))).H
     torque_noise = (H * torch.tensor(FORCE, dtype=torch.float64) ** 2) @ H.mT
-    a = shrunk.training.a
-    S = a.mT @ a / len(a)
-    S = S + torch.diag(1e-3 * S.diagonal() + 1e-12 * S.diagonal().sum())
+    S = torch.diag(shrunk.training.a.square().mean(0))
     G = S @ torch.linalg.inv(torque_noise + S)
     torch.testing.assert_close(here.mean, (G @ there.mean[..., None])[..., 0], rtol=1e-8, atol=1e-10)
     torch.testing.assert_close(here.covariance, G @ there.covariance @ G.mT + torque_noise @ G.mT, rtol=1e-7, atol=1e-9)

@@ -8,8 +8,10 @@ of the robot say a ~ N(0, S). By Bayes' rule
     a | u, f ~ N(G a_f, H F H^T G^T),      G = S (H F H^T + S)^-1,
 
 linear in f, so that everything stays Gaussian; along constraints, where H = 0, nothing changes: A G = A. (Regression
-with errors in variables; Carroll et al., "Measurement error in nonlinear models", 2006, section 4.2.) S holds the
-second moments of the training accelerations.
+with errors in variables; Carroll et al., "Measurement error in nonlinear models", 2006, section 4.2.) S holds the mean
+squares of the training accelerations on its diagonal. Correlations between joints are those of one motion and not of
+the next: with them, on two held-out fifths of a recording of a Franka Panda, intervals of 95 % covered 76 to 98 % and
+the negative log density was 10.6 nats a row, without them 88 to 100 % and 5.3 (docs/real-robots.md).
 """
 
 from __future__ import annotations
@@ -25,10 +27,9 @@ from forcegp.models.noise import FORCE
 
 
 def second_moments(a: Float[Tensor, "N nv"]) -> Float[Tensor, "nv nv"]:
-    """S of accelerations, with a thousandth of its diagonal added so that it can be divided by."""
-    moments = a.mT @ a / len(a)
-    diagonal = moments.diagonal()
-    return moments + torch.diag_embed(1e-3 * diagonal + 1e-12 * diagonal.sum())
+    """S of accelerations; a joint that never moved counts as moving a millionth as much as the others."""
+    squares = a.square().mean(0)
+    return torch.diag_embed(squares + 1e-12 * squares.sum())
 
 
 def shrunk(
