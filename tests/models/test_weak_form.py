@@ -171,6 +171,9 @@ def test_what_needs_single_rows_is_refused_with_a_remedy():
     for how in ({"engine": "inducing"}, {"learning_points": 5}):
         with pytest.raises(InvalidInput, match=r"windows .* are conditioned on exactly"):
             model.fit(data, observe=HOW, **how)
+    sensor = replace(model, noise=Noise(None, force=0.1, learn=True, measured_torque=True))
+    with pytest.raises(InvalidInput, match=r"windows .* tell that of their mean"):
+        sensor.fit(data, observe=HOW)
     with pytest.raises(InvalidInput, match=r"no observation 'weak' .*did you mean 'weak-form'"):
         model.fit(data, observe="weak")
     with pytest.raises(InvalidInput, match=r"points=99 is not between 2 and the \d+ windows of 0.1 s"):

@@ -51,8 +51,14 @@ def training_windows(
 def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:
     """The noise given; for None, learned from where the sensors put it.
 
-    That of the sensors is the least that windows can have: states at nodes are not exact either.
+    That of the sensors is the least that windows can have: states at nodes are not exact either. Raises InvalidInput
+    for a torque sensor whose noise predictions shall know: what windows tell is the noise of a mean torque.
     """
+    if noise is not None and noise.measured_torque:
+        raise InvalidInput(
+            "Noise(measured_torque=True) needs the noise of single torques, but windows (observe=...) tell that of "
+            "their mean; leave measured_torque out, or fit to accelerations"
+        )
     if noise is not None or windows.noise_level is None:
         return noise
     return Noise(tuple(float(std) for std in windows.noise_level), learn=True)
