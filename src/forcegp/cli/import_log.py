@@ -250,5 +250,5 @@ def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
     how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
     if done.get("preparation", {}).get("cutoff") is not None:
         how = "filtered and differentiated anew"
-    seconds = sum(recording["rows"] * recording["median_step"] for recording in done["recordings"])
+    seconds = sum(recording["seconds"] for recording in done["recordings"])
     terminal.say(f"{out}: {done['rows']} rows in {len(done['episodes'])} episodes ({seconds:.4g} s); {how}")

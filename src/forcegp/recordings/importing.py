@@ -239,6 +239,7 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
+                "seconds": float(recording.time[-1] - recording.time[0]),
                 "median_step": own.step,
                 "largest_deviation_of_a_step": own.worst,
                 "repeated_stamps_dropped": own.repeated,

@@ -1,7 +1,7 @@
 """Linear combinations of columns, `theta2 - theta1` or `0.001*tau + 0.5`: parsed here, never evaluated as code.
 
-    expression = ["+" | "-"] term { ("+" | "-") term }
-    term       = factor { ("*" | "/") factor }          at most one column, and only numbers below "/"
+    expression = ["+"] term { ("+" | "-") term }
+    term       = ["-"] factor { ("*" | "/") factor }    at most one column, and only numbers below "/"
     factor     = number | "pi" | column | `column`
 
 Known columns are recognised letter by letter, the longest first, so most names need no quotes whatever they contain;
@@ -76,9 +76,8 @@ class _Parser:
     def expression(self) -> LinearExpression:
         weights: dict[str, float] = {}
         constant = 0.0
-        sign = -1.0 if self._taken("-") else 1.0
-        if sign > 0:
-            self._taken("+")
+        sign = 1.0
+        self._taken("+")
         while True:
             name, factor = self._term()
             if name is None:
@@ -98,7 +97,9 @@ class _Parser:
         return LinearExpression({name: weight for name, weight in weights.items() if weight != 0.0}, constant)
 
     def _term(self) -> tuple[str | None, float]:
+        sign = -1.0 if self._taken("-") else 1.0
         name, value = self._factor()
+        value *= sign
         while True:
             if self._taken("*"):
                 other, factor = self._factor()
