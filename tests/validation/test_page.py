@@ -1,0 +1,55 @@
+"""docs/validation.md: its commands can be read, its example runs, and its pictures exist."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tests.validation.moving_arm import moving_arm
+
+from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.validate import Validate
+from forcegp.validation import DEFAULT_MODELS
+from forcegp.validation.candidates import candidates
+
+PAGE = Path(__file__).resolve().parent.parent.parent / "docs" / "validation.md"
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return PAGE.read_text(encoding="utf-8")
+
+
+def test_its_commands_can_be_read(page):
+    commands = []
+    for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
+        for words in re.findall(r"^ *forcegp (.*)$", block.replace("\\\n", " "), re.MULTILINE):
+            commands.append(parse_arguments(shlex.split(words)))
+    assert any(isinstance(command, Validate) for command in commands)
+
+
+def test_its_links_lead_somewhere(page):
+    links = [link for link in re.findall(r"\]\(([^)#]+)\)", page) if not link.startswith("http")]
+    assert not [link for link in links if not (PAGE.parent / link).exists()]
+
+
+def test_every_model_that_it_names_exists(page):
+    system = moving_arm(0.1, 1).system
+    (table,) = re.findall(r"\| `--models` \|.*?\n\n", page, re.DOTALL)
+    cells = [row.split("|")[1] for row in table.splitlines()[2:] if row.startswith("|")]
+    named = {name for cell in cells for name in re.findall(r"`([\w +-]+)`", cell) if not name.startswith("forcegp")}
+    named = {name for name in named if not name.startswith("-")}
+    assert set(candidates(sorted(named), system)) == named
+    assert {name for name in DEFAULT_MODELS if "@" not in name} <= named
+
+
+def test_its_example_runs(page, tmp_path):
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    moving_arm(1.5, 2).save(tmp_path / "log.h5")
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "Does a Gaussian process on forces beat the identified model?" in done.stdout
+    assert "mine / identified-acceleration" in done.stdout
+    assert "'median'" in done.stdout.splitlines()[-1]
+    assert (tmp_path / "mine" / "report.md").exists()
