@@ -1,0 +1,74 @@
+"""How noisy accelerations and forces are, from the residuals of forward dynamics.
+
+Residuals r_n = a_n - a^_n that have noise of both kinds are normal with covariance
+
+    S_n = diag(sigma_a^2) + M_n^-1 diag(sigma_F^2) M_n^-1,
+
+so joints of small inertia count less where the noise is one of forces. The two levels of every joint are those of
+largest likelihood (the model of `forcegp.models.Noise`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+ROWS = 2000
+"""Rows that levels are found from at most, evenly spread."""
+LEAST = 1e-3
+"""Smallest standard deviation, relative to that of all residuals."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """Standard deviations per joint: of accelerations [rad/s^2 or m/s^2] and of forces [Nm or N]."""
+
+    acceleration: Float[np.ndarray, " nv"]
+    force: Float[np.ndarray, " nv"]
+
+    @classmethod
+    def of(cls, residual: Float[np.ndarray, "rows nv"], M: Float[np.ndarray, "rows nv nv"]) -> NoiseLevels:
+        """Those of largest likelihood, by L-BFGS on their logarithms, each at least `LEAST` of the whole."""
+        chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
+        r, inverse = (torch.as_tensor(x) for x in (residual[chosen], np.linalg.inv(M[chosen])))
+        in_force = torch.linalg.solve(inverse, r[..., None])[..., 0]
+        whole = torch.stack([x.square().mean(0).sqrt().clamp_min(1e-12) for x in (r, in_force)])
+        logs = torch.full_like(whole, float(np.log(0.5)), requires_grad=True)
+        lowest = float(np.log(LEAST))
+
+        def levels() -> Tensor:
+            return whole * logs.clamp_min(lowest).exp()
+
+        def cost() -> Tensor:
+            acceleration, force = levels()
+            lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
+            white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)
+            # a weak pull to the start keeps a level that the residuals say nothing about from running away
+            pull = 0.5 * (logs - float(np.log(0.5))).square().sum()
+            return 0.5 * white.square().sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum() + pull
+
+        search = torch.optim.LBFGS([logs], max_iter=100, line_search_fn="strong_wolfe")
+
+        def closure() -> Tensor:
+            search.zero_grad()
+            value = cost()
+            value.backward()
+            return value
+
+        search.step(closure)  # type: ignore[arg-type]  # the closure may return a tensor
+        acceleration, force = levels().detach().numpy()
+        return cls(acceleration, force)
+
+    def whitening(self, M: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
+        """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance."""
+        inverse = torch.as_tensor(np.linalg.inv(M))
+        S = _covariance(inverse, torch.as_tensor(self.acceleration), torch.as_tensor(self.force))
+        return np.linalg.inv(torch.linalg.cholesky(S).numpy())
+
+
+def _covariance(inverse: Tensor, acceleration: Tensor, force: Tensor) -> Tensor:
+    return torch.diag_embed(acceleration.square()).expand_as(inverse) + (inverse * force.square()) @ inverse.mT
