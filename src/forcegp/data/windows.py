@@ -36,6 +36,7 @@ FEWEST_ROWS = EXACT_DEGREE + 3
 LONGEST_STEP = 2.5
 """Steps of time longer than this multiple of the median are gaps, and no window spans one."""
 
+WINDOWS_AT_ONCE = 4096
 SMALLEST_SHARE = 1e-6
 """Of the largest weight: rows at the ends of a window keep some, so that every node is the mean of its rows."""
 
@@ -118,12 +119,10 @@ class WindowObservation(ABC):
                 f"points={points} is not between 2 and the {len(rows)} windows of {self.seconds:g} s in the dataset; "
                 "give fewer points or shorter windows."
             )
+        if points is not None and points < len(rows):
+            rows = rows[farthest_point_sampling(self._mean_states(dataset, rows), points)]
         time = dataset.time[rows]
         weights, c = self.signal_weights(time), self.acceleration_weights(time)
-        if points is not None and points < len(rows):
-            states = [np.einsum("km,kmj->kj", c, getattr(dataset, name)[rows]) for name in ("q", "v", "u")]
-            chosen = farthest_point_sampling(np.hstack(states), points)
-            rows, weights, c = rows[chosen], weights[chosen], c[chosen]
         observed = np.einsum("km,kmj->kj", weights, getattr(dataset, self.signal)[rows])
         noise = white_noise(dataset, self.signal) * np.linalg.norm(weights, axis=1)[:, None]
         parts = np.array_split(np.arange(rows.shape[1]), self.nodes)
@@ -146,6 +145,16 @@ class WindowObservation(ABC):
             time_ordered=False,
         )
         return Windows(nodes, np.stack([c[:, part].sum(axis=1) for part in parts], axis=1))
+
+    def _mean_states(self, dataset: Dataset, rows: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N columns"]:
+        """q, v and u of every window, weighted as its acceleration is; some windows at a time, for logs may be long."""
+        means = []
+        for start in range(0, len(rows), WINDOWS_AT_ONCE):
+            some = rows[start : start + WINDOWS_AT_ONCE]
+            c = self.acceleration_weights(dataset.time[some])
+            states = (np.einsum("km,kmj->kj", c, getattr(dataset, name)[some]) for name in ("q", "v", "u"))
+            means.append(np.hstack(list(states)))
+        return np.concatenate(means)
 
 
 @dataclass(frozen=True)
