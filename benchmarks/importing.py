@@ -143,8 +143,8 @@ def imported(kind: str, size: int) -> dict[str, float]:
 
     with h5py.File(out) as file:
         count = len(file["time"])  # type: ignore[arg-type]  # a dataset
-    result = {"seconds": seconds, "memory_mib": usage.ru_maxrss / 1024, "rows": count, "bytes": path.stat().st_size}
-    result["written_bytes"] = out.stat().st_size
+    result = {"seconds": seconds, "cpu_s": usage.ru_utime + usage.ru_stime, "memory_mib": usage.ru_maxrss / 1024}
+    result |= {"rows": count, "bytes": path.stat().st_size, "written_bytes": out.stat().st_size}
     out.unlink()
     print(f"{kind}: {result}", flush=True)
     return result
@@ -157,6 +157,7 @@ def run() -> dict[str, float]:
         measured = imported(kind, BYTES)
         results |= {
             f"import_{kind}_1gb_s": measured["seconds"],
+            f"import_{kind}_1gb_cpu_s": measured["cpu_s"],
             f"import_{kind}_1gb_memory_mib": measured["memory_mib"],
             f"import_{kind}_1gb_rows": measured["rows"],
         }

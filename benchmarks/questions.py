@@ -12,6 +12,7 @@ TITLES = {
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
     "backends": "Restarts in several processes",
+    "importing": "Importing logs",
 }
 """The questions in the order in which they are asked, and their headings in docs/performance.md."""
 
@@ -129,5 +130,18 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "ray_overhead_seconds": ("", "the same on a Ray cluster of this machine: time beyond joblib's [s, wall-clock]"),
         "ray_cold_seconds": ("", "what its first call takes longer, which starts the cluster [s, wall-clock]"),
         "backends_identical": (">= 1", "1 if all parameters are the same to the last bit on all three backends"),
+    },
+    "importing": {
+        "import_csv_1gb_s": (
+            "<= 60",
+            "a CSV log of 1 GB, 7 joints, uneven stamps: forcegp import, wall-clock [s], with the threads it takes",
+        ),
+        "import_csv_1gb_cpu_s": ("", "the same: CPU time of all threads [s]"),
+        "import_csv_1gb_memory_mib": ("<= 1024", "the same: largest resident memory of the process [MiB]"),
+        "import_csv_1gb_rows": ("", "the same: rows written"),
+        "import_mcap_1gb_s": ("<= 60", "an MCAP file of 1 GB of JointState messages: the same [s]"),
+        "import_mcap_1gb_cpu_s": ("", "the same: CPU time of all threads [s]"),
+        "import_mcap_1gb_memory_mib": ("<= 1024", "the same: largest resident memory of the process [MiB]"),
+        "import_mcap_1gb_rows": ("", "the same: rows written"),
     },
 }

@@ -39,7 +39,7 @@ class Import(PreparationOptions, RobotOptions):
     --cutoff and its sisters say so.
 
     For instance:
-      forcegp import run.csv --time t --q pos{1..2} --u tau{1..2} --robot arm.urdf --out log.h5
+      forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
       forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
     """
