@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from forcegp.checks.evidence import Evidence
 from forcegp.checks.excitation import excitation_findings
-from forcegp.checks.findings import SEVERITIES, Finding, Severity, worst
+from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
 from forcegp.checks.mistakes import Hypothesis, without_mistakes
 from forcegp.checks.motion import motion_findings
-from forcegp.checks.noise import noise_findings
+from forcegp.checks.noise import noise_findings, numbers_of, torque_noise
 from forcegp.checks.robot_model import robot_findings
 from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
@@ -43,14 +45,38 @@ class CheckReport:
         """The findings on one subject."""
         return tuple(finding for finding in self.findings if finding.subject == subject)
 
+    def per_joint(self) -> list[dict[str, Any]]:
+        """What was measured of every joint; None where it is not known.
+
+        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics
+        (see `forcegp.checks.torques`), the factor only where the torque rests on it; "noise_before" and "noise_after"
+        the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
+        """
+        nothing = [None] * self.evidence.log.nv
+        columns: dict[str, list[Any]] = {"joint": list(self.evidence.names)}
+        fit = None if self.comparison is None else self.comparison.fit
+        rows = None if self.comparison is None else self.comparison.rows
+        columns["unexplained"] = nothing if fit is None else plain(fit.unexplained)
+        columns["residual"] = nothing
+        if fit is not None and rows is not None:
+            columns["residual"] = plain(np.std(rows.u - fit.predicted, axis=0))
+        columns["factor"] = nothing if fit is None else plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
+        report = {} if self.evidence.prepared is None else self.evidence.prepared.report
+        noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
+        columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
+        torque = torque_noise(self.evidence, numbers_of(noise["after"])) if self.evidence.prepared is not None else None
+        columns["noise_torque"] = nothing if torque is None else plain(torque)
+        return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON: severity, counts, findings."""
+        """Plain JSON: severity, counts, numbers of every joint, findings."""
         counts = {severity: sum(each.severity == severity for each in self.findings) for severity in SEVERITIES}
         prepared = self.evidence.prepared
         return {
             "severity": self.severity,
             "counts": counts,
             "cutoff": None if prepared is None else prepared.preparation.cutoff,
+            "joints": self.per_joint(),
             "findings": [finding.to_dict() for finding in self.findings],
         }
 

@@ -51,7 +51,7 @@ def motion_findings(evidence: Evidence) -> list[Finding]:
             break  # of wrong velocities nothing better can come
         fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
         told = [_finding(evidence, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
-        found += _merged([item for item in told if item is not None])
+        found += _merged([item for item in told if item is not None], even.nv)
         if not found and name == "v":
             found_ok = [fit for fit in fits if fit is not None]
             if found_ok:
@@ -148,7 +148,7 @@ def _finding(
     return None
 
 
-def _merged(findings: list[Finding]) -> list[Finding]:
+def _merged(findings: list[Finding], nv: int) -> list[Finding]:
     """One finding for all joints where they say the same."""
     kinds: dict[tuple, list[Finding]] = {}
     for item in findings:
@@ -162,9 +162,11 @@ def _merged(findings: list[Finding]) -> list[Finding]:
             merged.append(first)
             continue
         joints = tuple(name for item in group for name in item.joints)
-        seen = first.seen.replace(first.joints[0], listed(joints))
-        factors = [f"{item.numbers['factor']:.3g}" for item in group]
-        each = "" if len(set(factors)) == 1 else f" (factors {', '.join(factors)})"
+        every = len(joints) == nv and nv > 2
+        seen = first.seen.replace(first.joints[0], "all joints" if every else listed(joints))
+        factors = [item.numbers["factor"] for item in group]
+        alike = max(factors) - min(factors) < CLOSE * abs(factors[0])
+        each = "" if alike else f" Factors: {', '.join(f'{factor:.3g}' for factor in factors)}."
         merged.append(
             replace(
                 first,

@@ -20,25 +20,22 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
     cutoff = report["cutoff"]
     if cutoff is None:
         return [Finding(severity="ok", subject="noise", seen="the positions show no noise worth a filter.")]
-    before, after = (_numbers(report["acceleration_noise"][when]) for when in ("before", "after"))
-    torque = _torque_noise(evidence, after)
+    before, after = (numbers_of(report["acceleration_noise"][when]) for when in ("before", "after"))
     spread = np.std(evidence.prepared.dataset.a, axis=0)
-    each = []
-    for joint, name in enumerate(evidence.names):
-        unit = "rad/s²" if evidence.rotates[joint] else "m/s²"
-        newton = "" if torque is None else f" = {torque[joint]:.2g} {'Nm' if evidence.rotates[joint] else 'N'}"
-        each.append(f"{name} {before[joint]:.3g} -> {after[joint]:.2g} {unit}{newton}")
     why = "where the spectrum shows the end of the motion" if evidence.automatic else "as asked for"
-    numbers = {"cutoff": cutoff, "before": plain(before), "after": plain(after)}
-    numbers["torque"] = None if torque is None else plain(torque)
-    found = [
-        Finding(
-            severity="ok",
-            subject="noise",
-            seen=f"filtered at {cutoff:.3g} Hz ({why}), the noise of the acceleration falls: {'; '.join(each)}.",
-            numbers=numbers,
+    found = []
+    if np.isfinite(after).any():
+        worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
+        unit = "rad/s²" if evidence.rotates[worst] else "m/s²"
+        found.append(
+            Finding(
+                severity="ok",
+                subject="noise",
+                seen=f"a filter at {cutoff:.3g} Hz ({why}) brings the noise of the acceleration of "
+                f"{evidence.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
+                numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
+            )
         )
-    ]
     raw = "preparation" not in evidence.log.metadata
     with np.errstate(invalid="ignore"):
         loud = np.flatnonzero(before > MUCH * spread)
@@ -78,7 +75,7 @@ def _measured_noise(evidence: Evidence, joints: np.ndarray) -> bool:
     return bool((np.std(evidence.log.a, axis=0)[joints] > 1.0 * np.hypot(1.0, MUCH) * spread).any())
 
 
-def _torque_noise(evidence: Evidence, noise: np.ndarray) -> np.ndarray | None:
+def torque_noise(evidence: Evidence, noise: np.ndarray) -> np.ndarray | None:
     """Standard deviation of M times the noise of a [Nm or N]."""
     if evidence.robot is None:
         return None
@@ -87,5 +84,6 @@ def _torque_noise(evidence: Evidence, noise: np.ndarray) -> np.ndarray | None:
     return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
 
 
-def _numbers(values: list) -> np.ndarray:
+def numbers_of(values: list[float | None]) -> np.ndarray:
+    """Numbers from a report, NaN where it has none."""
     return np.array([np.nan if value is None else value for value in values], dtype=float)

@@ -13,10 +13,6 @@ from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH
 from forcegp.errors import DatasetError
 
-RESTS_ON_ROBOT = 0.5
-"""Share of the torque's variance that inverse dynamics must explain beyond friction for its factor to mean "
-"something."""
-
 NO_WORSE = 2.0
 """Factor by which more may remain without a rotor inertia."""
 
@@ -48,8 +44,8 @@ def _factors(evidence: Evidence, log: Hypothesis) -> list[Finding]:
     """Torques that are a multiple of what the motion needs."""
     fit = log.fit
     with np.errstate(invalid="ignore"):
-        means = (fit.friction - fit.plain > RESTS_ON_ROBOT) & (fit.factor > 0.0)
-        means &= fit.plain < NO_WORSE * fit.unexplained + 0.02  # else a rotor inertia is missing, not a factor
+        means = fit.rests_on_robot
+        means = means & (fit.plain < NO_WORSE * fit.unexplained + 0.02)  # else a rotor inertia is missing, not a factor
         ratio = np.where(means, np.maximum(fit.factor, 1.0 / np.maximum(fit.factor, 1e-300)), 1.0)
     off = np.flatnonzero(ratio > ROUGHLY)
     if not len(off):
@@ -116,25 +112,26 @@ def _unexplained(evidence: Evidence, log: Hypothesis) -> list[Finding]:
     known = np.isfinite(left)
     if not known.any():
         return []
-    residual = np.std(log.rows.u - log.fit.predicted, axis=0)
-    told = ", ".join(f"{evidence.names[k]} {residual[k]:.2g} ({100.0 * left[k]:.2g} %)" for k in np.flatnonzero(known))
+    worst = int(np.nanargmax(left))
     bad = np.flatnonzero(known & (left > UNEXPLAINED))
-    numbers = {"joints": list(evidence.names), "residual": plain(residual)}
-    numbers |= {"unexplained": plain(left), "factor": plain(log.fit.factor)}
-    what = f"inverse dynamics with a factor and friction leaves of the torque, in Nm or N rms (of its variance): {told}"
+    what = (
+        f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance of a "
+    )
+    what += f"torque unexplained ({evidence.names[worst]})"
     if not len(bad):
-        return [Finding(severity="ok", subject="torque", seen=f"{what}.", numbers=numbers)]
+        return [Finding(severity="ok", subject="torque", seen=f"{what}.")]
     shares = ", ".join(f"{evidence.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
     return [
         Finding(
             severity="look",
             subject="torque",
-            seen=f"{what}. Of the variance of some joints most remains: {shares}.",
-            remedy="The robot does not explain these torques: their channel, unit or zero may be wrong, the joint may "
-            "be "
-            "held or touch something, or its torque is nearly all friction or noise.",
+            seen=f"most of some torques is not what inverse dynamics with a factor and friction gives: {shares} of "
+            "their "
+            "variance.",
+            remedy="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
+            "nearly all friction or noise.",
             joints=tuple(evidence.names[joint] for joint in bad),
-            numbers=numbers,
+            numbers={"unexplained": plain(left[bad])},
         )
     ]
 

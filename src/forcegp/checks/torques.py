@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
 from forcegp.data import Dataset
@@ -20,6 +20,7 @@ from forcegp.robots import Robot
 CONSTANT = 1e-24
 """Variance relative to the square below which a torque is constant: rounding."""
 
+RESTS_ON_ROBOT = 0.5
 SLOW = 0.1
 """Of the root mean square velocity: where dry friction turns over."""
 
@@ -60,9 +61,9 @@ class TorqueFit:
     """What the robot explains of the torque of each joint.
 
     `unexplained` (nv,) is the share of the torque's variance that is left, NaN for a torque that never changes;
-    `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque. `friction` (nv,) is the share
-    that is left without inverse dynamics and armature, `plain` (nv,) that without armature, whose s is `factor` (nv,):
-    where tau is nearly proportional to a, s and I are not to be told apart.
+    `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque, with w = `slow` (nv,).
+    `friction` (nv,) is the share that is left without inverse dynamics and armature, `plain` (nv,) that without
+    armature, whose s is `factor` (nv,): where tau is nearly proportional to a, s and I are not to be told apart.
     """
 
     unexplained: Float[np.ndarray, " nv"]
@@ -71,6 +72,18 @@ class TorqueFit:
     factor: Float[np.ndarray, " nv"]
     coefficients: Float[np.ndarray, "nv 5"]
     predicted: Float[np.ndarray, "rows nv"]
+    slow: Float[np.ndarray, " nv"]
+
+    @property
+    def rests_on_robot(self) -> Bool[np.ndarray, " nv"]:
+        """Whether `factor` means something: inverse dynamics explains half of the torque's variance beyond friction."""
+        with np.errstate(invalid="ignore"):
+            return (self.friction - self.plain > RESTS_ON_ROBOT) & (self.factor > 0.0)
+
+    def at(self, tau: Float[np.ndarray, "rows nv"], rows: Dataset) -> Float[np.ndarray, "rows nv"]:
+        """The fitted torque of other rows, whose inverse dynamics is `tau`."""
+        s, armature, viscous, dry, constant = self.coefficients.T
+        return s * tau + armature * rows.a + viscous * rows.v + dry * np.tanh(rows.v / self.slow) + constant
 
 
 def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
@@ -93,6 +106,7 @@ def fit_torques(
         plain=np.array([share for _, share in plain]),
         factor=np.array([solution[0] for solution, _ in plain]),
         coefficients=np.stack([solution for solution, _ in every]),
+        slow=np.array([fit.slow for fit in fits]),
         predicted=np.stack([fit.predicted(solution) for fit, (solution, _) in zip(fits, every, strict=True)], axis=1),
     )
 
@@ -111,8 +125,8 @@ class _JointFit:
     """One joint's torque and what may explain it; a free constant takes the means out of both sides."""
 
     def __init__(self, tau: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> None:
-        slow = SLOW * float(np.sqrt(np.square(v).mean())) + 1e-12
-        self.columns = np.stack([tau, a, v, np.tanh(v / slow)], axis=1)
+        self.slow = SLOW * float(np.sqrt(np.square(v).mean())) + 1e-12
+        self.columns = np.stack([tau, a, v, np.tanh(v / self.slow)], axis=1)
         self.centered = self.columns - self.columns.mean(axis=0)
         self.size = np.linalg.norm(self.centered, axis=0)
         self.mean = float(u.mean())

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
+from forcegp.cli.check import Check
 from forcegp.cli.command import Command
 from forcegp.cli.compare import Compare
 from forcegp.cli.demo import Demo
@@ -17,6 +18,7 @@ from forcegp.cli.evaluate import Evaluate
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
 from forcegp.cli.import_log import Import
+from forcegp.cli.prepare import Prepare
 from forcegp.cli.reproduce import Reproduce
 from forcegp.cli.rollout import Rollout
 from forcegp.cli.simulate import Simulate
@@ -40,6 +42,8 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
     "simulate": (Simulate, "make a dataset with ground truth"),
     "import": (Import, "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot"),
+    "check": (Check, "what would spoil a model of this log, and what to do about it"),
+    "prepare": (Prepare, "filter and differentiate a raw log, and say what that costs"),
     "fit": (Fit, "learn the unknown forces from a dataset"),
     "compare": (Compare, "which kind of unknown force the data support"),
     "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),

@@ -1,0 +1,130 @@
+"""`forcegp check`: what would spoil a model of this log, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.command import Debug, Json
+from forcegp.cli.preparation_options import CutoffOptions
+from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
+from forcegp.errors import DatasetError
+
+if TYPE_CHECKING:
+    from forcegp.checks import CheckReport
+
+KIND = "forcegp check"
+COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(CutoffOptions, RobotOptions):
+    """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
+
+    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and says what to do. Nothing is
+    changed.
+
+    For instance:
+      forcegp check log.h5 --robot arm.urdf
+      forcegp check log.h5 --robot arm.urdf --plots look --strict
+    """
+
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """The dataset to check (HDF5)."""
+    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
+    """Filter for the comparison of q, v, a and u. auto: where the spectrum shows that motion ends and noise begins."""
+    plots: Annotated[Path | None, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: no plots)")] = (
+        None
+    )
+    """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
+    strict: bool = False
+    """Exit with code 2 if anything is wrong."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
+        if self.plots is not None:
+            require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
+        from forcegp.checks import check
+        from forcegp.data import Dataset
+
+        preparation = self._preparation()
+        dataset = Dataset.load(self.data)
+        needs_robot = self.robot is not None or self.identified is not None or dataset.system is not None
+        system = self.chosen_system(dataset, self.data) if needs_robot else None
+        with terminal.progress("checking"):
+            report = check(dataset, system, preparation=preparation)
+        content = {"data": str(self.data), **report.to_dict()}
+        if self.plots is not None:
+            self._draw(terminal, report, content)
+        terminal.say(*_shown(self.data, report))
+        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
+        if self.strict and wrong:
+            what = ", ".join(dict.fromkeys(finding.subject for finding in wrong))
+            raise DatasetError(
+                f"{self.data}: {len(wrong)} findings are wrong ({what}); without --strict this is no error."
+            )
+        return content
+
+    def _draw(self, terminal: Terminal, report: CheckReport, content: Mapping[str, Any]) -> None:
+        from forcegp.evaluation.check_plot import check_figure
+        from forcegp.evaluation.figure_style import save_figure
+
+        assert self.plots is not None
+        with folder_written_whole(self.plots) as folder:
+            folder.mkdir()
+            save_figure(check_figure(report), folder / "check.png")
+            write_json(folder / "check.json", content)
+            write_config(folder, KIND, {"data": str(self.data)})
+        terminal.note(f"plots: {self.plots}")
+
+
+def _shown(data: Path, report: CheckReport) -> list[Any]:
+    """One paragraph per finding, worst first, and the numbers of every joint."""
+    from rich.table import Table
+    from rich.text import Text
+
+    content = report.to_dict()
+    counts = content["counts"]
+    heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
+    findings = Table.grid(padding=(0, 1))
+    findings.add_column(no_wrap=True)
+    findings.add_column(overflow="fold")
+    for finding in report.findings:
+        told = Text(f"{finding.subject}: ", style="bold")
+        told.append(finding.seen, style="not bold")
+        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), told)
+        if finding.remedy:
+            findings.add_row("", Text(f"→ {finding.remedy}", style="dim"))
+    return [heading, findings, _numbers(report, content)]
+
+
+def _numbers(report: CheckReport, content: Mapping[str, Any]) -> Any:
+    from forcegp.cli.tables import NONE, columns
+
+    def shown(value: float | None, pattern: str = "{:.3g}") -> str:
+        return NONE if value is None else pattern.format(value)
+
+    cutoff = content["cutoff"]
+    filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
+    header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered, "times M"]
+    rows = [
+        [
+            each["joint"],
+            shown(None if each["unexplained"] is None else 100.0 * each["unexplained"], "{:.2g} %"),
+            *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after", "noise_torque")),
+        ]
+        for each in content["joints"]
+    ]
+    units = report.evidence.log.units
+    unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
+    return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)

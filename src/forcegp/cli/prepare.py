@@ -1,0 +1,123 @@
+"""`forcegp prepare`: filter, align, differentiate and thin out a raw log, and say what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from forcegp.cli.command import Debug, Json
+from forcegp.cli.preparation_options import PreparationOptions
+from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.terminal import Terminal
+from forcegp.cli.whole_folders import folder_written_whole, require_free_file, require_free_folder, write_config
+from forcegp.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from forcegp.data import Dataset, Prepared
+
+KIND = "forcegp prepare"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepare(PreparationOptions, RobotOptions):
+    """Filter, align, differentiate and thin out a raw log, and say what that costs.
+
+    The low-pass filter runs forwards and backwards, so that nothing is delayed; v and a are computed anew.
+
+    For instance:
+      forcegp prepare log.h5 --cutoff auto --every 10 --out data.h5 --plots spectra
+      forcegp prepare log.h5 --cutoff 20 --delay auto --robot arm.urdf --trim 0.1 --out data.h5
+    """
+
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    """The dataset to prepare (HDF5), as forcegp import wrote it."""
+    out: Annotated[Path, arg(metavar="FILE.h5")]
+    """The dataset to write."""
+    plots: Annotated[Path | None, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: no plots)")] = (
+        None
+    )
+    """Also draw the spectra before and after, with the cut-off, into this folder."""
+    overwrite: bool = False
+    """Replace the file if it exists, and the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Prepare, save, draw if asked to, and show."""
+        require_free_file(self.out, overwrite=self.overwrite)
+        if self.plots is not None:
+            require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
+        from dataclasses import replace
+
+        from forcegp.data import Dataset
+
+        preparation = self._preparation()
+        if preparation.changes_nothing:
+            raise InvalidInput("nothing to do: give --cutoff, --delay, --every or --trim.")
+        dataset = Dataset.load(self.data)
+        if self.robot is not None or self.identified is not None or dataset.system is not None:
+            dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
+        with terminal.progress("preparing"):
+            prepared = preparation.apply(dataset)
+        prepared.dataset.save(self.out)
+        if self.plots is not None:
+            self._draw(terminal, dataset, prepared)
+        terminal.say(*_report(self.out, dataset, prepared))
+        return {"out": str(self.out), "data": str(self.data), **prepared.report}
+
+    def _draw(self, terminal: Terminal, dataset: Dataset, prepared: Prepared) -> None:
+        from forcegp.evaluation.figure_style import save_figure
+        from forcegp.evaluation.spectrum_plot import preparation_figure
+
+        assert self.plots is not None
+        with folder_written_whole(self.plots) as folder:
+            folder.mkdir()
+            save_figure(preparation_figure(dataset, prepared.preparation), folder / "spectra.png")
+            write_config(folder, KIND, {"data": str(self.data), "preparation": prepared.report})
+        terminal.note(f"plots: {self.plots}")
+
+
+def _report(out: Path, dataset: Dataset, prepared: Prepared) -> list[Any]:
+    """The price, joint by joint."""
+    from rich.text import Text
+
+    from forcegp.cli.tables import NONE, columns, facts
+
+    report = prepared.report
+    before, after = report["rows"]
+    values = {"rows": f"{before} -> {after}"}
+    if "sample_rate" in report:
+        values["sample rate"] = " -> ".join(f"{rate:.4g} Hz" for rate in report["sample_rate"])
+    cutoff = report["cutoff"]
+    filtered = "none" if cutoff is None else f"{cutoff:.3g} Hz, order {report['order']}, forwards and backwards"
+    values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
+    delays = report["delay"]
+    if any(delays) or "delay" in report["why"]:
+        told = ", ".join(f"{1e3 * delay:.1f}" for delay in (delays if len(set(delays)) > 1 else delays[:1]))
+        values["delay of u"] = f"{told} ms" + (f"; {report['why']['delay']}" if "delay" in report["why"] else "")
+    tables: list[Any] = [facts(f"{out}: prepared", values)]
+    if cutoff is None:
+        return tables
+
+    def shown(value: float | None) -> str:
+        return NONE if value is None else f"{value:.3g}"
+
+    def share(value: float | None) -> str:
+        return NONE if value is None else f"{100.0 * value:.2g} %"
+
+    noise, removed = report["acceleration_noise"], report["power_removed"]
+    header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
+    rows = [
+        [name, shown(noise["before"][joint]), shown(noise["after"][joint])]
+        + [share(removed[signal][joint]) for signal in ("q", "v", "a", "u")]
+        for joint, name in enumerate(dataset.joint_names)
+    ]
+    unit = dataset.units["a"]
+    title = f"What it costs; noise in {unit if isinstance(unit, str) else 'the units of each joint'}, shares of power"
+    tables.append(columns(title.replace("^2", "²"), header, rows))
+    tables.append(Text("Noise is that of differenced positions above the noise floor; – where the log shows no floor."))
+    return tables

@@ -1,0 +1,114 @@
+"""`forcegp check` and `forcegp prepare` from end to end: what they write, what they print, and how they refuse."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from tests.checks.logs import arm, clean, column, late
+
+from forcegp import Dataset
+from forcegp.data import resample
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Logs with and without their robot, a clean one and one with two defects."""
+    place = tmp_path_factory.mktemp("check")
+    data = clean(1)
+    data.save(place / "clean.h5")
+    replace(data, system=None).save(place / "bare.h5")
+    column(late(data, 0.02), "u", 1, np.negative).save(place / "defects.h5")
+    noisy = replace(data, q=data.q + 1e-4 * np.random.default_rng(0).normal(size=data.q.shape))
+    noisy.save(place / "noisy.h5")
+    resample(noisy, 0.005).rows(np.delete(np.arange(1200), 600)).save(place / "lost.h5")
+    (place / "arm.urdf").write_text(arm().robot.urdf_text)
+    (place / "mine").mkdir()
+    (place / "mine" / "thesis.txt").write_text("years of work")
+    return place
+
+
+def test_a_clean_log_is_told_so(forcegp, folder):
+    done = forcegp("check", "bare.h5", "--robot", "arm.urdf", "--strict", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "bare.h5: 0 wrong, 0 to look at" in done.stdout
+    assert "Every joint; in Nm and rad/s²" in done.stdout
+    line = next(line for line in done.stdout.splitlines() if line.strip().startswith("lift"))
+    assert line.split()[2] == "%"
+
+
+def test_defects_are_told_and_drawn_but_are_no_error(forcegp, folder):
+    done = forcegp("check", "defects.h5", "--plots", "look", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["severity"] == "wrong"
+    subjects = {item["subject"]: item for item in told["findings"] if item["severity"] != "ok"}
+    assert subjects["torque sign"]["joints"] == ["lift"]
+    assert subjects["delay"]["numbers"]["delay"] == pytest.approx(0.02, abs=0.005)
+    assert json.loads((folder / "look" / "check.json").read_text()) == told
+    with Image.open(folder / "look" / "check.png") as picture:
+        assert picture.width > 1000
+    assert json.loads((folder / "look" / "config.json").read_text())["kind"] == "forcegp check"
+
+
+def test_strict_makes_what_is_wrong_an_error_of_one_line(forcegp, folder):
+    done = forcegp("check", "defects.h5", "--strict", folder=folder)
+    assert done.returncode == 2
+    assert "torque sign: the torque of lift has the opposite sign" in done.stdout.replace("\n", " ").replace("  ", " ")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("forcegp: defects.h5: ")
+    assert "torque sign" in line
+
+
+def test_prepare_writes_what_it_says(forcegp, folder):
+    done = forcegp(
+        *("prepare", "noisy.h5", "--cutoff", "auto", "--delay", "auto", "--every", 4, "--trim", 0.2),
+        *("--out", "data.h5", "--plots", "spectra", "--json"),
+        folder=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    data, raw = Dataset.load(folder / "data.h5"), Dataset.load(folder / "noisy.h5")
+    assert told["rows"] == [len(raw), len(data)]
+    assert json.loads(json.dumps(data.metadata["preparation"])) == {
+        k: told[k] for k in told if k not in ("out", "data")
+    }
+    np.testing.assert_allclose(np.diff(data.time), 4 * (raw.time[1] - raw.time[0]))
+    assert 1.0 < told["cutoff"] < 20.0
+    assert max(told["acceleration_noise"]["after"]) < 0.05 * min(told["acceleration_noise"]["before"])
+    with Image.open(folder / "spectra" / "spectra.png") as picture:
+        assert picture.width > 1000
+    again = forcegp("prepare", "noisy.h5", "--cutoff", 12, "--out", "data.h5", folder=folder)
+    assert again.returncode == 2
+    assert "data.h5 exists already; choose another name, or add --overwrite" in again.stderr
+    shown = forcegp("prepare", "noisy.h5", "--cutoff", 12, "--out", "data.h5", "--overwrite", folder=folder)
+    assert shown.returncode == 0, shown.stderr
+    assert "What it costs; noise in rad/s²" in shown.stdout
+    assert Dataset.load(folder / "data.h5").metadata["preparation"]["cutoff"] == 12.0
+
+
+REFUSALS = {
+    ("prepare", "noisy.h5", "--out", "x.h5"): "nothing to do: give --cutoff, --delay, --every or --trim",
+    ("prepare", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
+    ("prepare", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
+    ("prepare", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
+    ("prepare", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
+    ("prepare", "noisy.h5", "--every", "0", "--out", "x.h5"): "every is 0",
+    ("prepare", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
+    ("prepare", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 is not a file",
+    ("check", "clean.h5", "--plots", "mine"): "was not written by `forcegp check`, so it is not overwritten",
+    ("check", "clean.h5", "--cutoff", "-3"): "cutoff is -3.0",
+    ("check", "arm.urdf"): "is not an HDF5 file",
+}
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_what_cannot_be_done_is_refused_in_one_line(forcegp, folder, words):
+    done = forcegp(*words, folder=folder)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert REFUSALS[words] in line
+    assert not done.stdout
+    assert not (folder / "x.h5").exists()
+    assert [path.name for path in (folder / "mine").iterdir()] == ["thesis.txt"]
