@@ -49,6 +49,7 @@ if TYPE_CHECKING:
         PeriodicJointForces,
         ToolForces,
     )
+    from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
     from forcegp.robots import Robot
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
     from forcegp.validation import Comparison, Validation, split_named, validate
@@ -123,6 +124,7 @@ _ROOMS = {
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"}
     | {"StribeckJointFriction", "LoadJointFriction", "ConstantJointForce", "RotorInertia"},
     "data": {"Dataset", "VelocityIncrements", "WeakForm"},
+    "recordings": {"ColumnMapping", "ImportOptions", "import_recordings"},
     "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}
     | {"JointAccelerations", "NoForces"},
     "inference": {"Exact", "Iterative", "Inducing", "Stochastic"},
