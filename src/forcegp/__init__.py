@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from forcegp.analytical import AnalyticalIdentification, identify_analytical
     from forcegp.data import Dataset, VelocityIncrements, WeakForm
     from forcegp.evaluation import Evaluation, PriorComparison, compare_priors, evaluate
     from forcegp.inference import Exact, Inducing, Iterative, Stochastic
@@ -78,6 +79,9 @@ __all__ = [
     "RotorInertia",
     # what was measured
     "Dataset",
+    "import_recordings",
+    "ColumnMapping",
+    "ImportOptions",
     "WeakForm",
     "VelocityIncrements",
     "KukaSurfaceConfig",
@@ -99,6 +103,9 @@ __all__ = [
     "NetworkEnsemble",
     "save_posterior",
     "load_posterior",
+    # the same without Gaussian processes
+    "identify_analytical",
+    "AnalyticalIdentification",
     # how and where it is computed
     "Exact",
     "Iterative",
@@ -125,6 +132,7 @@ _ROOMS = {
     | {"StribeckJointFriction", "LoadJointFriction", "ConstantJointForce", "RotorInertia"},
     "data": {"Dataset", "VelocityIncrements", "WeakForm"},
     "recordings": {"ColumnMapping", "ImportOptions", "import_recordings"},
+    "analytical": {"AnalyticalIdentification", "identify_analytical"},
     "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}
     | {"JointAccelerations", "NoForces"},
     "inference": {"Exact", "Iterative", "Inducing", "Stochastic"},

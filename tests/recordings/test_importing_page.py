@@ -1,0 +1,47 @@
+"""The example of docs/importing.md runs as it stands, its commands are commands, and its mapping is one."""
+
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.import_log import Import
+from forcegp.recordings import read_mapping
+from forcegp.recordings.signal_units import UNITS
+
+
+@pytest.fixture(scope="module")
+def page(repository):
+    return (repository / "docs" / "importing.md").read_text(encoding="utf-8")
+
+
+def test_the_example_runs(page, tmp_path):
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    described, error = done.stdout.splitlines()
+    assert described == "Dataset(375 rows, 2 joints, episodes [0], no system)"
+    assert float(error.split()[0]) < 1e-14
+
+
+def test_the_commands_are_commands(page):
+    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    parsed = [parse_arguments(shlex.split(line)[1:]) for line in commands.splitlines()]
+    assert len(parsed) == 4
+    assert all(isinstance(command, Import) for command in parsed)
+
+
+def test_the_mapping_is_one(page, tmp_path):
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "columns.yaml").write_text(text)
+    mapping = read_mapping(tmp_path / "columns.yaml")
+    assert mapping.q == ("theta1", "theta2 - theta1")
+    assert mapping.scale["u"] == (0.083, 0.041)
+
+
+def test_every_unit_is_on_the_page(page):
+    (row,) = re.findall(r"\| `--unit` \|.*\| (.*) \|\n", page)
+    told = {part.split(": ")[0]: set(part.split(": ")[1].split(". ")[0].split(", ")) for part in row.split("; ")}
+    assert told == {quantity: set(units) for quantity, units in UNITS.items()}
