@@ -11,7 +11,8 @@ import torch
 from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies
 from forcegp.analytical.identified_robot import thickened
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import weighted_least_squares
+from forcegp.analytical.least_squares import Fit, weighted_least_squares
+from forcegp.analytical.noise_levels import NoiseLevels
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.regressor import body_pseudo_inertias
 from forcegp.analytical.result import AnalyticalIdentification
@@ -21,8 +22,10 @@ from forcegp.mechanics import MechanicalSystem
 
 Inertias = Literal["consistent", "free"]
 Likelihood = Literal["torque", "acceleration"]
-ROWS = 20_000
+ROWS = 5_000
 """Rows that are used at most, evenly spread: more of a filtered recording say little more."""
+REWEIGHTINGS = 2
+"""Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
 
 
 def identify_analytical(
@@ -44,13 +47,14 @@ def identify_analytical(
     ----------
     system: start and prior: the robot, friction it lists, and forces that are given. In no contact.
     dataset: q, v, u and a, filtered alike (`forcegp.data.Preparation`); rows need not be in order of time.
-    friction: out of "viscous", "coulomb" or "stribeck", "load" (in proportion to |u|) and "offset". Velocity scales are
+    friction: out of "viscous", "coulomb" or "stribeck" or "load" (c + mu |u|), and "offset". Velocity scales are
         estimated, too.
     rotors: "armature": one inertia per joint. "rotor": those of the system's RotorInertia. None: as listed.
     inertias: "consistent": every estimate belongs to a body (log-Cholesky coordinates, Rucker & Wensing 2022). "free":
         any numbers, that is, ordinary least squares of base parameters, which often give no robot.
     likelihood: "torque": residuals of inverse dynamics. "acceleration": of forward dynamics, maximum likelihood where
-        the noise is that of differentiated positions; needs consistent inertias.
+        accelerations are noisy (differentiated positions) and forces are, too (`NoiseLevels`); needs consistent
+        inertias.
     prior_strength: weight w of a prior w/2 d^2 around the system that is given, with d the affine-invariant distance of
         bodies (a mass wrong by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
         decides what the data do not, and hardly what they do.
@@ -111,14 +115,20 @@ def identify_analytical(
         return weight * values, weight * jacobian
 
     low, high = terms.bounds
-    fit = weighted_least_squares(
-        residual,
-        prior,
-        np.concatenate([np.zeros(split), terms.start()]),
-        (np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])),
-        robust=robust,
-        progress=progress,
-    )
+    bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
+
+    def search(start: np.ndarray, whitening: np.ndarray | None = None) -> Fit:
+        def white(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            r, jacobian = residual(x)
+            return (r, jacobian) if whitening is None else ((whitening @ r[..., None])[..., 0], whitening @ jacobian)
+
+        return weighted_least_squares(white, prior, start, bounds, robust=robust, progress=progress)
+
+    fit, noise = search(np.concatenate([np.zeros(split), terms.start()])), None
+    for _ in range(REWEIGHTINGS if likelihood == "acceleration" else 0):
+        predicted, M = recorded.acceleration(bodies.parameters(fit.x[:split]), fit.x[split:])
+        noise = NoiseLevels.of(a - predicted, M)
+        fit = search(fit.x, noise.whitening(M))
     return AnalyticalIdentification(
         given=system,
         bodies=bodies,
@@ -129,6 +139,7 @@ def identify_analytical(
         episode=dataset.episode[chosen],
         regressor=regressor,
         thickened=thick,
+        noise=noise,
     )
 
 

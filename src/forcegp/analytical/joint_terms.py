@@ -7,7 +7,7 @@ system (which has the opposite sign). A new friction law is one entry in `LAWS`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -75,9 +75,9 @@ def _coulomb(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _load(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scale = p["load_velocity_scale"]
-    sign = np.tanh(v / scale)
-    return p["load"] * load * sign, load * np.stack([sign, -p["load"] * (1.0 - sign**2) * v / scale**2])
+    scale = p["velocity_scale"]
+    sign, level = np.tanh(v / scale), p["coulomb"] + p["load"] * load
+    return level * sign, np.stack([sign, load * sign, -level * (1.0 - sign**2) * v / scale**2])
 
 
 def _stribeck(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -134,10 +134,10 @@ LAWS: dict[str, Law] = {
     ),
     "load": Law(
         LoadJointFriction,
-        (Field("load", "1", (0, 0, 0.1)), replace(VELOCITY_SCALE, name="load_velocity_scale")),
+        (COULOMB, Field("load", "1", (0, 0, 0.1)), VELOCITY_SCALE),
         _load,
-        lambda p: LoadJointFriction(torch.tensor(p["load"]), torch.tensor(p["load_velocity_scale"])),
-        lambda force: _numbers(force, load="coefficients", load_velocity_scale="velocity_scale"),
+        lambda p: LoadJointFriction(*(torch.tensor(p[name]) for name in ("load", "coulomb", "velocity_scale"))),
+        lambda force: _numbers(force, coulomb="coulomb", load="coefficients", velocity_scale="velocity_scale"),
     ),
     "offset": Law(
         ConstantJointForce,
@@ -150,6 +150,8 @@ LAWS: dict[str, Law] = {
 """Friction laws and the offset by the name that `friction=` has for them."""
 LINEAR_SPREAD = 10.0
 """Standard deviation of the prior on numbers that are not logarithms, in their sizes: as large as the torques."""
+DRY = ("coulomb", "stribeck", "load")
+"""Laws of dry friction: each has a constant part."""
 INERTIA = Field("armature", "inertia", (0, 0, 0.1))
 INERTIAS: dict[str, type[Armature | RotorInertia]] = {"armature": Armature, "rotor": RotorInertia}
 
@@ -160,7 +162,7 @@ class JointTerms:
     Parameters
     ----------
     system: where their start values are read, and the transmission of rotors.
-    friction: names out of `LAWS`; "coulomb" and "stribeck" exclude each other, since the latter contains the former.
+    friction: names out of `LAWS`; of those in `DRY` one, since each contains Coulomb friction.
     inertia: "armature", "rotor" (rotors of the system's RotorInertia) or None.
     torque, velocity, mass: typical size of joint forces, velocities and diagonal entries of M (nv,), with the unit
         of a coordinate in proportion.
@@ -181,8 +183,9 @@ class JointTerms:
         unknown = next((name for name in friction if name not in LAWS), None)
         if unknown is not None or isinstance(friction, str):
             raise InvalidInput(f"friction is {friction!r}; give a tuple of names out of {', '.join(LAWS)}.")
-        if {"coulomb", "stribeck"} <= set(friction):
-            raise InvalidInput("friction names coulomb and stribeck; leave coulomb out, stribeck contains it.")
+        dry = [name for name in dict.fromkeys(friction) if name in DRY]
+        if len(dry) > 1:
+            raise InvalidInput(f"friction names {' and '.join(dry)}; name one of them, each contains Coulomb friction.")
         if inertia not in (None, *INERTIAS):
             raise InvalidInput(f"rotors are {inertia!r}; give one of {', '.join(INERTIAS)}, or None.")
         self.laws = [LAWS[name] for name in dict.fromkeys(friction)]

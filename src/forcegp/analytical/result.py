@@ -15,11 +15,18 @@ from forcegp.analytical.bodies import BodyCoordinates, FreeBodies
 from forcegp.analytical.identified_robot import with_bodies, with_joint_dynamics
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import Fit, correlation_time
+from forcegp.analytical.noise_levels import NoiseLevels
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.regressor import UNITS, body_names, parameter_names
 from forcegp.analytical.scores import residual_scores
 from forcegp.data import Dataset
-from forcegp.mechanics import CoulombJointFriction, MechanicalSystem, StribeckJointFriction, ViscousJointFriction
+from forcegp.mechanics import (
+    CoulombJointFriction,
+    LoadJointFriction,
+    MechanicalSystem,
+    StribeckJointFriction,
+    ViscousJointFriction,
+)
 
 Rows = Float[np.ndarray, "rows nv"]
 
@@ -37,6 +44,8 @@ class AnalyticalIdentification:
     episode: Int[np.ndarray, " rows"]
     regressor: Float[np.ndarray, "rows nv bodies 10"]
     thickened: tuple[str, ...]
+    noise: NoiseLevels | None = None
+    """Of accelerations and forces, after maximum likelihood in accelerations."""
 
     # ------------------------------------------------------------------ the estimates
 
@@ -55,7 +64,7 @@ class AnalyticalIdentification:
         robot = with_bodies(self.given.robot, self.bodies.pseudo_inertias(self._in_bodies))
         found = self.terms.known_forces(self._in_terms)
         dry = [f.coefficients for f in found if type(f) is CoulombJointFriction]
-        dry += [f.coulomb for f in found if type(f) is StribeckJointFriction]
+        dry += [f.coulomb for f in found if isinstance(f, StribeckJointFriction | LoadJointFriction)]
         viscous = [f.coefficients for f in found if type(f) is ViscousJointFriction]
         damping, friction = (None if not x else torch.as_tensor(x[0]).numpy() for x in (viscous, dry))
         others = [force for force in self.given.known_forces if type(force) not in self.terms.kinds]
@@ -168,7 +177,8 @@ class AnalyticalIdentification:
                 }
                 for name, value in values.items()
             },
-            "noise_std": self.fit.noise.tolist(),
+            "noise_std": (self.fit.noise if self.noise is None else self.noise.acceleration).tolist(),
+            "force_noise_std": None if self.noise is None else self.noise.force.tolist(),
             "rows": len(self.episode),
             "base_parameters": list(self.base.expressions),
             "condition_number": self.condition_number,

@@ -105,14 +105,13 @@ def _report(
         header = ["joint", "force rms\nbefore [Nm]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
         tables.append(columns(f"{command.out}: residuals of the {name} data", header, rows))
     errors, values, units = found.standard_errors, found.values, found.units
-    fields = list(dict.fromkeys(name.partition(".")[0] for name in found.terms.names))
-    if fields:
-        rows = [
-            [joint, *(f"{values[f'{field}.{joint}']:.3g} ± {errors[f'{field}.{joint}']:.1g}" for field in fields)]
-            for joint in joints
-        ]
-        header = ["joint", *(f"{field.replace('_', ' ')}\n[{units[f'{field}.{joints[0]}']}]" for field in fields)]
-        tables.append(columns("friction and rotors, ± standard error", header, rows))
+    rows = []
+    for field in dict.fromkeys(name.partition(".")[0] for name in found.terms.names):
+        rows.append([f"{field.replace('_', ' ')} [{units[f'{field}.{joints[0]}']}]"])
+        for name in (f"{field}.{joint}" for joint in joints):
+            rows.append([f"  {name.partition('.')[2]}", f"{values[name]:.4g}", f"{errors[name]:.2g}"])
+    if rows:
+        tables.append(columns("friction and rotors", ["", "identified", "std. error"], rows))
     base = found.base
     told = (
         f"{base.rank} base parameters, condition number {base.condition:.3g}; "
