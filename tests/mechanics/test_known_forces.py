@@ -47,8 +47,8 @@ FORMULAS = {
         lambda q, v, u: -(TENSOR + (3.0 - TENSOR) * (-((v / TENTHS) ** 2)).exp()) * (v / 0.02).tanh(),
     ),
     "load": (
-        lambda: LoadJointFriction(NUMBERS, 0.02),
-        lambda q, v, u: -TENSOR * u.abs() * (v / 0.02).tanh(),
+        lambda: LoadJointFriction(NUMBERS, 0.7, 0.02),
+        lambda q, v, u: -(0.7 + TENSOR * u.abs()) * (v / 0.02).tanh(),
     ),
     "constant": (lambda: ConstantJointForce(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
     "armature": (lambda: Armature(NUMBERS), lambda q, v, u: torch.zeros_like(u)),

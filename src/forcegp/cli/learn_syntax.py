@@ -48,7 +48,7 @@ def with_learned_forces(system: MechanicalSystem, learn: Sequence[Learned]) -> t
     make = {
         "viscous-joint-friction": (ViscousJointFriction, lambda: ViscousJointFriction.from_robot(system.robot)),
         "coulomb-joint-friction": (CoulombJointFriction, lambda: CoulombJointFriction.from_robot(system.robot)),
-        "load-joint-friction": (LoadJointFriction, lambda: LoadJointFriction(0.0, 0.1)),
+        "load-joint-friction": (LoadJointFriction, lambda: LoadJointFriction(0.0, 0.0, 0.1)),
         "armature": (Armature, lambda: Armature(0.0)),
         "rotor-inertia": (RotorInertia, lambda: RotorInertia(0.0)),
     }

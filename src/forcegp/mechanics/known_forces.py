@@ -145,22 +145,24 @@ class StribeckJointFriction(KnownForce):
 
 @dataclass(frozen=True, eq=False)
 class LoadJointFriction(KnownForce):
-    """-mu |u| tanh(v / w): the part of a gear's dry friction that grows with the torque that it transmits.
+    """-(c + mu |u|) tanh(v / w): dry friction of a gear, which grows with the torque that it transmits.
 
-    mu without unit, `velocity_scale` w in rad/s or m/s; `CoulombJointFriction` is the part without load. Source: Hamon,
-    Gautier & Garrec, "Dynamic identification of robots with a dry friction model depending on load and velocity",
-    IROS 2010, where the load is the output torque; here it is that of the actuator.
+    `coefficients` mu without unit, `coulomb` c in Nm or N, `velocity_scale` w in rad/s or m/s. Source: Hamon, Gautier &
+    Garrec, "Dynamic identification of robots with a dry friction model depending on load and velocity", IROS 2010,
+    where the load is the output torque; here it is that of the actuator.
     """
 
     coefficients: PerJoint
+    coulomb: PerJoint = 0.0
     velocity_scale: PerJoint = 0.01
-    per_joint: ClassVar[tuple[str, ...]] = ("coefficients", "velocity_scale")
+    per_joint: ClassVar[tuple[str, ...]] = ("coefficients", "coulomb", "velocity_scale")
     positive: ClassVar[tuple[str, ...]] = ("velocity_scale",)
     learned: ClassVar[str | None] = "coefficients"
 
     @override
     def force(self, state: State) -> Tensor:
-        return -self.coefficients * state.u.abs() * torch.tanh(state.v / self.velocity_scale)  # type: ignore[operator]  # tensors once they are bound
+        mu, c, w = (torch.as_tensor(getattr(self, name)) for name in self.per_joint)  # tensors once they are bound
+        return -(c + mu * state.u.abs()) * torch.tanh(state.v / w)
 
 
 @dataclass(frozen=True, eq=False)
