@@ -75,6 +75,22 @@ def test_densities_and_intervals_are_those_of_the_noise(scores, test_rows):
     assert np.allclose(scores["noise_std"], SIGMA)
 
 
+def test_stretches_of_time_make_up_the_whole(scores, test_rows):
+    """Equal stretches: means of squares over them are those of all rows, and so are densities."""
+    stretches = scores["stretches"]
+    assert stretches["seconds"] == pytest.approx(0.39 / 20)
+    error = predicted(test_rows) - test_rows.a
+    number = (test_rows.time / stretches["seconds"]).astype(int)
+    rows = np.bincount(number)
+    assert len(stretches["force_rms"]) == len(rows)
+    force = np.average(np.square(stretches["force_rms"]), weights=rows)
+    assert force == pytest.approx(np.square(scores["force_rms"]).mean())
+    assert np.average(np.square(stretches["nrmse"]), weights=rows) == pytest.approx(np.square(scores["nrmse"]).mean())
+    assert np.average(stretches["nlpd"], weights=rows) == pytest.approx(scores["nlpd"])
+    first = number == 0
+    assert stretches["nrmse"][0] == pytest.approx(np.sqrt(((error / test_rows.a.std(0))[first] ** 2).mean()))
+
+
 def test_the_mass_matrix_counts_rotors(test_rows):
     system = given_system()
     with_rotors = MechanicalSystem(system.robot, (), (*system.known_forces, Armature((0.1, 0.2, 0.3))))

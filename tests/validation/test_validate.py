@@ -148,7 +148,7 @@ def test_an_identification_that_fails_leaves_the_mass_matrix_as_given_and_its_mo
     assert told == ["the system as given, because its identification failed (too still)"]
     for name in models[1:]:
         (failure,) = found.document["models"][name]["failures"]
-        assert failure["error"] == "the mine identification of its mean failed: too still"
+        assert failure["error"] == "the mine identification that it rests on failed: too still"
     assert found.document["models"]["analytical"]["runs"] == 1
     assert "the mine identification failed (episodes-1, seed 0): too still" in (tmp_path / "out/report.md").read_text()
 

@@ -39,6 +39,7 @@ def cell(seed: int, force: float | None, diverged: int = 0, motion: float | None
         return {"split": "s", "seed": seed, "result": None}
     motions = {"rms": [motion], "diverged": [diverged]}
     result = {"nrmse": [force], "force_rms": [force, force], "nlpd": -1.0 / force, "motions": motions}
+    result["stretches"] = {name: [force, 0.7] for name in ("nrmse", "force_rms", "nlpd")}  # equal in the second
     return {"split": "s", "seed": seed, "result": result}
 
 
@@ -79,6 +80,10 @@ def test_every_question_is_answered_by_the_best_of_each_kind():
     assert set(against["models"]) == {"urdf", "ls2", "gp"}
     assert against["models"]["ls2"]["force_rms"]["runs"] == 2
     assert against["models"]["urdf"]["force_rms"]["verdict"] == "worse"
+    gp, urdf = (against["models"][name]["force_rms"] for name in ("gp", "urdf"))
+    assert (gp["ahead"], urdf["ahead"], gp["stretches"]) == (1, 0, 2)
+    assert "better in 3 of 3 runs and in 1 of 2 held-out stretches of time" in gp["sentence"]
+    assert "stretches" not in against["models"]["gp"]["motion"]["sentence"]
 
 
 def test_a_model_whose_motions_diverge_is_not_the_best():

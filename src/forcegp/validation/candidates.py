@@ -67,7 +67,7 @@ class Training:
             return self.given
         found = self.identified[mean]
         if isinstance(found, str):
-            raise FitError(f"the {mean} identification of its mean failed: {found}")
+            raise FitError(f"the {mean} identification that it rests on failed: {found}")
         return found
 
     @property

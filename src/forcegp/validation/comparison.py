@@ -259,7 +259,7 @@ def reference_mass(
     """
     found = _identification(comparison, kept, comparison.identification, split, 0)
     if found["result"] is None:
-        told = f"the system as given, because its identification failed ({found['error']})"
+        told = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
         return mass_matrices(comparison.system, test), told
     system = MechanicalSystem.from_dict(found["result"]["system"])
     return mass_matrices(system, test), f"the system identified with seed 0 by {found['result']['how']}"

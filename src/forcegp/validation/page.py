@@ -234,14 +234,12 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
         for reason, runs in _grouped(
             (f["error"], f"{f['split']}, seed {f['seed']}") for f in model["failures"]
         ).items():
-            lines.append(
-                f"* **{name}** failed in {len(runs)} of {len(runs) and _runs(model)} runs ({'; '.join(runs)}): {reason}"
-            )
-    for cell in document["identifications"]:
-        if cell["error"] is not None:
-            lines.append(
-                f"* the {cell['name']} identification failed ({cell['split']}, seed {cell['seed']}): {cell['error']}"
-            )
+            lines.append(f"* **{name}** failed in {len(runs)} of {_runs(model)} runs ({'; '.join(runs)}): {reason}")
+    failed = [cell for cell in document["identifications"] if cell["error"] is not None]
+    reasons = _grouped((f"{cell['name']}\n{cell['error']}", f"{cell['split']}, seed {cell['seed']}") for cell in failed)
+    for reason, runs in reasons.items():
+        name, _, error = reason.partition("\n")
+        lines.append(f"* the {name} identification failed ({'; '.join(runs)}): {error}")
     return ["## Failures", "\n".join(lines)] if lines else []
 
 

@@ -9,14 +9,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, time_blocks
 from forcegp.evaluation import metrics
-from forcegp.evaluation.predicted_rows import predict_rows
+from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Of the central intervals whose coverage is told."""
+
+STRETCHES = 20
+"""Parts of the held-out time in which models are compared by themselves."""
 
 ROWS_PER_BLOCK = 4096
 
@@ -72,7 +75,28 @@ def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndar
         "nlpd_per_joint": plain(metrics.marginal_negative_log_density(predicted.mean, variance, a)),
         "levels": list(LEVELS),
         "coverage": [plain(each) for each in covered],
+        "stretches": _by_stretch(predicted, test, forces),
         "noise_std": plain(posterior.noise_std.detach().cpu().numpy()),
+    }
+
+
+def _by_stretch(
+    predicted: PredictedRows, test: Dataset, forces: Float[np.ndarray, "rows nv"]
+) -> dict[str, list[float | None] | float]:
+    """The same in each of about `STRETCHES` stretches of time, over all joints, where lower is better.
+
+    "nrmse" with the standard deviations of all held-out rows, "force_rms" and "nlpd"; "seconds" is their length.
+    """
+    lasting = sum(float(np.ptp(test.time[test.episode == episode])) for episode in test.episodes)
+    seconds = lasting / STRETCHES if lasting > 0.0 else 1.0
+    spread = test.a.std(axis=0)
+    relative = ((predicted.mean - test.a)[:, spread > 0.0] / spread[spread > 0.0]) ** 2
+    blocks = [list(block) for block in time_blocks(test.time, test.episode, seconds)]
+    return {
+        "seconds": seconds,
+        "nrmse": plain(np.array([np.sqrt(relative[block].mean()) if relative.size else np.nan for block in blocks])),
+        "force_rms": plain(np.array([np.sqrt((forces[block] ** 2).mean()) for block in blocks])),
+        "nlpd": plain(np.array([predicted.negative_log_density[block].mean() for block in blocks])),
     }
 
 

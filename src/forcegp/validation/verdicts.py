@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from scipy.stats import t as student
 
 from forcegp.validation.scores import over_joints
@@ -43,7 +44,8 @@ class Paired:
     """Challenger against baseline in one score.
 
     `value` is the geometric mean of the ratios of errors (0.8: a fifth less), or the mean difference in nats; the
-    interval is of the same kind, None for one run. In `wins` of `runs` the challenger was better.
+    interval is of the same kind, None for one run. In `wins` of `runs` the challenger was better, and in `ahead` of
+    `stretches` of the held-out time its median over seeds was (none for motions).
     """
 
     score: str
@@ -53,6 +55,8 @@ class Paired:
     wins: int
     value: float
     interval: tuple[float, float] | None
+    ahead: int = 0
+    stretches: int = 0
 
     @property
     def verdict(self) -> str:
@@ -73,7 +77,10 @@ class Paired:
             pair = f"{self.challenger} − {self.baseline} = {_told(self.score, self.value)} nats"
         else:
             pair = f"{self.challenger} / {self.baseline} = {_told(self.score, self.value)}"
-        return f"{said} by the {SCORES[self.score]}: {pair} ({spread}; better in {self.wins} of {self.runs} runs)."
+        better = f"better in {self.wins} of {self.runs} runs"
+        if self.stretches:
+            better += f" and in {self.ahead} of {self.stretches} held-out stretches of time"
+        return f"{said} by the {SCORES[self.score]}: {pair} ({spread}; {better})."
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
@@ -167,7 +174,29 @@ def compared(
     """`paired` over the runs that both models finished."""
     one, other = runs_of(score, cells[challenger]), runs_of(score, cells[baseline])
     shared = [run for run in one if run in other]
-    return paired(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
+    found = paired(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
+    if found is None or score == "motion":
+        return found
+    ahead = _ahead(score, shared, cells[challenger], cells[baseline])
+    return replace(found, ahead=int(ahead.sum()), stretches=len(ahead))
+
+
+def _ahead(
+    score: str,
+    runs: Sequence[tuple[str, int]],
+    one: Sequence[Mapping[str, Any]],
+    other: Sequence[Mapping[str, Any]],
+) -> Bool[np.ndarray, " stretches"]:
+    """In which held-out stretches of time the median over seeds of the first model is lower."""
+    out = []
+    for split in dict.fromkeys(split for split, _ in runs):
+        sides = []
+        for cells in (one, other):
+            kept = [cell["result"] for cell in cells if cell["split"] == split and (split, cell["seed"]) in runs]
+            values = np.array([result["stretches"][score] for result in kept], dtype=np.float64)
+            sides.append(np.median(values, axis=0))
+        out.append(sides[0] < sides[1])
+    return np.concatenate(out)
 
 
 def runs_of(score: str, cells: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], float]:
