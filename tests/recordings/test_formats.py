@@ -250,6 +250,14 @@ def test_columns_of_several_topics_are_refused(tmp_path):
         list(source.chunks(["/joint_states:log_time", "/wrench:log_time"], 10))
 
 
+def test_a_header_may_be_long(tmp_path):
+    columns = {f"a_long_name_of_column_{index}": np.arange(3.0) + index for index in range(3000)}
+    source = open_source(write_text(tmp_path / "log.csv", columns))
+    assert source.columns() == tuple(columns)
+    (piece,) = source.chunks(["a_long_name_of_column_2999"], 10)
+    np.testing.assert_array_equal(piece["a_long_name_of_column_2999"], [2999, 3000, 3001])
+
+
 def test_options_of_other_formats_are_refused(tmp_path):
     with pytest.raises(InvalidInput, match="mean nothing to"):
         open_source(write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)

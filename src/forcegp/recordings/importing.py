@@ -76,8 +76,8 @@ class ImportOptions:
 
 
 def import_recordings(
-    paths: Sequence[Path],
-    out: Path,
+    paths: Sequence[str | Path],
+    out: str | Path,
     mapping: ColumnMapping,
     *,
     system: MechanicalSystem | None = None,
@@ -93,8 +93,13 @@ def import_recordings(
     written. Warns (DataWarning) of what can be used but looks mistaken.
     """
     options = options or ImportOptions()
+    out = Path(out)
+    if not paths:
+        raise InvalidInput("no logs are given.")
+    if not out.parent.is_dir():
+        raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot = None if system is None else system.robot
-    sources = _sources(paths, mapping)
+    sources = _sources([Path(path) for path in paths], mapping)
     plans = [signal_plan(mapping, source, robot) for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
@@ -111,7 +116,7 @@ def import_recordings(
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
         step = _even_step(stamps, options)
         episodes = _without_jumps([rows for own in stamps for rows in _rows_of(own, plan, step, options)])
-        done = _what_was_done(paths, mapping, plan, recordings, stamps, step, options, sources)
+        done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
         with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
             for number, rows in enumerate(episodes):
                 report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
@@ -219,7 +224,6 @@ def _episode(rows: EpisodeRows, count: int) -> dict[str, Any]:
 
 
 def _what_was_done(
-    paths: Sequence[Path],
     mapping: ColumnMapping,
     plan: SignalPlan,
     recordings: Sequence[RawRecording],

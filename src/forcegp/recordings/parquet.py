@@ -41,7 +41,7 @@ class ParquetFile(Source):
         self._scalars: dict[str, str] = {}
         self._elements: dict[str, tuple[str, int]] = {}
         self._widths: dict[str, int] = {}
-        with reading(path, "a Parquet file", pa.ArrowException), parquet.ParquetFile(path) as file:
+        with reading(path, "a Parquet file", pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
             self.rows = file.metadata.num_rows
             require_distinct(path, file.schema_arrow.names)
             if not self.rows:
@@ -85,7 +85,10 @@ class ParquetFile(Source):
         self.require(names)
         stored = list(dict.fromkeys(self._elements[name][0] if name in self._elements else name for name in names))
         row = 0
-        with reading(self.path, "a Parquet file", pa.ArrowException), parquet.ParquetFile(self.path) as file:
+        with (
+            reading(self.path, "a Parquet file", pa.ArrowException),
+            parquet.ParquetFile(self.path, pre_buffer=False) as file,
+        ):
             for batch in file.iter_batches(rows, columns=stored):
                 if not len(batch):
                     continue

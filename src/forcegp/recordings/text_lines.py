@@ -23,7 +23,7 @@ _OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
 
 def opened(path: Path) -> io.BufferedReader:
     """The bytes of a text file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
-    stream = gzip_stream(path) if path.suffix.lower() == ".gz" else path.open("rb")
+    stream = gzip_stream(path) if path.suffix.lower() == ".gz" else io.BufferedReader(io.FileIO(path), 2**20)
     try:
         first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
         if not first.strip():
