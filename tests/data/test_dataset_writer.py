@@ -59,9 +59,7 @@ def test_chunks_are_what_the_filters_of_hdf5_would_have_made(tmp_path):
     with h5py.File(tmp_path / "log.h5") as stored, h5py.File(tmp_path / "own.h5", "w") as own:
         q = stored["q"]
         assert (q.compression, q.shuffle, q.chunks) == ("gzip", True, (8192, 3))
-        same = own.create_dataset(
-            "q", data=q[()], chunks=q.chunks, compression="gzip", compression_opts=4, shuffle=True
-        )
+        same = own.create_dataset("q", data=q[()], chunks=q.chunks, **COMPRESSION)
         for row in range(0, 20_000, 8192):
             assert q.id.read_direct_chunk((row, 0)) == same.id.read_direct_chunk((row, 0))
 

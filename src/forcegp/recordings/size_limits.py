@@ -56,7 +56,7 @@ class CountedStream(io.RawIOBase):
         super().close()
 
 
-def gzip_stream(path: Path) -> io.BufferedReader:
+def gzip_stream(path: Path) -> CountedStream:
     """The content of a .gz file. The size that it declares is checked first, what comes out is counted."""
     import gzip
 
@@ -67,4 +67,4 @@ def gzip_stream(path: Path) -> io.BufferedReader:
         file.seek(max(size - 4, 0))
         declared = int.from_bytes(file.read(4), "little")  # RFC 1952: ISIZE, modulo 2^32
     require_plausible_size(path, "what is compressed", declared, size)
-    return io.BufferedReader(CountedStream(path, gzip.open(path, "rb")), 2**20)
+    return CountedStream(path, gzip.open(path, "rb"))

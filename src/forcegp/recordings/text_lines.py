@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from typing_extensions import override
 
@@ -23,7 +23,8 @@ _OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
 
 def opened(path: Path) -> io.BufferedReader:
     """The bytes of a text file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
-    stream = gzip_stream(path) if path.suffix.lower() == ".gz" else io.BufferedReader(io.FileIO(path), 2**20)
+    raw: Any = gzip_stream(path) if path.suffix.lower() == ".gz" else io.FileIO(path)
+    stream = io.BufferedReader(raw, 2**20)
     try:
         first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
         if not first.strip():
