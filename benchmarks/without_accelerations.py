@@ -113,7 +113,7 @@ def multiarm(folder: Path) -> Rig:
         return _dataset(system, episodes)
 
     train, test, prior = runs(range(0, 12, 2)), runs(range(1, 12, 2)), JointForces(inputs=("q", "v"))
-    return Rig(train, test, prior, "zero", 25.0, (15.0, 20.0, 25.0, 35.0, 50.0), (0.04, 0.06, 0.08, 0.12, 0.16), None)
+    return Rig(train, test, prior, "zero", 25.0, (15.0, 20.0, 25.0, 35.0, 50.0), (0.04, 0.06, 0.08, 0.12), None)
 
 
 RIGS = {"dfki": dfki, "multiarm": multiarm}
