@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import minimize
 from torch import Tensor
 
 ROWS = 2000
@@ -37,30 +38,22 @@ class NoiseLevels:
         r, inverse = (torch.as_tensor(x) for x in (residual[chosen], np.linalg.inv(M[chosen])))
         in_force = torch.linalg.solve(inverse, r[..., None])[..., 0]
         whole = torch.stack([x.square().mean(0).sqrt().clamp_min(1e-12) for x in (r, in_force)])
-        logs = torch.full_like(whole, float(np.log(0.5)), requires_grad=True)
-        lowest = float(np.log(LEAST))
+        start = np.full(whole.numel(), np.log(0.5))
 
-        def levels() -> Tensor:
-            return whole * logs.clamp_min(lowest).exp()
-
-        def cost() -> Tensor:
-            acceleration, force = levels()
+        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+            logs = torch.tensor(x, requires_grad=True)
+            acceleration, force = whole * logs.view_as(whole).exp()
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
             white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)
             # a weak pull to the start keeps a level that the residuals say nothing about from running away
-            pull = 0.5 * (logs - float(np.log(0.5))).square().sum()
-            return 0.5 * white.square().sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum() + pull
+            pull = 0.5 * (logs - torch.as_tensor(start)).square().sum()
+            value = 0.5 * white.square().sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum() + pull
+            (gradient,) = torch.autograd.grad(value, logs)
+            return float(value.detach()), gradient.numpy()
 
-        search = torch.optim.LBFGS([logs], max_iter=100, line_search_fn="strong_wolfe")
-
-        def closure() -> Tensor:
-            search.zero_grad()
-            value = cost()
-            value.backward()
-            return value
-
-        search.step(closure)  # type: ignore[arg-type]  # the closure may return a tensor
-        acceleration, force = levels().detach().numpy()
+        # scipy's search, since the import of torch.optim takes seconds
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(np.log(LEAST), None)] * len(start))
+        acceleration, force = whole.numpy() * np.exp(found.x).reshape(whole.shape)
         return cls(acceleration, force)
 
     def whitening(self, M: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
