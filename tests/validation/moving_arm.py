@@ -37,8 +37,10 @@ def given_system() -> MechanicalSystem:
 def true_system(stribeck: bool = False) -> MechanicalSystem:
     """What really moves: other masses, viscous and dry friction; with `stribeck` more of it near rest."""
     heavier = URDF.replace('mass value="1.2"', 'mass value="1.5"').replace('mass value="0.6"', 'mass value="0.8"')
-    dry = StribeckJointFriction(0.4, 1.0, 0.3, 0.03) if stribeck else CoulombJointFriction(0.5, 0.1)
-    friction = (ViscousJointFriction(0.3), dry)
+    dry = CoulombJointFriction((0.5, 0.5, 0.1), 0.1)
+    if stribeck:
+        dry = StribeckJointFriction((0.4, 0.4, 0.06), (1.0, 1.0, 0.15), 0.5, 0.1)
+    friction = (ViscousJointFriction((0.3, 0.3, 0.05)), dry)
     return MechanicalSystem(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodyBias(), *friction))
 
 
@@ -57,8 +59,8 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
     integrator = integrator_named("rk4", system)
     found: dict[str, list[np.ndarray]] = {"q": [], "v": [], "u": [], "a": []}
     for k in range(rows):
-        u = system.robot.bias_forces(q, v) + torch.tensor([30.0, 30.0, 15.0]) * (torch.tensor(wanted[k]) - q)
-        u = u + torch.tensor([4.0, 4.0, 2.0]) * (torch.tensor(speed[k]) - v)
+        u = system.robot.bias_forces(q, v) + torch.tensor([20.0, 20.0, 3.0]) * (torch.tensor(wanted[k]) - q)
+        u = u + torch.tensor([2.0, 2.0, 0.3]) * (torch.tensor(speed[k]) - v)
 
         def acceleration(q, v, u=u):
             return system.dynamics(q, v, u).acceleration_map().offset
