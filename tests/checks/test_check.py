@@ -109,6 +109,35 @@ def test_a_gap_is_not_differentiated_across():
     assert report.of("torque")[0].severity == "ok"
 
 
+def test_a_joint_that_is_held_in_one_episode_is_named():
+    one, other = clean(6), clean(7)
+    q, v = other.q.copy(), other.v.copy()
+    q[:, 1], v[:, 1] = 0.2 + 1e-5 * np.sin(9 * other.time), 9e-5 * np.cos(9 * other.time)
+    joined = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in ("u", "a", "time")}
+    both = replace(
+        one, q=np.concatenate([one.q, q]), v=np.concatenate([one.v, v]), episode=np.repeat([0, 1], len(one)), **joined
+    )
+    (found,) = check(replace(both, u=both.u * 0 + np.sin(both.time[:, None]))).of("held joint")
+    assert found.joints == ("lift",)
+    assert found.numbers["stretches"] == [1]
+
+
+def test_noise_that_is_as_large_as_a_torque_is_told():
+    data = clean(3, pendulum())
+    loud = replace(data, q=data.q + 3e-3 * np.random.default_rng(0).normal(size=data.q.shape))
+    found = check(loud, preparation=Preparation(cutoff=20.0)).of("noise")
+    assert any("worth more than half of a torque" in item.seen for item in found)
+
+
+def test_what_importing_mended_is_told():
+    log = {"repeated_stamps_dropped": 3, "gaps": [[1.0, 2.0]], "largest_deviation_of_a_step": 0.5}
+    imported = {"recordings": [log, {"largest_deviation_of_a_step": 0.0}], "resampled_to_step": 0.005}
+    (found,) = check(replace(clean(1), metadata={"import": imported})).of("import")
+    assert found.severity == "look"
+    for told in ("2 logs", "3 repeated time stamps", "1 gaps", "50 % off"):
+        assert told in found.seen
+
+
 def test_repeated_rows_are_told():
     data = clean(7)
     kept = np.arange(len(data)) // 4 * 4

@@ -17,6 +17,9 @@ HYSTERESIS = 0.1
 """Of the root mean square velocity, beyond which a sign counts."""
 
 FEWEST_CHANGES = 4
+HELD = 0.02
+"""Range of a joint in one stretch, relative to its largest, below which it was held there."""
+
 STILL = {True: 0.02, False: 0.002}
 """Range in rad or m below which a joint does not move."""
 
@@ -65,7 +68,40 @@ def excitation_findings(evidence: Evidence) -> list[Finding]:
                 numbers={"joints": told},
             )
         )
-    return [*found, *_base_parameters(evidence)]
+    return [*found, *_held(evidence, still), *_base_parameters(evidence)]
+
+
+def _held(evidence: Evidence, still: list[str]) -> list[Finding]:
+    """Joints that stand still in whole stretches although they move in others."""
+    assert evidence.prepared is not None
+    rows = evidence.prepared.dataset
+    found = []
+    if len(rows.episodes) < 2:
+        return []
+    spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
+    for joint, name in enumerate(evidence.names):
+        held = np.flatnonzero(
+            (spans[:, joint] < HELD * spans[:, joint].max()) & (spans.max(axis=1) > 5.0 * spans[:, joint])
+        )
+        if name in still or not len(held) or len(held) > len(spans) // 2:
+            continue
+        first = int(held[0])
+        begin = float(rows.time[rows.episode == rows.episodes[first]][0])
+        found.append(
+            Finding(
+                severity="look",
+                subject="held joint",
+                seen=f"{name} stays within {spans[first, joint]:.2g} rad or m in {len(held)} of {len(spans)} stretches "
+                "while "
+                f"other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it moves "
+                f"{spans[:, joint].max():.2g}.",
+                remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
+                "(--lock).",
+                joints=(name,),
+                numbers={"stretches": held.tolist(), "range": float(spans[first, joint])},
+            )
+        )
+    return found
 
 
 def _base_parameters(evidence: Evidence) -> list[Finding]:

@@ -12,6 +12,10 @@ MUCH = 0.2
 """Noise relative to the spread of the signal from which a filter is worth its name."""
 
 
+LARGE_TORQUE = 0.5
+"""Noise times M, relative to the spread of the torque."""
+
+
 def noise_findings(evidence: Evidence) -> list[Finding]:
     """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
     if evidence.prepared is None:
@@ -53,6 +57,7 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
                 joints=names,
             )
         )
+    found += _in_torques(evidence, after)
     if len(left):
         names = tuple(evidence.names[joint] for joint in left)
         found.append(
@@ -66,6 +71,31 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
             )
         )
     return found
+
+
+def _in_torques(evidence: Evidence, after: np.ndarray) -> list[Finding]:
+    """Noise of the acceleration that is as large as the torques when multiplied by M."""
+    assert evidence.prepared is not None
+    noise = torque_noise(evidence, after)
+    if noise is None or evidence.contacts:
+        return []
+    spread = np.std(evidence.prepared.dataset.u, axis=0)
+    with np.errstate(invalid="ignore"):
+        loud = np.flatnonzero((noise > LARGE_TORQUE * spread) & (spread > 0.0))
+    if not len(loud):
+        return []
+    told = ", ".join(f"{evidence.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
+    return [
+        Finding(
+            severity="look",
+            subject="noise",
+            seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {told} Nm or N.",
+            remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "
+            "accelerations bears it.",
+            joints=tuple(evidence.names[joint] for joint in loud),
+            numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
+        )
+    ]
 
 
 def _measured_noise(evidence: Evidence, joints: np.ndarray) -> bool:

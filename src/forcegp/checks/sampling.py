@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,9 @@ MUCH_LOST = 0.01
 
 LITTLE_LOST = 1e-4
 """Share that every logger loses."""
+
+VERY_UNEVEN = 2.0
+"""Deviation of a step from the median, relative to it: samples were lost."""
 
 OFTEN_REPEATED = 0.02
 """Share of rows that repeat the one before while the robot moves, which a logger without new values leaves."""
@@ -114,23 +116,25 @@ def _repeated(evidence: Evidence) -> list[Finding]:
 def _imported(metadata: Mapping[str, Any]) -> list[Finding]:
     """What `forcegp import` met in the log files and mended, as `metadata["import"]` tells it."""
     told = metadata.get("import")
-    recordings = told.get("recordings", ()) if isinstance(told, Mapping) else ()
-    found = []
-    for item in recordings:
-        repeated, gaps = item.get("repeated_stamps_dropped", 0), len(item.get("gaps", ()))
-        uneven = float(item.get("largest_deviation_of_a_step", 0.0))
-        met = [f"{repeated} repeated time stamps (dropped)"] if repeated else []
-        met += [f"{gaps} gaps (split there)"] if gaps else []
-        if told.get("resampled_to_step") is not None and uneven > JITTER:  # type: ignore[union-attr]  # it has recordings
-            met.append(f"time steps up to {100.0 * uneven:.0f} % off their median (resampled)")
-        if met:
-            found.append(
-                Finding(
-                    severity="look",
-                    subject="import",
-                    seen=f"in {Path(item['name']).name} importing met {', '.join(met)}.",
-                    remedy="Nothing for this dataset; look at the logger if it happens often.",
-                    numbers={"repeated_stamps": repeated, "gaps": gaps, "largest_deviation_of_a_step": uneven},
-                )
-            )
-    return found
+    if not isinstance(told, Mapping) or not told.get("recordings"):
+        return []
+    logs = told["recordings"]
+    repeated = sum(item.get("repeated_stamps_dropped", 0) for item in logs)
+    gaps = sum(len(item.get("gaps", ())) for item in logs)
+    uneven = max(float(item.get("largest_deviation_of_a_step", 0.0)) for item in logs)
+    met = [f"{repeated} repeated time stamps (dropped)"] if repeated else []
+    met += [f"{gaps} gaps (split there)"] if gaps else []
+    if told.get("resampled_to_step") is not None and uneven > JITTER:
+        met.append(f"time steps up to {100.0 * uneven:.0f} % off their median (resampled)")
+    if not met:
+        return []
+    often = gaps > 0 or repeated > 0 or uneven > VERY_UNEVEN
+    return [
+        Finding(
+            severity="look" if often else "ok",
+            subject="import",
+            seen=f"importing {'the log' if len(logs) == 1 else f'{len(logs)} logs'} met {', '.join(met)}.",
+            remedy="Nothing is left to do in this dataset; look at the logger." if often else "",
+            numbers={"repeated_stamps": repeated, "gaps": gaps, "largest_deviation_of_a_step": uneven},
+        )
+    ]

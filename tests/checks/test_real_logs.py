@@ -1,0 +1,69 @@
+"""Logs of real robots, which lie beside the repository where they are there: no false alarm, and defects are found."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.checks.logs import column, exchanged
+
+from forcegp.checks import check
+from forcegp.data import Dataset
+from forcegp.mechanics import MechanicalSystem
+from forcegp.recordings import ColumnMapping, import_recordings
+from forcegp.robots import Robot
+
+
+@pytest.fixture(scope="module")
+def panda(shared, tmp_path_factory) -> Dataset:
+    folder: Path = shared("realdata/panda_gaz2019")
+    names = ("time", "positions", "velocity", "torques")
+    mapping = ColumnMapping(
+        time="exciting_traj_time:c1",
+        q=("exciting_traj_positions",),
+        v=("exciting_traj_velocity",),
+        u=("exciting_traj_torques",),
+        headerless=(1, 7, 7, 7),
+        side_by_side=True,
+    )
+    system = MechanicalSystem(Robot.from_urdf(folder / "model" / "panda_gaz2019_nomesh.urdf"))
+    out = tmp_path_factory.mktemp("panda") / "log.h5"
+    import_recordings([folder / "raw" / f"exciting_traj_{name}.txt.gz" for name in names], out, mapping, system=system)
+    return Dataset.load(out)
+
+
+def test_a_panda_is_well_but_its_velocities_are_late(panda):
+    report = check(panda)
+    assert report.severity == "look"
+    assert report.comparison is not None
+    assert np.nanmax(report.comparison.fit.unexplained) < 0.06
+    (late,) = report.of("velocity")
+    assert set(late.joints) == set(panda.joint_names)
+    assert not report.of("delay")
+    (excitation,) = report.of("excitation")
+    assert excitation.numbers["seen"] == 43  # base parameters of seven joints with general axes
+
+
+def test_defects_planted_in_a_real_log_are_found(panda):
+    order = [0, 3, 2, 1, 4, 5, 6]
+    for planted, subject, joints in (
+        (column(panda, "u", 6, np.negative), "torque sign", {"panda_joint7"}),
+        (exchanged(panda, "u", order), "joints exchanged", {"panda_joint2", "panda_joint4"}),
+        (replace(panda, u=np.roll(panda.u, 20, axis=0)), "delay", set(panda.joint_names)),
+    ):
+        (found,) = check(planted).of(subject)
+        assert set(found.joints) == joints
+
+
+def test_a_double_pendulum_whose_elbow_sticks_in_one_run(shared, tmp_path):
+    folder: Path = shared("realdata/dfki_double_pendulum")
+    mapping = ColumnMapping(time="time", q=("pos_meas{1..2}",), v=("vel_meas{1..2}",), u=("tau_meas{1..2}",))
+    system = MechanicalSystem(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
+    runs = [folder / "raw" / f"20230629-{name}.csv.gz" for name in ("143339", "143601", "143906")]
+    import_recordings(runs, tmp_path / "log.h5", mapping, system=system)
+    report = check(Dataset.load(tmp_path / "log.h5"))
+    assert report.severity == "look"
+    (held,) = report.of("held joint")
+    assert held.joints == ("joint2",)
+    assert held.numbers["stretches"] == [2]
+    assert held.numbers["range"] < 0.005
