@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -31,9 +30,9 @@ class MatlabHDF5(HDF5Arrays):
     @cached_property
     def _arrays(self) -> dict[str, tuple[int, ...]]:
         arrays = super()._arrays
-        cells = []
         with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
-            cells = [name for name, item in file.items() if item.attrs.get("MATLAB_class", b"") == b"cell"]
+            named = ((name, item) for name, item in file.items() if item is not None)  # None: a link to nothing
+            cells = [name for name, item in named if item.attrs.get("MATLAB_class", b"") == b"cell"]
         if cells and not arrays:
             raise _cell(self.path, cells[0])
         return {name: _as_rows(shape) for name, shape in arrays.items()}
@@ -65,7 +64,7 @@ class MatlabFile(ArrayFile):
     def _arrays(self) -> dict[str, np.ndarray]:
         from scipy.io import loadmat, matlab
 
-        errors = (matlab.MatReadError, zlib.error, NotImplementedError, MemoryError, IndexError)
+        errors = (matlab.MatReadError, NotImplementedError, MemoryError, IndexError)
         with reading(self.path, WHAT, *errors):
             size = self.path.stat().st_size
             for name, shape, kind in matlab.whosmat(str(self.path)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import zipfile
-import zlib
 from collections.abc import Iterator
 from functools import cached_property
 from typing import ClassVar
@@ -19,7 +18,7 @@ from forcegp.recordings.size_limits import require_plausible_size
 from forcegp.recordings.source import reading
 
 WHAT = "a NumPy archive"
-_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+_ERRORS = (zipfile.BadZipFile, NotImplementedError)
 
 
 class NumpyArchive(ArrayFile):

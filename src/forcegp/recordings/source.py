@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -120,7 +121,7 @@ def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[Non
         yield
     except ForceGPError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, *errors) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zlib.error, *errors) as error:
         told = " ".join(str(error).split()) or type(error).__name__
         raise FileFormatError(
             f"{path} cannot be read as {what}: {told.rstrip('.')}. It may be truncated or of another format; "
