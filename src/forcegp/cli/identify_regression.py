@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
+from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.robot_choice import SYSTEM_FILE
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
@@ -24,7 +25,7 @@ INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
     _refuse_what_does_nothing(command)
-    friction = tuple(word for word in command.friction.split(",") if word and word != "none")
+    friction = friction_laws(command.friction)
     require_free_folder(command.out, kind=kind, overwrite=command.overwrite)
     from forcegp.analytical import identify_analytical, motion_residuals, residual_scores
     from forcegp.analytical.least_squares import ROUNDS

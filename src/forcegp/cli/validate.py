@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from forcegp.cli.backend_choice import BackendOptions
 from forcegp.cli.command import Debug, Json
+from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_choice import RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -56,6 +57,8 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     identification: Annotated[str, arg(metavar="METHOD")] = "acceleration"
     """What @identified takes, and whose mass matrix turns errors of accelerations into forces: acceleration, torque or
     least-squares, or from all training rows acceleration-all or torque-all."""
+    friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,coulomb"
+    """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, and offset; or none."""
     points: Annotated[int, arg(metavar="N")] = 100
     """Rows that every model learns from: those that lie farthest apart among two thirds of the training rows."""
     seeds: Annotated[int, arg(metavar="N")] = 5
@@ -75,7 +78,8 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     ] = None
     """Models with physics learn a noise of the joint forces as well, beginning at this standard deviation in Nm."""
     measured_torque: bool = False
-    """u was measured by sensors as noisy as that, and models with physics take it so when they predict."""
+    """u was measured by noisy sensors, and models with physics take it so when they predict: those with --force-noise,
+    or a noise from an identification of all training rows."""
     jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: 1)")] = None
     """Pieces of work at once, each on one core."""
     overwrite: bool = False
@@ -136,6 +140,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             iterations=self.iterations,
             force_noise=self.force_noise,
             measured_torque=self.measured_torque,
+            friction=friction_laws(self.friction),
         )
 
     def _warn_of_memory(self, terminal: Terminal, cutoff: Any, order: int) -> None:

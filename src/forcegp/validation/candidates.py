@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, get_args
 
+from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizerOptions
@@ -45,6 +46,7 @@ class Training:
     restarts, iterations: of the search for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins [Nm or N]; None is none.
     measured_torque: whether predictions know that their u is as noisy (`Noise`).
+    levels: the noise about the identified system, where its identification knows it; else it is learned.
     """
 
     rows: Dataset
@@ -55,11 +57,18 @@ class Training:
     iterations: int | None = None
     force_noise: float | None = None
     measured_torque: bool = False
+    levels: NoiseLevels | None = None
 
     @property
     def noise(self) -> Noise:
-        """What models with physics learn."""
-        return learned_noise(self.rows, self.force_noise, self.measured_torque)
+        """Of models with physics."""
+        if self.levels is None:
+            measured = self.measured_torque and self.force_noise is not None
+            return learned_noise(self.rows, self.force_noise, measured)
+        acceleration, force = (
+            tuple(float(std) for std in stds) for stds in (self.levels.acceleration, self.levels.force)
+        )
+        return Noise(acceleration, force, measured_torque=self.measured_torque)
 
     def system(self, mean: str) -> MechanicalSystem:
         """The system of this name: given, or an identification. Raises FitError where that has failed."""
@@ -171,7 +180,7 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
     if name in CANDIDATES:
         return CANDIDATES[name]
     if name.removeprefix(IDENTIFIED) in IDENTIFICATIONS and name.startswith(IDENTIFIED):
-        return _identified_candidate(name.removeprefix(IDENTIFIED))
+        return _identified_candidate(name.removeprefix(IDENTIFIED), identification)
     expression, at, mean = (part.strip() for part in name.partition(MEAN))
     mean = mean if at else "given"
     method = {"given": None, "identified": identification}.get(mean, mean)
@@ -191,17 +200,23 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
     takes = "as given" if method is None else f"identified by {IDENTIFICATIONS[method].summary}"
     return Candidate(
         f"Gaussian processes on unknown forces ({expression}), mean of the system {takes}",
-        "force prior" if method is None or not IDENTIFICATIONS[method].all_rows else "yardstick",
+        "yardstick" if _is_yardstick(method, identification) else "force prior",
         partial(_fit_forces, expression, "given" if method is None else method),
         method,
         cost=10.0,
     )
 
 
-def _identified_candidate(method: str) -> Candidate:
+def _is_yardstick(method: str | None, identification: str) -> bool:
+    """Whether it knows more rows than the others: unless all that is `@identified` does."""
+    return method is not None and method != identification and IDENTIFICATIONS[method].all_rows
+
+
+def _identified_candidate(method: str, identification: str) -> Candidate:
     chosen = IDENTIFICATIONS[method]
-    kind: Kind = "yardstick" if chosen.all_rows else "identified"
-    summary = f"the system identified by {chosen.summary}; noise learned"
+    kind: Kind = "yardstick" if _is_yardstick(method, identification) else "identified"
+    noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
+    summary = f"the system identified by {chosen.summary}; {noise}"
     return Candidate(summary, kind, partial(_fit_system, method), method)
 
 

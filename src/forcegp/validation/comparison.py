@@ -15,6 +15,7 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from forcegp import __version__
+from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
 from forcegp.errors import FitError, ForceGPError, InvalidInput
 from forcegp.evaluation.machine import machine
@@ -22,7 +23,13 @@ from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.validation.candidates import Candidate, Training
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions, motion_scores
-from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, Identification, learned_noise
+from forcegp.validation.identified_systems import (
+    DEFAULT_IDENTIFICATION,
+    FRICTION,
+    IDENTIFICATIONS,
+    Identification,
+    learned_noise,
+)
 from forcegp.validation.kept_cells import KeptCells
 from forcegp.validation.scores import acceleration_scores, mass_matrices
 from forcegp.validation.splits import Split
@@ -46,7 +53,9 @@ class Comparison:
     identification: what `@identified` and the mass matrix of force errors take, a key of `IDENTIFICATIONS`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
-    measured_torque: whether predictions know that their u is as noisy (`Noise`); needs `force_noise`.
+    measured_torque: whether predictions know that their u is as noisy (`Noise`); needs `force_noise`, or models that
+        rest on an identification that knows its noise.
+    friction: laws that identifications estimate, as in `forcegp.analytical.identify_analytical`.
 
     Raises InvalidInput for parts that do not fit, and DatasetError for splits whose sides overlap.
     """
@@ -64,6 +73,7 @@ class Comparison:
     iterations: int | None = None
     force_noise: float | None = None
     measured_torque: bool = False
+    friction: tuple[str, ...] = FRICTION
 
     def __post_init__(self) -> None:
         names = tuple(self.system.robot.joint_names)
@@ -76,7 +86,7 @@ class Comparison:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
-        learned_noise(self.rows, self.force_noise, self.measured_torque)
+        learned_noise(self.rows, self.force_noise)
         integrator_named(self.integrator, self.system)
         if self.identification not in IDENTIFICATIONS:
             given, allowed = self.identification, ", ".join(IDENTIFICATIONS)
@@ -103,7 +113,9 @@ class Comparison:
             "iterations",
             "force_noise",
             "measured_torque",
+            "friction",
         )
+        given = {name: getattr(self, name) for name in options}
         return {
             "forcegp": __version__,
             "rows_sha256": fingerprint(self.rows),
@@ -111,7 +123,7 @@ class Comparison:
             "system_sha256": hashlib.sha256(self.system.to_json().encode()).hexdigest(),
             "splits": [split.to_dict() for split in self.splits],
             "horizons": list(self.horizons),
-            **{name: getattr(self, name) for name in options},
+            **{name: list(value) if isinstance(value, tuple) else value for name, value in given.items()},
         }
 
 
@@ -197,9 +209,12 @@ def _identify(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, 
     if cell.work.all_rows:
         rows, _ = comparison.splits[cell.split].apply(comparison.rows)
     start = time.process_time()
-    system = cell.work.identify(comparison.system, rows)
+    system = cell.work.identify(comparison.system, rows, comparison.friction)
+    told: dict[str, Any] = {"how": cell.work.summary, "training_rows": len(rows)}
+    if cell.work.noise is not None:
+        noise = cell.work.noise(comparison.system, rows, comparison.friction)
+        told["noise"] = {"acceleration": noise.acceleration.tolist(), "force": noise.force.tolist()}
     seconds = time.process_time() - start
-    told = {"how": cell.work.summary, "training_rows": len(rows)}
     return {"cpu_seconds": seconds, **told, "system": system.to_dict()}
 
 
@@ -208,9 +223,9 @@ def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any
     rows, test = _training_rows(comparison, cell)
     name = cell.work.identification
     identified: dict[str, MechanicalSystem | str] = {}
-    before = 0.0
+    before, noise = 0.0, None
     if name is not None:
-        identified[name], before = identified_system(comparison, kept, name, cell.split, cell.seed)
+        identified[name], before, noise = identified_system(comparison, kept, name, cell.split, cell.seed)
     training = Training(
         rows,
         comparison.system,
@@ -220,6 +235,7 @@ def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any
         comparison.iterations,
         comparison.force_noise,
         comparison.measured_torque,
+        noise,
     )
     start = time.process_time()
     posterior = cell.work.fit(training)
@@ -234,12 +250,15 @@ def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any
 
 def identified_system(
     comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int
-) -> tuple[MechanicalSystem | str, float]:
-    """The system of a finished identification, or why there is none, and the CPU seconds that it took."""
+) -> tuple[MechanicalSystem | str, float, NoiseLevels | None]:
+    """The system of a finished identification, or why there is none, its CPU seconds and its noise if it knows it."""
     found = _identification(comparison, kept, name, split, seed)
-    if found["result"] is None:
-        return str(found["error"]), 0.0
-    return MechanicalSystem.from_dict(found["result"]["system"]), found["result"]["cpu_seconds"]
+    result = found["result"]
+    if result is None:
+        return str(found["error"]), 0.0, None
+    noise = result.get("noise")
+    levels = None if noise is None else NoiseLevels(*(np.array(noise[kind]) for kind in ("acceleration", "force")))
+    return MechanicalSystem.from_dict(result["system"]), result["cpu_seconds"], levels
 
 
 def _identification(comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int) -> dict[str, Any]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from forcegp.analytical import identify_analytical
+from forcegp.analytical import NoiseLevels, held_out_noise, identify_analytical
 from forcegp.data import Dataset
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise
@@ -39,35 +39,48 @@ class Identification:
     Fields
     ------
     summary: how, as a part of a sentence.
-    identify: (given system, training rows) -> identified system.
-    all_rows: from all training rows, not from those few that every model learns from: a yardstick.
+    identify: (given system, training rows, friction laws) -> identified system.
+    all_rows: from all training rows, not from those few that every model learns from.
+    noise: (given system, training rows, friction laws) -> the noise about it, for models that rest on it; None where
+        these learn theirs.
     """
 
     summary: str
-    identify: Callable[[MechanicalSystem, Dataset], MechanicalSystem]
+    identify: Callable[[MechanicalSystem, Dataset, Sequence[str]], MechanicalSystem]
     all_rows: bool = False
+    noise: Callable[[MechanicalSystem, Dataset, Sequence[str]], NoiseLevels] | None = None
 
 
-def _identified(system: MechanicalSystem, rows: Dataset, **how: Any) -> MechanicalSystem:
-    return identify_analytical(system, rows, **how).system
+def _identified(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> MechanicalSystem:
+    return identify_analytical(system, rows, friction=friction, **how).system
 
 
-_LEAST_SQUARES = partial(_identified, inertias="free", likelihood="torque")
-_TORQUE = partial(_identified, inertias="consistent", likelihood="torque")
-_ACCELERATION = partial(_identified, inertias="consistent", likelihood="acceleration")
+def _noise(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> NoiseLevels:
+    return held_out_noise(system, rows, friction=friction, **how)
+
+
+def _consistent(likelihood: str, rows: str, all_rows: bool) -> Identification:
+    how = {"inertias": "consistent", "likelihood": likelihood}
+    method = {"torque": "least squares of joint forces", "acceleration": "maximum likelihood of accelerations"}
+    summary = f"{method[likelihood]}{rows}, physically consistent"
+    noise = partial(_noise, **how) if all_rows else None
+    return Identification(summary, partial(_identified, **how), all_rows, noise)
+
 
 IDENTIFICATIONS: dict[str, Identification] = {
     "least-squares": Identification(
-        "ordinary least squares of joint forces, whose inertias need not belong to a body", _LEAST_SQUARES
+        "ordinary least squares of joint forces, whose inertias need not belong to a body",
+        partial(_identified, inertias="free", likelihood="torque"),
     ),
-    "torque": Identification("least squares of joint forces, physically consistent", _TORQUE),
-    "acceleration": Identification("maximum likelihood of accelerations, physically consistent", _ACCELERATION),
-    "torque-all": Identification("least squares of joint forces of ALL training rows", _TORQUE, all_rows=True),
-    "acceleration-all": Identification(
-        "maximum likelihood of accelerations of ALL training rows", _ACCELERATION, all_rows=True
-    ),
+    "torque": _consistent("torque", "", False),
+    "acceleration": _consistent("acceleration", "", False),
+    "torque-all": _consistent("torque", " of ALL training rows", True),
+    "acceleration-all": _consistent("acceleration", " of ALL training rows", True),
 }
 """By name. Add your own: IDENTIFICATIONS["mine"] = Identification("how", identify_mine)."""
+
+FRICTION = ("viscous", "coulomb")
+"""Laws that are identified where nothing else is asked for."""
 
 DEFAULT_IDENTIFICATION = "acceleration"
 """What `@identified` and the mass matrix of force errors take where nothing else is asked for."""

@@ -58,11 +58,21 @@ def _done(document: Mapping[str, Any]) -> list[str]:
         "each joint's acceleration among the training rows; networks estimate their own. Intervals and densities are "
         "those of measurements."
     )
+    laws = ", ".join(document["configuration"]["friction"]) or "none"
+    lines.append(f"* Friction that identifications estimate: {laws}.")
     force_noise = document["configuration"]["force_noise"]
     if force_noise is not None:
-        taken = ", and take the u of predictions to be as noisy" if document["configuration"]["measured_torque"] else ""
+        lines.append(f"* Models with physics learn a noise of the joint forces as well, from {force_noise:g} on.")
+    if any("noise" in (cell["result"] or {}) for cell in document["identifications"]):
         lines.append(
-            f"* Models with physics learn a noise of the joint forces as well, from {force_noise:g} on{taken}."
+            "* Models that rest on an identification of all training rows do not learn their noise: they have that of "
+            "accelerations and forces about stretches of training rows, each predicted by a system identified from the "
+            "others (block cross-validation)."
+        )
+    if document["configuration"]["measured_torque"]:
+        lines.append(
+            "* Where models have a noise of forces, it is that of measured torques: the u of a prediction is as noisy, "
+            "and accelerations that only this noise explains are shrunk."
         )
     whose = "; ".join(document["mass_matrix"]) or "none, since no model finished"
     lines.append(
