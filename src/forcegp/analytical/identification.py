@@ -56,7 +56,7 @@ def identify_analytical(
         accelerations are noisy (differentiated positions) and forces are, too (`NoiseLevels`); needs consistent
         inertias.
     prior_strength: weight w of a prior w/2 d^2 around the system that is given, with d the affine-invariant distance of
-        bodies (a mass wrong by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
+        bodies (one heavier throughout by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
         decides what the data do not, and hardly what they do.
     robust: count residuals beyond 1.5 standard deviations by their absolute value (soft L1).
     rows: use so many at most, evenly spread.
