@@ -182,7 +182,7 @@ def mcap(folder: Path) -> Path:
 
 
 def unknown_compression(folder: Path) -> Path:
-    path = next(write_bag2(folder / "log", motion(), compressed=True).glob("*.mcap"))
+    path = next(write_bag2(folder / "log", motion(), compressed="STORAGE").glob("*.mcap"))
     content = path.read_bytes()
     assert b"zstd" in content
     path.write_bytes(content.replace(b"zstd", b"brot"))

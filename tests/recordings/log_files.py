@@ -97,12 +97,15 @@ def joint_states(data: dict[str, np.ndarray], store, *, ros1: bool):
         yield stamp, state(header=made, name=list(JOINTS), **values)
 
 
-def write_bag1(path: Path, data: dict[str, np.ndarray]) -> Path:
+def write_bag1(path: Path, data: dict[str, np.ndarray], compression: str | None = None) -> Path:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
-    with Writer(path) as bag:
+    bag = Writer(path)
+    if compression is not None:
+        bag.set_compression(Writer.CompressionFormat[compression])
+    with bag:
         connection = bag.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
         for stamp, message in joint_states(data, store, ros1=True):
             bag.write(connection, stamp + 1000, store.serialize_ros1(message, connection.msgtype))
@@ -110,7 +113,7 @@ def write_bag1(path: Path, data: dict[str, np.ndarray]) -> Path:
 
 
 def write_bag2(
-    path: Path, data: dict[str, np.ndarray], storage: str = "mcap", gripper: bool = False, compressed: bool = False
+    path: Path, data: dict[str, np.ndarray], storage: str = "mcap", gripper: bool = False, compressed: str | None = None
 ) -> Path:
     """A folder; with `gripper`, another publisher on the same topic now and then."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -119,8 +122,8 @@ def write_bag2(
     store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     bag = Writer(path, version=9, storage_plugin=plugin)
-    if compressed:
-        bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    if compressed is not None:
+        bag.set_compression(CompressionMode[compressed], CompressionFormat.ZSTD)
     with bag:
         connection = bag.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
         wrench = bag.add_connection("/wrench", "geometry_msgs/msg/WrenchStamped", typestore=store)

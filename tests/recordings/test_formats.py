@@ -197,7 +197,25 @@ class TestBareSqlite(Bags):
 
 class TestCompressedMcap(TestRos2Folder):
     def write(self, folder):
-        return write_bag2(folder / "log", motion(), compressed=True)
+        return write_bag2(folder / "log", motion(), compressed="STORAGE")
+
+
+class TestCompressedMessages(TestRos2Folder):
+    def write(self, folder):
+        return write_bag2(folder / "log", motion(), compressed="MESSAGE")
+
+
+class TestCompressedSqlite(TestRos2Folder):
+    def write(self, folder):
+        return write_bag2(folder / "log", motion(), "sqlite3", compressed="FILE")
+
+    def truncated(self, path):
+        return next(path.glob("*.zstd"))
+
+
+class TestCompressedRos1Bag(Bags):
+    def write(self, folder):
+        return write_bag1(folder / "log.bag", motion(), "LZ4")
 
 
 class TestTopicWithTwoPublishers(TestRos2Folder):
