@@ -51,7 +51,7 @@ def made(*names):
     system = replace(bare, known_forces=listed)
     q, v, u, a = states()
     rotors = next((name for name in names if name in ("armature", "rotor")), None)
-    terms = joint_terms(system, [name for name in names if name and name != rotors], rotors, q, v, a)
+    terms = joint_terms(system, [name for name in names if name and name != rotors], rotors, q, v, u, a)
     return system, terms, (q, v, u, a)
 
 
@@ -107,13 +107,13 @@ def test_jacobians(names, likelihood):
     ],
 )
 def test_choices_that_make_no_sense(friction, rotors, said):
-    q, v, _, a = states()
+    q, v, u, a = states()
     with pytest.raises(InvalidInput, match=said):
-        joint_terms(arm_system(0), friction, rotors, q, v, a)
+        joint_terms(arm_system(0), friction, rotors, q, v, u, a)
 
 
 def test_a_force_that_is_listed_twice_is_not_estimated():
     twice = replace(arm_system(0), known_forces=(*arm_system(0).known_forces, FORCES["viscous"], FORCES["viscous"]))
-    q, v, _, a = states()
+    q, v, u, a = states()
     with pytest.raises(InvalidInput, match="more than once"):
-        joint_terms(twice, ("viscous",), None, q, v, a)
+        joint_terms(twice, ("viscous",), None, q, v, u, a)

@@ -14,6 +14,7 @@ The distance is a vector norm, so that it can stand among the residuals of non-l
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -33,6 +34,9 @@ _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3
 
 class BodyCoordinates(ABC):
     """Ten coordinates x of each of n bodies, 0 at the reference pseudo-inertias (n, 4, 4), which are definite."""
+
+    longest_step: ClassVar[float] = np.inf
+    """Most that a coordinate should change at once: infinite where parameters are linear in them."""
 
     def __init__(self, reference: Float[np.ndarray, "n 4 4"]):
         self.factors = upper_cholesky(reference)
@@ -90,6 +94,8 @@ class FreeBodies(BodyCoordinates):
 
 class ConsistentBodies(BodyCoordinates):
     """Parameters of bodies of positive density: relative log-Cholesky coordinates alpha, d1-3, s12, s23, s13, t1-3."""
+
+    longest_step: ClassVar[float] = 1.0  # a mass by a factor of e^2
 
     @override
     def pseudo_inertias(self, x: np.ndarray) -> np.ndarray:

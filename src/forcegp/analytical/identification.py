@@ -89,7 +89,7 @@ def identify_analytical(
     system = system.with_robot(robot)
     reference = body_pseudo_inertias(robot).cpu().numpy()
     bodies: BodyCoordinates = ConsistentBodies(reference) if inertias == "consistent" else FreeBodies(reference)
-    terms = joint_terms(system, friction, rotors, q, v, a)
+    terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)
     split = bodies.size
@@ -115,6 +115,7 @@ def identify_analytical(
         return weight * values, weight * jacobian
 
     low, high = terms.bounds
+    longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
     bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
 
     def search(start: np.ndarray, whitening: np.ndarray | None = None) -> Fit:
@@ -122,7 +123,7 @@ def identify_analytical(
             r, jacobian = residual(x)
             return (r, jacobian) if whitening is None else ((whitening @ r[..., None])[..., 0], whitening @ jacobian)
 
-        return weighted_least_squares(white, prior, start, bounds, robust=robust, progress=progress)
+        return weighted_least_squares(white, prior, start, bounds, longest=longest, robust=robust, progress=progress)
 
     fit, noise = search(np.concatenate([np.zeros(split), terms.start()])), None
     for _ in range(REWEIGHTINGS if likelihood == "acceleration" else 0):
@@ -144,12 +145,22 @@ def identify_analytical(
 
 
 def joint_terms(
-    system: MechanicalSystem, friction: Sequence[str], rotors: str | None, q: np.ndarray, v: np.ndarray, a: np.ndarray
+    system: MechanicalSystem,
+    friction: Sequence[str],
+    rotors: str | None,
+    q: np.ndarray,
+    v: np.ndarray,
+    u: np.ndarray,
+    a: np.ndarray,
 ) -> JointTerms:
-    """Terms whose coordinates are in proportion to the torques of inverse dynamics, velocities and M of these rows."""
+    """Terms whose coordinates are in proportion to the forces, velocities and M of these rows.
+
+    Forces are those measured or those of inverse dynamics, whichever are larger: light joints may have friction alone,
+    passive ones are not driven.
+    """
     kinematics = system.robot.kinematics(*(torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v)))
-    torque = kinematics.inverse_dynamics(torch.as_tensor(np.array(a), device=system.robot.device)).cpu().numpy()
+    needed = kinematics.inverse_dynamics(torch.as_tensor(np.array(a), device=system.robot.device)).cpu().numpy()
     mass = system.mass_matrix(kinematics).diagonal(dim1=-2, dim2=-1).mean(0).cpu().numpy()
-    typical = [np.sqrt((x**2).mean(0)) for x in (torque, v)]
-    torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in typical)
+    needed, measured, speed = (np.sqrt((x**2).mean(0)) for x in (needed, u, v))
+    torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in (np.maximum(needed, measured), speed))
     return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)

@@ -228,6 +228,11 @@ class JointTerms:
         each = np.repeat(np.array(limits).reshape(-1, 2), len(self.joints), axis=0)
         return each[:, 0], each[:, 1]
 
+    @property
+    def longest_steps(self) -> Float[np.ndarray, " k"]:
+        """Most that a coordinate should change at once: infinite for those that the torque is linear in."""
+        return (np.where(self._logarithms, 1.0, np.inf) * np.ones_like(self._sizes)).ravel()
+
     def start(self, unlisted: float = 1.0) -> Float[np.ndarray, " k"]:
         """Coordinates of what the system lists; of what it does not, `unlisted`, and typical velocities."""
         rows: list[np.ndarray] = []

@@ -22,8 +22,6 @@ MOST_EVALUATIONS = 300
 """Of the residuals in one round."""
 CONTENT = 0.01
 """Two steps in a row that lower the objective by less than so many nats end a round."""
-LONGEST_STEP = 1.0
-"""Most that a coordinate may change at once: a mass by a factor of e^2."""
 LEAST_NOISE = 1e-6
 """Noise that is this fraction of the residual at the start counts as none: the data are exact."""
 SETTLED = 1e-3
@@ -70,10 +68,14 @@ def weighted_least_squares(
     start: Float[np.ndarray, " k"],
     bounds: tuple[np.ndarray, np.ndarray],
     *,
+    longest: Float[np.ndarray, " k"] | float = np.inf,
     robust: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> Fit:
-    """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round."""
+    """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
+
+    `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it.
+    """
     last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
     def at(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +89,7 @@ def weighted_least_squares(
     noise, evaluations, settled, converged = _noise(r, robust), 0, False, False
     floor = np.maximum(LEAST_NOISE * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
-        x, nfev, converged = _minimized(at, prior, x, bounds, noise, robust)
+        x, nfev, converged = _minimized(at, prior, x, bounds, longest, noise, robust)
         evaluations += nfev
         r, jacobian = at(x)
         before, noise = noise, np.maximum(_noise(r, robust), floor)
@@ -112,7 +114,13 @@ class _Point:
 
 
 def _minimized(
-    at: Residual, prior: Prior, x: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], noise: np.ndarray, robust: bool
+    at: Residual,
+    prior: Prior,
+    x: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    longest: np.ndarray | float,
+    noise: np.ndarray,
+    robust: bool,
 ) -> tuple[np.ndarray, int, bool]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, and whether it converged.
 
@@ -127,7 +135,7 @@ def _minimized(
         step = np.zeros_like(here.x)
         diagonal = np.diag(curvature.diagonal() + 1e-12)
         step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
-        step *= min(1.0, LONGEST_STEP / max(float(abs(step).max()), 1e-300))
+        step /= max(1.0, float((abs(step) / longest).max()))
         there = np.clip(here.x + step, low, high)
         moved = there - here.x
         expected = -float(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
