@@ -82,8 +82,8 @@ def test_what_was_repaired_is_said(forcegp, tmp_path):
     write_text(tmp_path / "log.csv", columns)
     done = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "1 rows with a repeated time stamp dropped" in done.stderr
-    assert "1 gaps of up to 0.502 s begin new episodes" in done.stderr
+    assert "1 row with a repeated time stamp dropped" in done.stderr
+    assert "1 gap of up to 0.502 s splits it" in done.stderr
     assert "resampled to 512 Hz: steps deviate by up to" in done.stderr
     assert "in 2 episodes" in done.stdout
 
@@ -111,5 +111,5 @@ def test_messages_of_another_publisher_are_left_out_and_said(forcegp, tmp_path):
     columns = ("--q", "/joint_states:position.{joints}", "--u", "/joint_states:effort.{joints}")
     done = forcegp("import", "log", *columns, "--joints", "shoulder,elbow", "--out", "log.h5", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "67 messages without all of the columns left out" in done.stderr
+    assert "messages left out because they lack a column, as those of another publisher do: 67" in done.stderr
     assert len(Dataset.load(tmp_path / "log.h5")) == 200

@@ -84,7 +84,7 @@ class SourceConformance(ABC):
 
     def test_files_exist(self, source):
         assert source.files()
-        assert all(file.is_file() or file.is_dir() for file in source.files())
+        assert all(file.is_file() for file in source.files())
 
     @pytest.mark.parametrize("share", [0.3, 0.9])
     def test_half_a_file_is_refused_by_name(self, own_path, share):

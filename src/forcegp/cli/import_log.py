@@ -44,6 +44,10 @@ class Import(PreparationOptions, RobotOptions):
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
     """
 
+    robot: Annotated[Path | None, arg(metavar="ARM.urdf", constructor=Path, help_behavior_hint="(default: none)")] = (
+        None
+    )
+    """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
     logs: Positional[Annotated[tuple[Path, ...], arg(metavar="LOG...")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
@@ -228,11 +232,14 @@ def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
     for recording in done["recordings"]:
         told = list(recording["notes"])
         if recording["repeated_stamps_dropped"]:
-            told.append(f"{recording['repeated_stamps_dropped']} rows with a repeated time stamp dropped")
+            told.append(f"{_counted(recording['repeated_stamps_dropped'], 'row')} with a repeated time stamp dropped")
         if recording["gaps"]:
-            told.append(f"{len(recording['gaps'])} gaps of up to {max(recording['gaps']):.4g} s begin new episodes")
+            count, longest = len(recording["gaps"]), max(recording["gaps"])
+            told.append(f"{_counted(count, 'gap')} of up to {longest:.4g} s {'splits' if count == 1 else 'split'} it")
         if recording["rows_in_stretches_too_short"]:
-            told.append(f"{recording['rows_in_stretches_too_short']} rows in stretches of fewer than 5 left out")
+            told.append(
+                f"{_counted(recording['rows_in_stretches_too_short'], 'row')} in stretches of fewer than 5 left out"
+            )
         if told:
             terminal.note(f"{recording['name']}: {'; '.join(told)}")
     if done["resampled_to_step"] is not None:
@@ -251,4 +258,9 @@ def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
     if done.get("preparation", {}).get("cutoff") is not None:
         how = "filtered and differentiated anew"
     seconds = sum(recording["seconds"] for recording in done["recordings"])
-    terminal.say(f"{out}: {done['rows']} rows in {len(done['episodes'])} episodes ({seconds:.4g} s); {how}")
+    rows, episodes = _counted(done["rows"], "row"), _counted(len(done["episodes"]), "episode")
+    terminal.say(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"

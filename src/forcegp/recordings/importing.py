@@ -262,7 +262,5 @@ def _what_was_done(
 
 
 def _digest(path: Path) -> str:
-    if path.is_dir():
-        return ""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -111,10 +111,16 @@ class RosBag(Source):
         return stamp if stamp in columns else f"{topic}:{LOG_TIME}"
 
     @override
+    def files(self) -> tuple[Path, ...]:
+        if self.path.is_file():
+            return (self.path,)
+        return tuple(sorted(file for file in self.path.iterdir() if file.is_file()))
+
+    @override
     def notes(self) -> tuple[str, ...]:
         if not self._left_out:
             return ()
-        return (f"{self._left_out} messages without all of the columns left out (another publisher on the topic)",)
+        return (f"messages left out because they lack a column, as those of another publisher do: {self._left_out}",)
 
     def _topic_of(self, name: str) -> str:
         return next(topic for topic, names in self._topics.items() if name in names)
