@@ -255,6 +255,16 @@ BROKEN = {
     "text": Broken(
         text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "stop", 1)), "'q_elbow' holds 'stop' at row 4"
     ),
+    "dates": Broken(
+        written("log.csv", b"time,q,u\n2024-01-01 12:00:00.5,0,0\n"),
+        "Write the time as a number of seconds",
+        "--time time --q q --u u --joints a",
+    ),
+    "decimal commas": Broken(
+        written("log.csv", b"time;q;u\n0,5;0;0\n"),
+        "Write decimal points instead of commas",
+        "--time time --q q --u u --joints a",
+    ),
     "ragged": Broken(text(lambda t: t + "1.0,2.0\n"), "row 200 (line 202) has 2 fields instead of 7"),
     "cut line": Broken(text(lambda t: t[:-40]), "fields instead of 7"),
     "duplicate names": Broken(text(lambda t: t.replace("v_elbow", "q_elbow")), "'q_elbow' stands over columns 3, 5"),

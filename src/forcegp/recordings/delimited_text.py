@@ -181,7 +181,7 @@ class DelimitedText(Source):
             name = "c1" if self._lines_per_row > 1 else self._columns[int(column)]
             where = f" at {self._line(int(row))}" if row else ""
             return FileFormatError(
-                f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. Repair or remove that row."
+                f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. {_remedy(value)}"
             )
         if ragged:
             row, expected, found = ragged.groups()
@@ -196,6 +196,14 @@ class DelimitedText(Source):
         """Where a line stands that pyarrow counts from 1."""
         row = (number - 1) // self._lines_per_row
         return self.place(row)
+
+
+def _remedy(value: str) -> str:
+    if re.fullmatch(r"[+-]?\d+,\d+", value):
+        return "Write decimal points instead of commas."
+    if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", value):
+        return "Write the time as a number of seconds, or give --step."
+    return "Repair or remove that row."
 
 
 def _numbers(column) -> np.ndarray:

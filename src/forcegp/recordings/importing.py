@@ -16,7 +16,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings.array_file import ArrayFile
 from forcegp.recordings.episode_rows import EpisodeRows
 from forcegp.recordings.formats import open_source
-from forcegp.recordings.mapping import ColumnMapping
+from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.plausibility import require_plausible_positions, warn_of_implausible_forces
 from forcegp.recordings.reading import RawRecording, read_recording
 from forcegp.recordings.side_by_side import SideBySide
@@ -233,12 +233,12 @@ def _what_was_done(
     sources: Sequence[tuple[str, Source]],
 ) -> dict[str, Any]:
     files = dict.fromkeys(file for _, source in sources for file in source.files())
-    logged = {name: "logged" for name in plan.logged}
+    made = {"v": "central differences of q", "a": "central differences of v"}
     return {
         "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
-        "signals": {"v": "central differences of q", "a": "central differences of v"} | logged,
+        "signals": {name: "logged" if name in plan.logged else made[name] for name in SIGNALS},
         "recordings": [
             {
                 "name": recording.label,

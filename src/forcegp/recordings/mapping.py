@@ -112,4 +112,5 @@ class ColumnMapping:
 def _shortened(value: Any) -> Any:
     if not isinstance(value, tuple):
         return value
-    return value[0] if len(value) == 1 else list(value)
+    alone = len(value) == 1 and "," not in str(value[0])  # a text with a comma would be read as a list
+    return value[0] if alone else list(value)
