@@ -163,9 +163,15 @@ def cells_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int
         Cell(IDENTIFICATION, name, each, *place)
         for place in places
         for name, each in IDENTIFICATIONS.items()
-        if name in wanted or (name == comparison.identification and place[1] == 0)
+        if (name in wanted and place[1] == _seed_of(name, place[1]))
+        or (name == comparison.identification and place[1] == 0)
     ]
     return first, [Cell(MODEL, name, each, *place) for place in places for name, each in models.items()]
+
+
+def _seed_of(identification: str, seed: int) -> int:
+    """Seeds choose rows, so what takes all of them is done once."""
+    return 0 if IDENTIFICATIONS[identification].all_rows else seed
 
 
 def compute(comparison: Comparison, kept: KeptCells, cell: Cell) -> None:
@@ -252,7 +258,7 @@ def identified_system(
     comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int
 ) -> tuple[MechanicalSystem | str, float, NoiseLevels | None]:
     """The system of a finished identification, or why there is none, its CPU seconds and its noise if it knows it."""
-    found = _identification(comparison, kept, name, split, seed)
+    found = _identification(comparison, kept, name, split, _seed_of(name, seed))
     result = found["result"]
     if result is None:
         return str(found["error"]), 0.0, None
