@@ -60,7 +60,9 @@ def main(words: list[str]) -> None:
         compared("dfki", system, train, test, DRIVEN, "acceleration_nrmse")
     if "panda" in names:
         system = panda_system(folder)
-        compared("panda", system, *panda(folder, system), MANIPULATOR, "force_rms")
+        train, test = panda(folder, system)
+        compared("panda", system, train, test, MANIPULATOR, "force_rms")
+        compared("panda", system, train, test, MANIPULATOR[1:2], "acceleration_nrmse")
 
 
 def compared(
@@ -81,7 +83,7 @@ def compared(
 
 def told(what: str, scores: dict[str, list[float]], key: str) -> None:
     """One line."""
-    print(f"{key:>18}  {np.array2string(np.array(scores[key]), precision=4, max_line_width=200)}  {what}", flush=True)
+    print(f"{key:>18} {np.array2string(np.array(scores[key]), precision=4, max_line_width=200)}  {what}", flush=True)
 
 
 if __name__ == "__main__":

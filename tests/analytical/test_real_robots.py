@@ -20,7 +20,7 @@ def test_published_numbers_of_a_pendulum_predict_its_motion(shared):
 
 
 def test_eleven_parameters_of_a_driven_pendulum_from_accelerations(shared):
-    """As good on other runs as analytical parameters that were fitted by hand: nRMSE .156 and .111."""
+    """At least as good on other runs as eleven analytical parameters of the pendulum: nRMSE .156 and .111."""
     folder = shared("realdata")
     system = dfki_system(folder)
     train = dfki(folder, system, 143524, 143601, 143704, 144115)
@@ -28,7 +28,7 @@ def test_eleven_parameters_of_a_driven_pendulum_from_accelerations(shared):
     found = identify_analytical(system, train, rotors="rotor", likelihood="acceleration", rows=2000)
     _, residual = motion_residuals(found.system, test)
     nrmse = np.sqrt((residual**2).mean(0)) / test.a.std(0)
-    assert (nrmse < [0.159, 0.113]).all()
+    assert (nrmse < [0.157, 0.112]).all()
 
 
 @pytest.mark.parametrize("inertias", ["free", "consistent"])
