@@ -1,7 +1,7 @@
 """Is it better to filter and differentiate a log, or to learn from windows of its raw positions? On two real rigs.
 
     python -m benchmarks.without_accelerations ../shared/realdata [--rig dfki|multiarm] [--points 100] [--seeds 3]
-                                               [--encoder COUNTS]
+                                               [--encoder COUNTS] [--only TEXT]
 
 Both sides learn the same forces from the same number of points of the same training runs, windows or rows, with one
 search from moments. Filtered rows: zero-phase Butterworth of order 4 on q and u, v and a by central differences, 0.12 s
@@ -136,23 +136,35 @@ def coarse(rig: Rig, counts: int) -> Rig:
     return replace(rig, train=replace(rig.train, q=q, v=v))
 
 
-Source = float | Literal["auto"] | WindowObservation | None
-"""A cut-off in Hz, windows, or None: nothing is learned."""
+MORE, MORE_WINDOWS = 6, 3
+"""Rows for every point, and windows of 2 nodes: kernel matrices of the size that windows of 6 nodes have."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is learned from: rows after a low-pass [Hz], windows, or nothing; `times` as many as there are points."""
+
+    how: float | Literal["auto"] | WindowObservation | None
+    times: int = 1
 
 
 def sources(rig: Rig) -> Iterator[tuple[str, Source]]:
     """Filtered rows by their cut-off, then windows."""
-    yield "nothing: rigid bodies alone", None
-    yield "filtered, automatic cut-off", "auto"
+    yield "nothing: rigid bodies alone", Source(None)
+    yield "filtered, automatic cut-off", Source("auto")
     for cutoff in rig.cutoffs:
-        yield f"filtered at {cutoff:g} Hz", cutoff
+        yield f"filtered at {cutoff:g} Hz", Source(cutoff)
+    yield f"filtered at {rig.reference:g} Hz, {MORE} x the points", Source(rig.reference, MORE)
     for seconds in rig.seconds:
-        yield f"weak form, q, {seconds:g} s", WeakForm(seconds)
+        yield f"weak form, q, {seconds:g} s", Source(WeakForm(seconds))
+    short = WeakForm(min(rig.seconds), nodes=2)
+    yield f"weak form, {short.seconds:g} s, {MORE_WINDOWS} x the points", Source(short, MORE_WINDOWS)
     for seconds in rig.seconds:
-        yield f"velocity increments, {seconds:g} s", VelocityIncrements(seconds)
+        yield f"velocity increments, {seconds:g} s", Source(VelocityIncrements(seconds))
 
 
-def fitted(rig: Rig, how: Source, points: int, seed: int) -> StructuredPosterior:
+def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPosterior:
+    how, points = source.how, source.times * points
     if how is None:
         return StructuredGP(rig.train.system, NoForces(), noise=Noise(1.0)).fit(rig.train, points=2)
     model = StructuredGP(rig.train.system, rig.prior, rig.mean)
@@ -199,23 +211,25 @@ class Targets:
         return [*normalised, *np.sqrt([apart[:, k].mean() for k in at])]
 
 
-def compare(rig: Rig, points: int, seeds: int) -> None:
-    """Fit and score both sides, and print medians over the seeds with the range of the longest horizon."""
+def compare(rig: Rig, points: int, seeds: int, only: str) -> None:
+    """Fit and score sources with `only` in their names; print medians and the range of the longest horizon."""
     targets = Targets.of(rig)
-    print(f"{'learned from':30} {'nRMSE a':>13} " + " ".join(f"q {h:4.2f} s" for h in HORIZONS) + "  range, CPU s")
-    for label, how in sources(rig):
+    print(f"{'learned from':34} {'nRMSE a':>13} " + " ".join(f"q {h:4.2f} s" for h in HORIZONS) + "  range, CPU s")
+    for label, source in sources(rig):
+        if only not in label:
+            continue
         begin, found = time.process_time(), []
-        for seed in range(seeds if how is not None else 1):
+        for seed in range(seeds if source.how is not None else 1):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NumericalWarning)
                 warnings.simplefilter("ignore", DataWarning)
-                found.append(targets.scores(fitted(rig, how, points, seed)))
+                found.append(targets.scores(fitted(rig, source, points, seed)))
         table = np.array(found)
         middle, last = np.median(table, axis=0), table[:, -1]
         joints = "/".join(f"{value:.3f}" for value in middle[: -len(HORIZONS)])
         ahead = " ".join(f"{value:8.4f}" for value in middle[-len(HORIZONS) :])
         seconds = (time.process_time() - begin) / len(found)
-        print(f"{label:30} {joints:>13} {ahead}  {last.min():.4f}-{last.max():.4f} {seconds:5.0f}", flush=True)
+        print(f"{label:34} {joints:>13} {ahead}  {last.min():.4f}-{last.max():.4f} {seconds:5.0f}", flush=True)
 
 
 def main() -> None:
@@ -224,6 +238,7 @@ def main() -> None:
     parser.add_argument("--rig", choices=tuple(RIGS), action="append")
     parser.add_argument("--points", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", default="", metavar="TEXT", help="only what is learned from sources of that name")
     parser.add_argument("--encoder", type=int, metavar="COUNTS", help="round the training positions to such an encoder")
     given = parser.parse_args()
     if not given.folder.is_dir():
@@ -234,7 +249,7 @@ def main() -> None:
             coarser = "" if given.encoder is None else f", training positions rounded to {given.encoder} counts"
             print(f"{name}: {given.points} points, medians of {given.seeds} seeds{coarser}", flush=True)
             rig = RIGS[name](given.folder)
-            compare(rig if given.encoder is None else coarse(rig, given.encoder), given.points, given.seeds)
+            compare(rig if given.encoder is None else coarse(rig, given.encoder), given.points, given.seeds, given.only)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.without_accelerations import Targets, coarse, fitted, multiarm
+from benchmarks.without_accelerations import Source, Targets, coarse, fitted, multiarm
 
 from forcegp.cli.arguments import parse_arguments
 from forcegp.data import WeakForm
@@ -30,7 +30,7 @@ def test_raw_positions_of_a_real_pendulum_teach_its_dynamics(real_logs):
     few = replace(rig, test=rig.test.select_episodes(rig.test.episodes[:3]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
-        scores = Targets.of(few).scores(fitted(few, WeakForm(0.08), 80, seed=0))
+        scores = Targets.of(few).scores(fitted(few, Source(WeakForm(0.08)), 80, seed=0))
     assert max(scores[:2]) < 0.05  # of the standard deviation of the acceleration
     assert scores[2] < 0.01  # rad after 0.1 s
 
