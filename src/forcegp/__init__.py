@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from forcegp.analytical import AnalyticalIdentification, identify_analytical
-    from forcegp.data import Dataset, VelocityIncrements, WeakForm
+    from forcegp.checks import CheckReport, check
+    from forcegp.data import Dataset, Preparation, VelocityIncrements, WeakForm
     from forcegp.evaluation import Evaluation, PriorComparison, compare_priors, evaluate
     from forcegp.inference import Exact, Inducing, Iterative, Stochastic
     from forcegp.mechanics import (
@@ -79,6 +80,9 @@ __all__ = [
     "RotorInertia",
     # what was measured
     "Dataset",
+    "check",
+    "CheckReport",
+    "Preparation",
     "import_recordings",
     "ColumnMapping",
     "ImportOptions",
@@ -130,7 +134,8 @@ _ROOMS = {
     "mechanics": {"MechanicalSystem", "Contact", "Plane", "Sphere", "Cylinder", "ImplicitSurface", "Baumgarte"}
     | {"Actuation", "RigidBodyBias", "ViscousJointFriction", "CoulombJointFriction", "Armature"}
     | {"StribeckJointFriction", "LoadJointFriction", "ConstantJointForce", "RotorInertia"},
-    "data": {"Dataset", "VelocityIncrements", "WeakForm"},
+    "checks": {"CheckReport", "check"},
+    "data": {"Dataset", "Preparation", "VelocityIncrements", "WeakForm"},
     "recordings": {"ColumnMapping", "ImportOptions", "import_recordings"},
     "analytical": {"AnalyticalIdentification", "identify_analytical"},
     "priors": {"JointForces", "JointFriction", "PeriodicJointForces", "ToolForces", "ContactFriction", "Payload"}

@@ -48,8 +48,7 @@ def excitation_findings(evidence: Evidence) -> list[Finding]:
                 severity="look",
                 subject="excitation",
                 seen=f"{listed(still)} moved less than 0.02 rad (2 mm): {'its' if len(still) == 1 else 'their'} "
-                "friction and "
-                "inertia do not show.",
+                "friction and inertia do not show.",
                 remedy="Move every joint that is to be learned, or lock it in the robot (--lock JOINT=RAD).",
                 joints=tuple(still),
                 numbers={"joints": told},
@@ -61,8 +60,7 @@ def excitation_findings(evidence: Evidence) -> list[Finding]:
                 severity="look",
                 subject="excitation",
                 seen=f"{listed(one_way)} changed direction fewer than {FEWEST_CHANGES} times: friction of both "
-                "directions "
-                "cannot be told from gravity.",
+                "directions cannot be told from gravity.",
                 remedy="Record motion to and fro.",
                 joints=tuple(one_way),
                 numbers={"joints": told},
@@ -92,9 +90,8 @@ def _held(evidence: Evidence, still: list[str]) -> list[Finding]:
                 severity="look",
                 subject="held joint",
                 seen=f"{name} stays within {spans[first, joint]:.2g} rad or m in {len(held)} of {len(spans)} stretches "
-                "while "
-                f"other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it moves "
-                f"{spans[:, joint].max():.2g}.",
+                f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
+                f"moves {spans[:, joint].max():.2g}.",
                 remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
                 "(--lock).",
                 joints=(name,),

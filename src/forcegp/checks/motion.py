@@ -138,8 +138,7 @@ def _finding(
             severity="look",
             subject=what,
             seen=f"the {what} of {label} is logged {1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'} "
-            "than "
-            f"{derivative}: {abs(shift) / step:.1f} time steps.",
+            f"than {derivative}: {abs(shift) / step:.1f} time steps.",
             remedy=f"It was filtered by the robot: compute {name} from positions (forcegp prepare --cutoff auto "
             "--differentiate q).",
             joints=(label,),

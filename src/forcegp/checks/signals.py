@@ -204,8 +204,7 @@ def _limits(evidence: Evidence) -> list[Finding]:
                 f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
                 f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
                 remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
-                "is "
-                "not that of your robot, which does no harm here.",
+                "is not that of your robot, which does no harm here.",
                 joints=beyond,
                 numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
             )

@@ -126,8 +126,7 @@ def _unexplained(evidence: Evidence, log: Hypothesis) -> list[Finding]:
             severity="look",
             subject="torque",
             seen=f"most of some torques is not what inverse dynamics with a factor and friction gives: {shares} of "
-            "their "
-            "variance.",
+            "their variance.",
             remedy="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
             "nearly all friction or noise.",
             joints=tuple(evidence.names[joint] for joint in bad),
@@ -183,13 +182,16 @@ def _unit(evidence: Evidence, joint: int) -> str:
 
 def not_compared(evidence: Evidence) -> Finding:
     """What is said where torques cannot be compared."""
-    why = "the robot touches something" if evidence.contacts else "no robot was given"
+    if evidence.contacts:
+        return Finding(
+            severity="ok",
+            subject="torque",
+            seen="not compared with inverse dynamics: the robot touches something, and the forces of contacts are not "
+            "known. Check a log of free motion, too.",
+        )
     return Finding(
         severity="look",
         subject="torque",
-        seen=f"torques were not compared with inverse dynamics: {why}.",
-        remedy="The forces of contacts are not known; check a log of free motion, too."
-        if evidence.contacts
-        else "Add --robot ARM.urdf.",
-        joints=(),
+        seen="not compared with inverse dynamics: no robot was given.",
+        remedy="Add --robot ARM.urdf.",
     )

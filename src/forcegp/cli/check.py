@@ -105,7 +105,8 @@ def _shown(data: Path, report: CheckReport) -> list[Any]:
         findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), told)
         if finding.remedy:
             findings.add_row("", Text(f"→ {finding.remedy}", style="dim"))
-    return [heading, findings, _numbers(report, content)]
+    measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
+    return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
 
 
 def _numbers(report: CheckReport, content: Mapping[str, Any]) -> Any:

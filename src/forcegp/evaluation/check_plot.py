@@ -10,6 +10,7 @@ from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
 from forcegp.data import Dataset, Preparation, motion_spectrum
 from forcegp.evaluation.figure_style import (
+    KNOWN_PHYSICS,
     LARGE,
     MEASUREMENT,
     NORMAL,
@@ -23,6 +24,7 @@ from forcegp.evaluation.figure_style import (
     short_joint_names,
     window,
 )
+from forcegp.evaluation.prediction_plot import legend_entries
 from forcegp.evaluation.spectrum_plot import draw_cutoff, draw_time_steps
 
 if TYPE_CHECKING:
@@ -30,19 +32,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMNS = 3
-SECONDS = 10.0
+SECONDS = 5.0
 MOST_ROWS = 1000
 
 
 def check_figure(report: CheckReport) -> Figure:
-    """Torques of every joint over up to 10 s, then the spectra of all accelerations, then all time steps.
+    """Torques of every joint over up to 5 s, then the spectra of all accelerations, then all time steps.
 
     Where torques were not compared, positions are drawn instead.
     """
     evidence = report.evidence
     nv = evidence.log.nv
-    grid = -(-nv // COLUMNS) if nv > 4 else -(-nv // 2)
-    columns = COLUMNS if nv > 4 else min(nv, 2)
+    columns = min(nv, COLUMNS if nv != 4 else 2)
+    grid = -(-nv // columns)
     figure = new_figure(10.0, 1.75 * grid + 3.4)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7))
     panels = halves[0].subplots(grid, columns, sharex=True, squeeze=False)
@@ -57,8 +59,7 @@ def check_figure(report: CheckReport) -> Figure:
         bottom = joint + columns >= nv
         panel.tick_params(labelbottom=bottom)
         quiet(panel, title=_title(names[joint], report, joint), y=drawn[joint], x="time in s" if bottom else "")
-    counts = report.to_dict()["counts"]
-    handles, labels = panels.flat[0].get_legend_handles_labels()
+    handles, labels = legend_entries(*panels.flat[:nv])
     halves[0].legend(
         handles,
         labels,
@@ -67,7 +68,7 @@ def check_figure(report: CheckReport) -> Figure:
         fontsize=NORMAL,
         frameon=False,
         markerscale=4,
-        title=f"Check: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok",
+        title=_heading(report),
         title_fontproperties={"size": LARGE, "weight": "bold"},
         alignment="left",
     )
@@ -88,15 +89,28 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     rows = log.correction.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
     measured, fitted = rows.u[:, joint], log.fit.at(tau, rows)[:, joint]
-    axes.plot(rows.time, measured, color=MEASUREMENT, linewidth=2.2, label="measured (filtered)")
-    axes.plot(rows.time, tau[:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics of the URDF")
+    mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
+    if mended:
+        axes.plot(
+            rows.time, shown.u[:, joint], color=KNOWN_PHYSICS, linewidth=0.9, label="before the mistake is taken out"
+        )
+    axes.plot(rows.time, measured, color=MEASUREMENT, linewidth=2.2, label="measured, filtered")
+    axes.plot(rows.time, tau[:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics")
     style = (0, (4, 1.5))
-    label = "the same with a factor, armature and friction"
+    label = "with factor, armature, friction"
     axes.plot(rows.time, fitted, color=PREDICTION, linewidth=1.1, linestyle=style, label=label)
-    low, high = min(measured.min(), fitted.min()), max(measured.max(), fitted.max())
+    drawn = [measured, fitted, *([shown.u[:, joint]] if mended else [])]
+    low, high = min(values.min() for values in drawn), max(values.max() for values in drawn)
     space = 0.3 * max(float(high - low), 1e-9)
     axes.set_ylim(low - space, high + space)  # inverse dynamics alone may be far off: a wrong unit, say
     return joint_units(shown, "u")[joint]
+
+
+def _heading(report: CheckReport) -> str:
+    counts = report.to_dict()["counts"]
+    wrong = dict.fromkeys(finding.subject for finding in report.findings if finding.severity == "wrong")
+    what = f" ({', '.join(wrong)})" if wrong else ""
+    return f"Check: {counts['wrong']} wrong{what}, {counts['look']} to look at, {counts['ok']} ok"
 
 
 def _title(name: str, report: CheckReport, joint: int) -> str:

@@ -1,0 +1,39 @@
+"""The example of docs/checking.md runs as it stands and finds what it says; its commands are commands."""
+
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.check import Check
+from forcegp.cli.import_log import Import
+from forcegp.cli.prepare import Prepare
+
+
+@pytest.fixture(scope="module")
+def page(repository):
+    return (repository / "docs" / "checking.md").read_text(encoding="utf-8")
+
+
+def test_the_example_finds_what_was_planted(page, tmp_path):
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert re.search(r"\[wrong\] torque sign: the torque of elbow has the opposite sign", done.stdout)
+    delay = re.search(r"\[wrong\] delay: the torque of all joints is logged (\S+) ms .* later", done.stdout)
+    assert delay is not None
+    assert float(delay[1]) == pytest.approx(20.0, abs=1.5)
+    assert done.stdout.count("[wrong]") == 2
+
+
+def test_the_commands_are_commands(page):
+    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    parsed = [parse_arguments(shlex.split(line)[1:]) for line in commands.splitlines()]
+    assert [type(command) for command in parsed] == [Import, Check, Prepare]
+
+
+def test_its_links_lead_somewhere(page, repository):
+    for target in re.findall(r"\]\(([^)#]+)\)", page):
+        assert (repository / "docs" / target).exists(), target
