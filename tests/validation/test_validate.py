@@ -148,7 +148,7 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
 def test_an_identification_that_fails_leaves_the_mass_matrix_as_given_and_its_models_without_a_mean(
     data, tmp_path, monkeypatch
 ):
-    def fail(system, rows):
+    def fail(system, rows, friction):
         raise InvalidInput("too still")
 
     monkeypatch.setitem(IDENTIFICATIONS, "mine", Identification("my own way", fail))
@@ -189,7 +189,6 @@ def test_wrong_arguments_are_refused_before_anything_is_written(data, tmp_path, 
         ({"starts": 0}, "number of starts"),
         ({"restarts": 0}, "restarts is 0"),
         ({"integrator": "euler"}, "euler"),
-        ({"measured_torque": True}, "give force=SIGMA"),
         ({"force_noise": -1.0}, "force"),
         ({"identification": "guessing"}, "no identification is called 'guessing'"),
     ],
