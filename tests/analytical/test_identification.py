@@ -161,3 +161,16 @@ def test_systems_that_cannot_be_identified_so():
         identify_analytical(arm_system(1), data)
     with pytest.raises(InvalidInput, match="list it"):
         identify_analytical(arm_system(0, known_forces=(Actuation(),)), data)
+
+
+def test_standard_errors_are_those_of_the_posterior():
+    """Gauss-Newton's information, of independent residuals, inverted densely; and finite where there is hardly any."""
+    train = recorded(200, 30, torque_noise=0.2)
+    found = identify_analytical(train.system, train, friction=("viscous",), rotors=None)
+    information = found.fit.information + found.fit.prior_information
+    split = found.bodies.size
+    in_terms = np.sqrt(np.diag(np.linalg.inv(information)))[split:] * found.terms.slopes(found.fit.x[split:]).ravel()
+    ours = [found.standard_errors[f"viscous.{joint}"] for joint in ("pan", "lift", "bend")]
+    np.testing.assert_allclose(ours, in_terms, rtol=0.3)
+    poor = identify_analytical(given(), recorded(4, 31), inertias="free", prior_strength=1e-6)
+    assert np.isfinite(list(poor.standard_errors.values())).all()

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import torch
 from jaxtyping import Float, Int
 
@@ -105,21 +106,22 @@ class AnalyticalIdentification:
 
         Where the data say nothing it is the prior's spread. Linearised (delta method).
         """
-        return dict(zip(self.names, np.sqrt(np.diag(self._covariance)).tolist(), strict=True))
+        return dict(zip(self.names, np.linalg.norm(self._spread, axis=1).tolist(), strict=True))
 
     @cached_property
-    def _covariance(self) -> np.ndarray:
-        """Sandwich: information of the data counted as if only one row in a correlation time were independent."""
+    def _spread(self) -> np.ndarray:
+        """S with S S^T the covariance of all numbers, as if only one row in a correlation time were independent."""
         time = correlation_time(self.fit.residual / self.fit.noise, self.episode)
         scaled = self.fit.jacobian * (np.sqrt(self.fit.weight / time) / self.fit.noise)[..., None]
         flat = scaled.reshape(-1, scaled.shape[-1])
-        inverse = np.linalg.inv(flat.T @ flat + self.fit.prior_information)
-        moved = np.zeros((len(self.names), len(inverse)))
+        # by QR, not by normal equations, whose rounding can make a variance negative
+        root = np.linalg.qr(np.concatenate([flat, np.linalg.cholesky(self.fit.prior_information).T]), mode="r")
+        moved = np.zeros((len(self.names), len(root)))
         split = self.bodies.size
         for body, block in enumerate(self.bodies.derivatives(self._in_bodies)):
             moved[10 * body : 10 * body + 10, 10 * body : 10 * body + 10] = block
         moved[split:, split:] = np.diag(self.terms.slopes(self._in_terms).ravel())
-        return moved @ inverse @ moved.T
+        return scipy.linalg.solve_triangular(root, moved.T, trans="T").T
 
     # ------------------------------------------------------------------ what the data tell
 
