@@ -89,10 +89,16 @@ def test_a_model_that_fails_is_a_row_that_says_why(data, tmp_path):
         assert f"({name}.png)" in page
 
 
-def test_processes_find_the_same_as_this_one(data, tmp_path):
-    models = ("analytical", "joint-friction")
-    one, two = (validate(comparison(data), tmp_path / str(jobs), models=models, seeds=1, jobs=jobs) for jobs in (1, 2))
+def test_processes_find_the_same_as_this_one_also_what_somebody_has_added(data, tmp_path, monkeypatch):
+    def leave(system, rows, friction):
+        return system
+
+    monkeypatch.setitem(IDENTIFICATIONS, "mine", Identification("leaving it as it is", leave, all_rows=True))
+    models = ("identified-mine", "joint-friction@mine")
+    one, two = (validate(comparison(data), tmp_path / str(jobs), models=models, seeds=2, jobs=jobs) for jobs in (1, 2))
+    assert len(list((tmp_path / "2" / "cells").glob("*identification-mine*"))) == 1, "of all rows, so once"
     for name in models:
+        assert two.document["models"][name]["runs"] == 2
         for score in ("nrmse", "force_rms", "nlpd", "motions"):
             here, there = (each.document["models"][name][score] for each in (one, two))
             assert numbers(here) == pytest.approx(numbers(there), rel=1e-6)  # searches end where rounding lets them

@@ -163,15 +163,10 @@ def cells_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int
         Cell(IDENTIFICATION, name, each, *place)
         for place in places
         for name, each in IDENTIFICATIONS.items()
-        if (name in wanted and place[1] == _seed_of(name, place[1]))
+        if (name in wanted and (place[1] == 0 or not each.all_rows))  # seeds choose rows: what takes all is done once
         or (name == comparison.identification and place[1] == 0)
     ]
     return first, [Cell(MODEL, name, each, *place) for place in places for name, each in models.items()]
-
-
-def _seed_of(identification: str, seed: int) -> int:
-    """Seeds choose rows, so what takes all of them is done once."""
-    return 0 if IDENTIFICATIONS[identification].all_rows else seed
 
 
 def compute(comparison: Comparison, kept: KeptCells, cell: Cell) -> None:
@@ -258,7 +253,7 @@ def identified_system(
     comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int
 ) -> tuple[MechanicalSystem | str, float, NoiseLevels | None]:
     """The system of a finished identification, or why there is none, its CPU seconds and its noise if it knows it."""
-    found = _identification(comparison, kept, name, split, _seed_of(name, seed))
+    found = _identification(comparison, kept, name, split, seed)
     result = found["result"]
     if result is None:
         return str(found["error"]), 0.0, None
@@ -268,7 +263,12 @@ def identified_system(
 
 
 def _identification(comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int) -> dict[str, Any]:
-    stored = kept.read(file_name(comparison.splits[split], seed, IDENTIFICATION, name))
+    """What was kept for this seed, or for the first where the identification takes all rows.
+
+    Asked of the files, for a process of its own need not know ways to identify that somebody has added.
+    """
+    names = [file_name(comparison.splits[split], each, IDENTIFICATION, name) for each in (seed, 0)]
+    stored = kept.read(names[0]) or kept.read(names[1])
     if stored is None:
         raise FitError(f"the identification {name!r} with seed {seed} was not done")
     return stored
