@@ -129,6 +129,20 @@ def test_noise_that_is_as_large_as_a_torque_is_told():
     assert any("worth more than half of a torque" in item.seen for item in found)
 
 
+def test_a_prepared_log_is_told_with_the_price_that_was_paid():
+    noisy = clean(3)
+    noisy = replace(noisy, q=noisy.q + 1e-4 * np.random.default_rng(0).normal(size=noisy.q.shape))
+    prepared = Preparation(cutoff=8.0, every=4, trim=0.2).apply(noisy)
+    report = check(prepared.dataset)
+    assert report.severity == "ok", told(report)
+    assert report.evidence.prepared is not None
+    assert report.evidence.prepared.preparation.cutoff is None  # it is not filtered twice
+    assert report.to_dict()["cutoff"] == 8.0
+    paid = prepared.report["acceleration_noise"]["after"]
+    assert [each["noise_after"] for each in report.per_joint()] == pytest.approx(paid)
+    assert "when this dataset was prepared" in report.of("noise")[0].seen
+
+
 def test_what_importing_mended_is_told():
     log = {"repeated_stamps_dropped": 3, "gaps": [[1.0, 2.0]], "largest_deviation_of_a_step": 0.5}
     imported = {"recordings": [log, {"largest_deviation_of_a_step": 0.0}], "resampled_to_step": 0.005}

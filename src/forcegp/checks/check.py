@@ -61,7 +61,7 @@ class CheckReport:
         if fit is not None and rows is not None:
             columns["residual"] = plain(np.std(rows.u - fit.predicted, axis=0))
         columns["factor"] = nothing if fit is None else plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
-        report = {} if self.evidence.prepared is None else self.evidence.prepared.report
+        report = {} if self.evidence.prepared is None else self.evidence.price
         noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
         columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
         torque = torque_noise(self.evidence, numbers_of(noise["after"])) if self.evidence.prepared is not None else None
@@ -71,11 +71,10 @@ class CheckReport:
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: severity, counts, numbers of every joint, findings."""
         counts = {severity: sum(each.severity == severity for each in self.findings) for severity in SEVERITIES}
-        prepared = self.evidence.prepared
         return {
             "severity": self.severity,
             "counts": counts,
-            "cutoff": None if prepared is None else prepared.preparation.cutoff,
+            "cutoff": None if self.evidence.prepared is None else self.evidence.price.get("cutoff"),
             "joints": self.per_joint(),
             "findings": [finding.to_dict() for finding in self.findings],
         }

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
 from forcegp.data import Dataset, Preparation, Prepared, resample, uniform_step
-from forcegp.data.spectrum import FEWEST_ROWS
+from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
@@ -66,6 +68,12 @@ class Evidence:
         data = self.compared
         return data.rows(slice(None, None, max(1, -(-len(data) // MOST_ROWS))))
 
+    @property
+    def price(self) -> Mapping[str, Any]:
+        """What the filter of the check did, or that of an earlier preparation where this one filters nothing."""
+        assert self.prepared is not None
+        return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
+
     @classmethod
     def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> Evidence:
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
@@ -81,8 +89,9 @@ class Evidence:
             trim = 0.0 if chosen.cutoff is None else min(1.0 / float(chosen.cutoff), LONGEST_TRIM * shortest)
             prepared = replace(chosen, trim=float(trim)).apply(even)
             compared = prepared.dataset
-            if chosen.cutoff is not None:
-                lower = COMPARED * float(chosen.cutoff)
+            applied = chosen.cutoff or _earlier(dataset).get("cutoff")
+            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(_first(even)):
+                lower = COMPARED * float(applied)
                 compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
         return cls(
             log=dataset,
@@ -95,6 +104,20 @@ class Evidence:
             wraps=wraps,
             jumps=jumps,
         )
+
+
+def _earlier(dataset: Dataset) -> Mapping[str, Any]:
+    """The report of a preparation with a filter that this dataset went through; empty without one."""
+    told = dataset.metadata.get("preparation")
+    while isinstance(told, Mapping):
+        if told.get("cutoff") is not None:
+            return told
+        told = told.get("earlier")
+    return {}
+
+
+def _first(even: Dataset) -> np.ndarray:
+    return even.time[even.episode == even.episode[0]]
 
 
 def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:

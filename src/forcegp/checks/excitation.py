@@ -16,7 +16,7 @@ BADLY = 1000.0
 HYSTERESIS = 0.1
 """Of the root mean square velocity, beyond which a sign counts."""
 
-FEWEST_CHANGES = 4
+FEWEST_CHANGES = 2
 HELD = 0.02
 """Range of a joint in one stretch, relative to its largest, below which it was held there."""
 
@@ -59,7 +59,7 @@ def excitation_findings(evidence: Evidence) -> list[Finding]:
             Finding(
                 severity="look",
                 subject="excitation",
-                seen=f"{listed(one_way)} changed direction fewer than {FEWEST_CHANGES} times: friction of both "
+                seen=f"{listed(one_way)} changed direction less than twice: friction of both "
                 "directions cannot be told from gravity.",
                 remedy="Record motion to and fro.",
                 joints=tuple(one_way),

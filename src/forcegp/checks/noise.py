@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -20,13 +22,15 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
     """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
     if evidence.prepared is None:
         return []
-    report = evidence.prepared.report
-    cutoff = report["cutoff"]
-    if cutoff is None:
+    report = evidence.price
+    cutoff = report.get("cutoff")
+    if cutoff is None or "acceleration_noise" not in report:
         return [Finding(severity="ok", subject="noise", seen="the positions show no noise worth a filter.")]
     before, after = (numbers_of(report["acceleration_noise"][when]) for when in ("before", "after"))
     spread = np.std(evidence.prepared.dataset.a, axis=0)
     why = "where the spectrum shows the end of the motion" if evidence.automatic else "as asked for"
+    if report is not evidence.prepared.report:
+        why = "when this dataset was prepared"
     found = []
     if np.isfinite(after).any():
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
@@ -35,7 +39,7 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
             Finding(
                 severity="ok",
                 subject="noise",
-                seen=f"a filter at {cutoff:.3g} Hz ({why}) brings the noise of the acceleration of "
+                seen=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
                 f"{evidence.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
                 numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
             )
@@ -114,6 +118,6 @@ def torque_noise(evidence: Evidence, noise: np.ndarray) -> np.ndarray | None:
     return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
 
 
-def numbers_of(values: list[float | None]) -> np.ndarray:
+def numbers_of(values: Sequence[float | None]) -> np.ndarray:
     """Numbers from a report, NaN where it has none."""
     return np.array([np.nan if value is None else value for value in values], dtype=float)

@@ -21,6 +21,7 @@ CONSTANT = 1e-24
 """Variance relative to the square below which a torque is constant: rounding."""
 
 RESTS_ON_ROBOT = 0.5
+POOR = 0.2
 SLOW = 0.1
 """Of the root mean square velocity: where dry friction turns over."""
 
@@ -76,9 +77,12 @@ class TorqueFit:
 
     @property
     def rests_on_robot(self) -> Bool[np.ndarray, " nv"]:
-        """Whether `factor` means something: inverse dynamics explains half of the torque's variance beyond friction."""
+        """Whether `factor` means something: inverse dynamics explains half of the torque's variance beyond friction.
+
+        And little is left: noise in tau makes the factor of a poor fit too small.
+        """
         with np.errstate(invalid="ignore"):
-            return (self.friction - self.plain > RESTS_ON_ROBOT) & (self.factor > 0.0)
+            return (self.friction - self.plain > RESTS_ON_ROBOT) & (self.plain < POOR) & (self.factor > 0.0)
 
     def at(self, tau: Float[np.ndarray, "rows nv"], rows: Dataset) -> Float[np.ndarray, "rows nv"]:
         """The fitted torque of other rows, whose inverse dynamics is `tau`."""
