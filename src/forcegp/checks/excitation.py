@@ -84,12 +84,13 @@ def _held(evidence: Evidence, still: list[str]) -> list[Finding]:
         if name in still or not len(held) or len(held) > len(spans) // 2:
             continue
         first = int(held[0])
+        unit = "rad" if evidence.rotates[joint] else "m"
         begin = float(rows.time[rows.episode == rows.episodes[first]][0])
         found.append(
             Finding(
                 severity="look",
                 subject="held joint",
-                seen=f"{name} stays within {spans[first, joint]:.2g} rad or m in {len(held)} of {len(spans)} stretches "
+                seen=f"{name} stays within {spans[first, joint]:.2g} {unit} in {len(held)} of {len(spans)} stretches "
                 f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
                 f"moves {spans[:, joint].max():.2g}.",
                 remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
