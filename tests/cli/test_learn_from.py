@@ -5,6 +5,7 @@ import json
 import pytest
 from tests.models.raw_log import motion
 
+from forcegp.data import differentiated
 from forcegp.models import load_posterior
 
 FIT = ("fit", "raw.h5", "--prior", "joint-friction", "--points", 12, "--iterations", 10, "--restarts", 1)
@@ -56,6 +57,15 @@ def test_what_makes_no_sense_is_one_line(forcegp, folder, words, message):
     (line,) = refused.stderr.strip().splitlines()
     assert message in line
     assert not (folder / "refused").exists()
+
+
+def test_contacts_are_not_looked_for_in_accelerations_that_nobody_measured(forcegp, folder):
+    words = ("--contact", "hand@0,0,0.2:plane:0,0,1,1.045", "--learn-from", "weak-form", "--out", "contact")
+    differentiated(motion(), "q").save(folder / "differences.h5")
+    fit = ("fit", "differences.h5", *FIT[2:4], "--points", 8, "--iterations", 1, "--restarts", 1)
+    done = forcegp(*fit, *words, folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "as a contact" not in done.stderr
 
 
 def test_other_models_refuse_windows(forcegp, folder):

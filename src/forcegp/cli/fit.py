@@ -131,7 +131,9 @@ class Fit(FitOptions):
         start = time.monotonic()
         dataset = Dataset.load(self.data)
         system = self._system(dataset)
-        dataset, rows_note = self._rows(dataset, system)
+        rows_note = None
+        if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
+            dataset, rows_note = self._rows(dataset, system)
         model = make_model(command, system.to(self.device), dataset)
         observe = window_observation(command.learn_from, command.window)
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
