@@ -122,13 +122,17 @@ def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fi
     return figure
 
 
+LINE, LETTER = 0.6, 0.075
+"""Inches that the line and a letter of a legend's entry take."""
+
+
 def _legend(figure: Figure, axes: Axes, count: int) -> None:
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles,
         labels,
         loc="outside lower center",
-        ncols=min(count, 3 if max(map(len, labels), default=0) > 24 else 4),
+        ncols=min(count, 4, max(1, int(figure.get_figwidth() / (LINE + LETTER * max(map(len, labels), default=0))))),
         fontsize=SMALL,
         frameon=False,
         labelcolor=QUIET,
