@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 from tests.analytical.realdata import dfki, dfki_system, multiarm, multiarm_system, panda, panda_system
 
 from forcegp.analytical import identify_analytical, motion_residuals
-from forcegp.mechanics import ViscousJointFriction
+from forcegp.mechanics import Contact, Sphere, ViscousJointFriction
 
 
 def test_published_numbers_of_a_pendulum_predict_its_motion(shared):
@@ -44,3 +45,31 @@ def test_least_squares_of_a_manipulator_on_held_out_blocks(shared, inertias):
     if inertias == "consistent":  # a robot that can be written down predicts the same
         force, _ = motion_residuals(found.system, test)
         np.testing.assert_allclose(np.sqrt((force**2).mean(0)), rms, rtol=1e-9)
+
+
+def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):
+    """Its second link is as far from the first joint as it was: a point of it stays on a sphere around that joint.
+
+    With the constraint the error of the first joint falls to about 0.6 of what it is without.
+    """
+    folder = shared("realdata")
+    system = dfki_system(folder)
+    train = dfki(folder, system, 143524, 143601, 143704, 144115)
+    stuck = dfki(folder, system, 143906)
+    found = identify_analytical(
+        system, train, friction=("viscous", "load"), rotors="rotor", likelihood="acceleration", rows=1000
+    ).system
+    offset, length = 0.1, 0.2
+    sphere = Sphere((0.0, 0.0, 0.0), float(np.hypot(offset, length)))
+    held = found.with_contacts([Contact("link2", (offset, 0.0, 0.0), sphere)])
+    free_error, held_error = (
+        np.sqrt(((each.dynamics(*states(stuck)).acceleration_map().offset.numpy() - stuck.a) ** 2).mean(0))
+        for each in (found, held)
+    )
+    assert held_error[0] < 0.7 * free_error[0]
+    assert held_error[0] < 0.6 * stuck.a[:, 0].std()
+    assert held_error[1] < 0.1 * free_error[1]
+
+
+def states(rows):
+    return tuple(torch.tensor(x) for x in (rows.q, rows.v, rows.u))

@@ -1,5 +1,7 @@
 """`FRAME@x,y,z:SURFACE:numbers` reads as the contact that it looks like."""
 
+import json
+
 import pytest
 
 from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts
@@ -40,3 +42,17 @@ def test_none_is_no_contact():
 def test_anything_else_is_refused(text):
     with pytest.raises(InvalidInput):
         parse_contact(text)
+
+
+def test_a_model_is_scored_under_other_contacts(forcegp, workshop):
+    """Without its plane the tool falls, so the recorded motion on the plane is predicted worse."""
+    held, free = (
+        forcegp("evaluate", "run", "test.h5", "--every", 20, "--json", *more, folder=workshop)
+        for more in ((), ("--contact", "none"))
+    )
+    assert (held.returncode, free.returncode) == (0, 0), free.stderr
+    assert json.loads(free.stdout)["contact"] == ["none"]
+    assert json.loads(free.stdout)["mae"] > json.loads(held.stdout)["mae"]
+    wrong = forcegp("evaluate", "run", "test.h5", "--contact", "tool:plane", folder=workshop)
+    assert wrong.returncode == 2
+    assert len(wrong.stderr.strip().splitlines()) == 1

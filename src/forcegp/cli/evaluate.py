@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.terminal import Terminal
 from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
@@ -30,6 +31,7 @@ class Evaluate(Command):
     For instance:
       forcegp evaluate run test.h5 --plots figures
       forcegp evaluate run test.h5 --json | jq .mae
+      forcegp evaluate run elsewhere.h5 --contact tool@0,0,0.1:plane:0,0,1,0.05
     """
 
     run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -40,6 +42,11 @@ class Evaluate(Command):
     """Take every K-th row only."""
     system: SystemChoice = "model"
     """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
+    contact: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: those of --system)"),
+    ] = ()
+    """Predict under these contacts instead, for example a joint that stuck; written as for forcegp fit."""
     plots: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: no plots)")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
     overwrite: bool = False
@@ -60,6 +67,8 @@ class Evaluate(Command):
         posterior = load_posterior(self.run_folder)
         dataset = Dataset.load(self.data).rows(slice(None, None, self.every))
         posterior = carried_over(terminal, posterior, dataset, self.system)
+        if self.contact:
+            posterior = posterior.with_system(posterior.system.with_contacts(parse_contacts(self.contact)))
         evaluation = score(terminal, posterior, dataset)
         forces = force_scores(posterior, dataset)
         rests_on_prior = normal_force_rests_on_prior(posterior)
@@ -68,6 +77,7 @@ class Evaluate(Command):
             "data": str(self.data),
             "every": self.every,
             "system": self.system,
+            "contact": list(self.contact),
             "model": posterior.description,
             "points": len(posterior.training),
             **evaluation.to_dict(),
@@ -79,7 +89,7 @@ class Evaluate(Command):
                 folder.mkdir()
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
-                options = ("run", "data", "every", "system")
+                options = ("run", "data", "every", "system", "contact")
                 write_config(folder, KIND, {"options": {name: scores[name] for name in options}})
             terminal.note(f"plots: {self.plots}")
         from forcegp.cli.tables import NORMAL_FORCES, NORMAL_FORCES_KNOWN, NORMAL_FORCES_SEEN, force_facts
@@ -149,7 +159,7 @@ def _report(
     points = len(posterior.training)
     units = dataset.units["a"]
     unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
-    where = "" if posterior.target is None else ", carried to the robot and contacts of the data"
+    where = "" if posterior.target is None else ", carried to another robot or contacts"
     title = (
         f"{points} training points, {posterior.description}{where}; {evaluation.rows} rows of {data}; errors in {unit}"
     )
