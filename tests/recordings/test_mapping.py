@@ -154,7 +154,12 @@ FULL = ColumnMapping(
 
 
 def test_a_mapping_survives_its_file(tmp_path):
-    for mapping in (FULL, ColumnMapping(q=("a,b",)), ColumnMapping(), ColumnMapping(step=0.001, q=("x",), joints=("only",))):
+    for mapping in (
+        FULL,
+        ColumnMapping(q=("a,b",)),
+        ColumnMapping(),
+        ColumnMapping(step=0.001, q=("x",), joints=("only",)),
+    ):
         (tmp_path / "m.yaml").write_text(mapping_text(mapping))
         if mapping == ColumnMapping():
             (tmp_path / "m.yaml").write_text("{}")
