@@ -10,8 +10,8 @@ of the robot say a ~ N(0, S). By Bayes' rule
 linear in f, so that everything stays Gaussian; along constraints, where H = 0, nothing changes: A G = A. (Regression
 with errors in variables; Carroll et al., "Measurement error in nonlinear models", 2006, section 4.2.) S holds the mean
 squares of the training accelerations on its diagonal. Correlations between joints are those of one motion and not of
-the next: with them, on two held-out fifths of a recording of a Franka Panda, intervals of 95 % covered 76 to 98 % and
-the negative log density was 10.6 nats a row, without them 88 to 100 % and 5.3 (docs/real-robots.md).
+the next: with them, on two held-out fifths of a recording of a Franka Panda, intervals of 95 % covered 76 to 92 %
+and the negative log density was 10.6 nats a row, without them 87 to 100 % and 5.4 (docs/real-robots.md).
 """
 
 from __future__ import annotations
