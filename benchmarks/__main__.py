@@ -10,30 +10,19 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import sys
 from datetime import UTC, datetime
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 
 from benchmarks.performance_page import PAGE, performance_page
 from benchmarks.questions import MEANINGS, TITLES
+from forcegp.evaluation.machine import machine
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results.json"
 README = FOLDER / "README.md"
 BEGIN, END = "<!-- table: written by `make bench` -->", "<!-- end of table -->"
-
-
-def machine() -> str:
-    """Processor, cores and the versions that decide the numbers."""
-    model = platform.processor() or platform.machine()
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else ():
-        if line.startswith("model name"):
-            model = line.partition(":")[2].strip()
-            break
-    versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("torch", "scipy", "numpy"))
-    return f"{model}, {os.cpu_count()} cores, one thread used; Python {platform.python_version()}, {versions}"
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -68,7 +57,7 @@ def main(questions: list[str]) -> None:
         module = import_module(f"benchmarks.{name}")
         with threadpool_limits(1):  # entered after the libraries are loaded, or it would miss them
             stored |= module.run()
-        stored["machine"] = machine()
+        stored["machine"] = f"{machine()}; one thread used"
         stored["date"] = datetime.now(UTC).date().isoformat()
         write_whole(RESULTS, json.dumps(stored, indent=1, sort_keys=True) + "\n")
     text = README.read_text(encoding="utf-8")

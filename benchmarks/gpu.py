@@ -26,9 +26,10 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from benchmarks.__main__ import machine, write_whole
+from benchmarks.__main__ import write_whole
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
+from forcegp.evaluation.machine import machine
 from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
@@ -208,7 +209,7 @@ def main(arguments: list[str] | None = None) -> int:
     threads = 1 if given.small else given.threads
     torch.set_num_threads(threads)
     cpu = torch.device("cpu")
-    processor = machine().replace("one thread used", f"{threads} used")
+    processor = f"{machine()}; {threads} threads used"
     print(f"CPU: {processor}, {gib(free_memory(cpu))} free")
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)

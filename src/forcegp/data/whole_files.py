@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import FileFormatError, InvalidInput
 
 LOCK = ".lock"
 
@@ -29,6 +29,17 @@ def write_text(path: Path, text: str) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """A JSON object that was written whole. Raises FileFormatError with the remedy for anything else."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{path} is half written or damaged ({error}); {remedy}.") from None
+    if not isinstance(stored, dict):
+        raise FileFormatError(f"{path} is damaged; {remedy}.")
+    return stored
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import shutil
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from forcegp import __version__
-from forcegp.data.whole_files import LOCK, only_one_process
+from forcegp.data.whole_files import LOCK, only_one_process, read_json
 from forcegp.data.whole_files import write_json as write_json
 from forcegp.data.whole_files import write_text as write_text
 from forcegp.errors import FileFormatError, InvalidInput
@@ -50,7 +49,7 @@ class Results:
         return results
 
     def _require_same(self, description: Path, preset: str) -> None:
-        stored = _read(description, f"choose another --out, or delete {self.folder}")
+        stored = read_json(description, f"choose another --out, or delete {self.folder}")
         if stored.get("kind") != KIND:
             raise InvalidInput(f"{self.folder} was not written by `{KIND}`; choose another --out.")
         written_by = stored.get("forcegp_version"), stored.get("format_version")
@@ -83,7 +82,7 @@ class Results:
         """What the cell stored. Raises FileFormatError if it is damaged, or of another digest than the one given."""
         file = self.cell_folder(name) / CELL_FILE
         remedy = f"delete the folder {file.parent} and run the same command again: only this cell is computed anew"
-        stored = _read(file, remedy)
+        stored = read_json(file, remedy)
         if not {"digest", "spec", "result"} <= set(stored):
             raise FileFormatError(f"{file} is half written; {remedy}.")
         if digest is not None and stored["digest"] != digest:
@@ -125,13 +124,3 @@ class Results:
 def _is_own_start(entry: Path) -> bool:
     """What a run leaves that is killed before it has written its description."""
     return entry.name == LOCK or (entry.name.startswith(f".{DESCRIPTION}.") and entry.name.endswith(".tmp"))
-
-
-def _read(file: Path, remedy: str) -> dict[str, Any]:
-    try:
-        stored = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FileFormatError(f"{file} is half written or damaged ({error}); {remedy}.") from None
-    if not isinstance(stored, dict):
-        raise FileFormatError(f"{file} is damaged; {remedy}.")
-    return stored

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from forcegp.data.whole_files import LOCK, only_one_process, write_json
+from forcegp.data.whole_files import LOCK, only_one_process, read_json, write_json
 from forcegp.errors import FileFormatError, InvalidInput
 
 KIND = "forcegp validate"
@@ -32,7 +32,7 @@ class KeptCells:
         kept, file = cls(folder), folder / CONFIGURATION
         own = file.exists()
         if own:
-            stored = _read(file, f"choose another --out, or delete {folder}")
+            stored = read_json(file, f"choose another --out, or delete {folder}")
             kept._require_own(stored)
             if not overwrite:
                 kept._require_same(stored["configuration"], configuration)
@@ -76,7 +76,7 @@ class KeptCells:
         file = self.file(name)
         if not file.exists():
             return None
-        stored = _read(file, "delete it and run the same command again: only this one is computed anew")
+        stored = read_json(file, "delete it and run the same command again: only this one is computed anew")
         if not {"name", "seed", "split", "result", "error"} <= set(stored):
             raise FileFormatError(f"{file} is damaged; delete it and run the same command again.")
         return stored
@@ -93,13 +93,3 @@ class KeptCells:
 def _is_own_start(entry: Path) -> bool:
     """What a run leaves that is killed before it has written its configuration."""
     return entry.name in (LOCK, CELLS) or (entry.name.startswith(f".{CONFIGURATION}.") and entry.name.endswith(".tmp"))
-
-
-def _read(file: Path, remedy: str) -> dict[str, Any]:
-    try:
-        stored = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FileFormatError(f"{file} is half written or damaged ({error}); {remedy}.") from None
-    if not isinstance(stored, dict):
-        raise FileFormatError(f"{file} is damaged; {remedy}.")
-    return stored
