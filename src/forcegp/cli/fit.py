@@ -113,6 +113,8 @@ class Fit(FitOptions):
     """Most L-BFGS iterations of each start, or training steps of a network."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/gpu.md. The folder that is written can be used on any machine."""
+    measured_torque: bool = False
+    """u comes from sensors as noisy as --force-noise says, and predictions know it. Not for commanded torques."""
     json: Json = False
     debug: Debug = False
 

@@ -26,6 +26,7 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "mean": ("structured",),
     "prior": ("structured",),
     "force_noise": ("structured", "unconstrained", "analytical"),
+    "measured_torque": ("structured", "unconstrained", "analytical"),
     "restarts": SEARCHED,
     "jobs": SEARCHED,
     "engine": ("structured", "unconstrained"),
@@ -86,6 +87,8 @@ def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Mode
         return (NeuralNetwork if command.model == "neural-network" else NetworkEnsemble)(system, noise, **steps)
     windows = command.learn_from != "accelerations"
     noise = (noise_of_windows if windows else resolved_noise)(command.noise, dataset, command.force_noise)
+    if command.measured_torque:
+        noise = of_measured_torque(noise)
     if command.model == "independent-gp":
         return IndependentGP(system, noise=noise)
     if command.model == "unconstrained":
@@ -132,6 +135,13 @@ def noise_of_windows(given: str, dataset: Dataset, force: float | None = None) -
     from forcegp.models import Noise
 
     return resolved_noise(given, dataset, force) if given not in ("dataset", "learned") else Noise(None, force, True)
+
+
+def of_measured_torque(noise: Noise | None) -> Noise:
+    """The noise, with its forces those of torque sensors. Raises InvalidInput where it has none of forces."""
+    if noise is None or noise.force is None:
+        raise InvalidInput("--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA.")
+    return replace(noise, measured_torque=True)
 
 
 def resolved_noise(given: str, dataset: Dataset, force: float | None = None) -> Noise | None:
