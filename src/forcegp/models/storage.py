@@ -139,7 +139,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         if moved_to is not None:
             target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
         training = _rows(TRAINING, tensors)
-        if any(name.startswith(REFERENCE) for name in tensors):
+        if document["format_version"] == UPDATED or any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
