@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cli.one_line import assert_refused
 from tests.models.arm import URDF, arm_data, arm_system
 
 from forcegp.cli.arguments import one_line
@@ -103,14 +104,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("words", "message"), WRONG, ids=[words or "nothing" for words, _ in WRONG])
 def test_a_wrong_command_is_one_line_and_exit_code_2(folder, capfd, words, message):
-    before = sorted(folder.rglob("*"))
-    assert main(words.split()) == 2
-    told = capfd.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("forcegp: ")
-    assert told.err.count("\n") == 1, told.err
-    assert message in told.err
-    assert sorted(folder.rglob("*")) == before
+    assert_refused(words, message, folder, capfd)
 
 
 @pytest.mark.parametrize("words", ["--debug fit missing.h5 --out run", "fit missing.h5 --out run --debug"])

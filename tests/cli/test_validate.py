@@ -5,10 +5,9 @@ import json
 import re
 
 import pytest
+from tests.cli.one_line import assert_refused
 from tests.models.arm import URDF
 from tests.validation.moving_arm import moving_arm
-
-from forcegp.cli.main import main
 
 MODELS = ("analytical", "identified-acceleration", "joint-friction", "joint-friction@identified")
 QUICK = ("--points", 40, "--restarts", 1, "--iterations", 30, "--horizon", "0.1,0.3", "--starts", 2)
@@ -132,6 +131,7 @@ WRONG = [
     (f"validate log.h5 {OUT} --models anaytical", "did you mean 'analytical'"),
     (f"validate log.h5 {OUT} --identification magic", "no identification is called 'magic'"),
     (f"validate log.h5 {OUT} --cutoff 80", "cutoff is 80.0 Hz"),
+    (f"validate log.h5 {OUT} --measured-torque", "needs a noise of the forces"),
     (f"validate log.h5 {OUT} --backend ray", "does not share files"),
     ("validate log.h5 --out log.h5", "was not written by `forcegp validate`"),
 ]
@@ -140,11 +140,4 @@ WRONG = [
 @pytest.mark.parametrize(("words", "message"), WRONG, ids=[words for words, _ in WRONG])
 def test_a_wrong_command_is_one_line_and_exit_code_2(folder, monkeypatch, capfd, words, message):
     monkeypatch.chdir(folder)
-    before = sorted(folder.rglob("*"))
-    assert main(words.split()) == 2
-    told = capfd.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("forcegp: ")
-    assert told.err.count("\n") == 1, told.err
-    assert message in told.err
-    assert sorted(folder.rglob("*")) == before
+    assert_refused(words, message, folder, capfd)

@@ -313,7 +313,9 @@ class JointTerms:
     def _transmission(self) -> torch.Tensor:
         if self.inertia == "armature":
             return torch.eye(len(self.joints), dtype=torch.float64)
-        return torch.as_tensor(getattr(self._given[RotorInertia], "transmission"))  # noqa: B009  # of a subclass
+        rotors = self._given[RotorInertia]
+        assert isinstance(rotors, RotorInertia), "known forces are kept by their class"
+        return torch.as_tensor(rotors.transmission)
 
     def _inertia_basis(self) -> np.ndarray:
         """(rotor, nv, nv): inertia added per unit of each rotor's."""

@@ -27,6 +27,7 @@ from typing_extensions import override
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.deflation import whiten
 from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
+from forcegp.inference.likelihood import scaled_gradients
 from forcegp.inference.memory import require_memory
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 from forcegp.inference.terms import Terms
@@ -125,12 +126,7 @@ class _NormalNLL(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
-        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            raise NotImplementedError(
-                "the likelihood of functionals has first derivatives only; for a Hessian take finite differences of "
-                "its gradient"
-            )
-        return tuple(None if slope is None else upstream * slope for slope in ctx.gradients)
+        return scaled_gradients("the likelihood of functionals", upstream, ctx.gradients)
 
 
 @dataclass(frozen=True, eq=False)

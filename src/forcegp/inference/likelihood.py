@@ -146,12 +146,16 @@ class _DeflatedNLL(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
-        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            raise NotImplementedError(
-                "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its "
-                "gradient"
-            )
-        return tuple(None if g is None else upstream * g for g in ctx.gradients)
+        return scaled_gradients("the deflated likelihood", upstream, ctx.gradients)
+
+
+def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
+    """What `backward` returns of gradients that `forward` computed. Raises NotImplementedError for second ones."""
+    if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
+        raise NotImplementedError(
+            f"{what} has first derivatives only; for a Hessian take finite differences of its gradient"
+        )
+    return tuple(None if g is None else upstream * g for g in gradients)
 
 
 def _inverse_contractions(
