@@ -1,7 +1,7 @@
 """Models and datasets that forcegp 0.1.0 wrote still load, and predict what they predicted then.
 
-The folder `files` was written once, by commit b7c33ef: fits of the arm of `tests/models/arm.py` to 12 to 24 rows, one for
-every kind of model, engine and format version. `predictions.npz` holds what they predicted at five states.
+The folder `files` was written once, by commit b7c33ef: fits of the arm of `tests/models/arm.py` to 12 to 24 rows, one
+for every kind of model, engine and format version. `predictions.npz` holds what they predicted at five states.
 """
 
 from pathlib import Path
