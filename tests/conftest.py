@@ -1,6 +1,6 @@
-"""Environment of every test: one thread, no verdict by the clock, and on request a check of every shape in a signature.
+"""Environment of every test: one thread, no verdict by the clock, and on request a check of all annotated shapes.
 
-`FORCEGP_CHECK_SHAPES=1` (`make test-all`) checks at run time what the annotations of forcegp promise, at more than twice
+`FORCEGP_CHECK_SHAPES=1` (`make test-all`) checks at run time what annotations of forcegp promise, at more than twice
 the time. `FORCEGP_TEST_THREADS=2` computes with two threads (`make test-processors`).
 """
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # read when numpy and torch are imported
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # numpy and torch read them at import
     os.environ[variable] = str(THREADS)
 
 import pytest

@@ -34,8 +34,9 @@ def test_a_diverging_motion_is_nan_from_where_it_says_and_the_others_go_on(integ
     assert torch.isnan(motion.a[row:, 0]).all()
     assert (motion.v[:row, 0].abs() <= SPEED_LIMIT).all()
     alone = integrate(integrator, explosive, q0[1:], v0[1:], force[:, 1:], 0.01)
-    torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=0, atol=0)
-    torch.testing.assert_close(motion.a[:, 1:], alone.a, rtol=0, atol=0)
+    # three motions together and two by themselves: vector instructions round other batches otherwise, at each of 100 steps
+    torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(motion.a[:, 1:], alone.a, rtol=1e-11, atol=1e-11)
 
 
 def test_a_motion_that_leaves_its_constraint_ends_alone():

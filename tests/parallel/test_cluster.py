@@ -54,7 +54,7 @@ class TestRay(WorkersConformance):
 
 @pytest.mark.parametrize("model", [StructuredGP, IndependentGP])
 def test_a_fit_is_the_same_on_every_backend(cluster, model):
-    """To the last bit: every worker computes on one thread, as the tests do."""
+    """But for rounding, which other processes, whose memory is aligned otherwise, need not share."""
     train = arm_data(30, seed=0)
     how = {"points": 15, "restarts": 3, "seed": 7, "options": OptimizerOptions(iterations=4)}
     one, two, three = (
@@ -62,8 +62,9 @@ def test_a_fit_is_the_same_on_every_backend(cluster, model):
     )
     assert len(set(one.settings["restart_objective"])) == 3
     for other in (two, three):
-        assert other.settings["restart_objective"] == one.settings["restart_objective"]
-        assert all(torch.equal(other.parameters[name], value) for name, value in one.parameters.items())
+        assert other.settings["restart_objective"] == pytest.approx(one.settings["restart_objective"], rel=1e-9)
+        for name, value in one.parameters.items():
+            torch.testing.assert_close(other.parameters[name], value, rtol=1e-7, atol=1e-9)
 
 
 def test_cells_are_computed_without_seeing_the_folder_of_results(cluster, tmp_path):
