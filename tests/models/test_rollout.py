@@ -250,5 +250,5 @@ def test_feedback_sees_the_batch_dimensions_of_the_motions(posterior, start):
 
 def test_feedback_of_another_shape_is_refused(posterior, start):
     q, v, u = start
-    with pytest.raises(InvalidInput, match=r"feedback gave \(3,\) at step 0; it must give a tensor \(2, 3\)"):
+    with pytest.raises(InvalidInput, match=r"feedback .*\(3,\) at step 0.*\(2, 3\)"):
         posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: torch.zeros(3).double())

@@ -239,7 +239,7 @@ def test_wrong_mean_and_contradictory_contacts_are_refused(train):
 
 def test_a_surface_that_no_row_touches_is_refused(train):
     raised = train.system.with_contacts((Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9)),))
-    with pytest.raises(ContactError, match=r"no training point touches .* contact 0 \(frame 'hand'\).* 0\.49 m away"):
+    with pytest.raises(ContactError, match=r"contact 0 \(frame 'hand'\).* 0\.49 m"):
         StructuredGP(raised).fit(train, points=10, restarts=1, options=OptimizerOptions(iterations=1))
 
 
