@@ -3,8 +3,6 @@
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 from benchmarks.force_pictures import PICTURES
@@ -21,8 +19,7 @@ from forcegp.priors import KERNELS, NAMED_PRIORS, named_prior
 def test_the_python_example_runs(repository: Path, tmp_path: Path):
     (example,) = re.findall(r"```python\n(.*?)```", (repository / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert len([line for line in example.splitlines() if line.strip()]) <= 12
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    acceleration, forces, error = done.stdout.splitlines()
+    acceleration, forces, error = run_example(example, tmp_path).splitlines()
     assert acceleration == "torch.Size([1200, 7]) torch.Size([1200, 7, 7])"
     assert forces == "torch.Size([1200, 1]) torch.Size([1200, 7])"
     assert float(error.split()[3]) < 0.2
