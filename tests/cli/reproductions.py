@@ -28,7 +28,7 @@ class Reproduced:
     def everything(cls, forcegp: Forcegp, folder: Path, preset: str, page: str) -> Reproduced:
         """All of it in this folder."""
         pytest.importorskip("pybullet")
-        words = ("reproduce", "all", "--preset", preset, "--out", "out", "--docs", "docs", "--jobs", 1)
+        words = ("reproduce", "all", "--preset", preset, "--out", "out", "--docs", "docs", "--jobs", 2)
         done = forcegp(*words, folder=folder)
         assert done.returncode == 0, done.stderr
         assert f"{page}.md tells what was found" in done.stdout

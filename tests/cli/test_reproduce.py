@@ -10,10 +10,13 @@ from tests.cli.reproductions import Reproduced
 
 FIGURES = ("fig2b", "fig2c", "fig3", "fig4", "extrapolation", "ablation")
 
+# minutes of fits; tests/experiments covers the cells, test_executable.py the command, test_reproduce_refusals.py refusals
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture(scope="module")
-def reproduced(forcegp, tmp_path_factory):
-    return Reproduced.everything(forcegp, tmp_path_factory.mktemp("reproduce"), "smoke", "reproduction")
+def reproduced(installed, tmp_path_factory):
+    return Reproduced.everything(installed, tmp_path_factory.mktemp("reproduce"), "smoke", "reproduction")
 
 
 def test_all_figures_tables_and_the_page_are_there(reproduced):
@@ -47,14 +50,6 @@ def test_published_values_stand_beside_ours(reproduced):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("fig9",), "no figure 'fig9'"),
-        (("fig2b", "--preset", "huge"), "no preset 'huge'"),
-        (("fig2b", "--jobs", -1), "jobs is -1; give the number of tasks at once, at least 1"),
-        (("fig2b", "--backend", "dask"), "no backend 'dask'; choose serial, joblib, ray"),
-        (("fig2b", "--address", "10.0.0.1:6379"), "add --backend ray"),
-        (("fig2b", "--points", 500, "--out", "new"), "its data have 400 rows, so give 2 to 400"),
-        (("fig2b", "--points", 1, "--out", "new"), "asked for 1 training points"),
-        (("fig2b", "--seeds", -3, "--out", "new"), "--seeds"),
         (("all", "--preset", "paper", "--out", "out"), "holds results of preset 'smoke', not 'paper'"),
         (("all", "--out", "docs"), "was not written by `forcegp reproduce`"),
         (("all", "--out", "out", "--docs", "docs/reproduction.md"), "cannot be made"),
@@ -64,12 +59,12 @@ def test_refusals_are_one_line_and_leave_everything(reproduced, arguments, messa
     reproduced.check_refusal(arguments, message)
 
 
-def test_a_half_written_cell_and_another_version_are_named_and_nothing_is_lost(reproduced, forcegp, tmp_path):
+def test_a_half_written_cell_and_another_version_are_named_and_nothing_is_lost(reproduced, installed, tmp_path):
     shutil.copytree(reproduced.folder / "out", tmp_path / "out")
     file = next((tmp_path / "out" / "cells" / "fits").glob("**/cell.json"))
     whole = file.read_text()
     file.write_text(whole[:100])
-    refused = forcegp("reproduce", "all", "--out", "out", folder=tmp_path)
+    refused = installed("reproduce", "all", "--out", "out", folder=tmp_path)
     assert refused.returncode == 2
     assert str(file.relative_to(tmp_path)) in refused.stderr
     assert "only this cell is computed anew" in refused.stderr
@@ -78,6 +73,6 @@ def test_a_half_written_cell_and_another_version_are_named_and_nothing_is_lost(r
     description = tmp_path / "out" / "reproduction.json"
     stored = json.loads(description.read_text())
     description.write_text(json.dumps({**stored, "forcegp_version": "0.0.1"}))
-    refused = forcegp("reproduce", "all", "--out", "out", folder=tmp_path)
+    refused = installed("reproduce", "all", "--out", "out", folder=tmp_path)
     assert refused.returncode == 2
     assert "holds results of forcegp 0.0.1" in refused.stderr

@@ -8,10 +8,13 @@ from tests.cli.reproductions import Reproduced
 EXPERIMENTS = ("data-efficiency", "friction", "transfer", "unilateral-contact", "deep-kernel")
 FIGURES = ("data-efficiency", "friction-errors", "friction-curves", "friction-normal-force")
 
+# minutes of fits; tests/experiments covers the cells, test_executable.py the command, test_reproduce_refusals.py refusals
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture(scope="module")
-def reproduced(forcegp, tmp_path_factory):
-    return Reproduced.everything(forcegp, tmp_path_factory.mktemp("reproduce-forces"), "forces-smoke", "force-priors")
+def reproduced(installed, tmp_path_factory):
+    return Reproduced.everything(installed, tmp_path_factory.mktemp("reproduce-forces"), "forces-smoke", "force-priors")
 
 
 def test_all_figures_tables_and_the_page_are_there(reproduced):
@@ -59,9 +62,6 @@ def test_one_experiment_has_a_page_of_its_own(reproduced, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("fig2b", "--preset", "forces-smoke"), "no figure 'fig2b'"),
-        (("friction",), "no figure 'friction'"),
-        (("friction", "--preset", "forces-smoke", "--points", 201, "--out", "new"), "have 200 rows, so give 2 to 200"),
         (("all", "--preset", "forces", "--out", "out"), "holds results of preset 'forces-smoke', not 'forces'"),
     ],
 )
