@@ -8,7 +8,7 @@ from tests.cli.reproductions import Reproduced
 EXPERIMENTS = ("data-efficiency", "friction", "transfer", "unilateral-contact", "deep-kernel")
 FIGURES = ("data-efficiency", "friction-errors", "friction-curves", "friction-normal-force")
 
-# minutes of fits: tests/experiments covers the cells, test_executable.py the command, test_reproduce_refusals.py the rest
+# minutes of fits; tests/experiments covers the cells, test_executable.py the command
 pytestmark = pytest.mark.nightly
 
 
