@@ -20,8 +20,9 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.inference import LatentKernels, Terms
 from forcegp.inference.deflation import Deflation, deflate, whiten
 from forcegp.inference.kernels import kernel_cross
-from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
-from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.models.training_data import TrainingData
 
 SEED, SECONDS = 901, 220.0
 ROWS, LEARNING_ROWS = 2000, 250

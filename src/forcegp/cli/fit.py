@@ -150,7 +150,7 @@ class Fit(FitOptions):
 
 
 def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> Any:
-    """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
+    """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar that shows the restart, the iteration and the objective."""
     from forcegp.models.search import ALL_ROWS, default_restarts
 
     options: OptimizerOptions | None = how.get("options")  # networks have none, but steps of their own
@@ -167,7 +167,8 @@ def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fittin
             note = f"{start}iteration {iteration}, objective {_short(value)}"
             report(restart * steps + min(iteration, steps), restarts * steps, note)
 
-        return model.fit(dataset, **how, progress=progress)
+        learn = model.identify if "learn" in how else model.fit_windows if "observe" in how else model.fit
+        return learn(dataset, **how, progress=progress)
 
 
 def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:

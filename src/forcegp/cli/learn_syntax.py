@@ -9,13 +9,13 @@ from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
     from forcegp.mechanics import MechanicalSystem
-    from forcegp.models.physical_parameters import Learned
+    from forcegp.models.identification.physical_parameters import Learned
 
 
 def parse_learn(words: Sequence[str]) -> tuple[Learned, ...]:
     """`LINK:mass,com,inertia`, or `FORCE`, `FORCE:joint,joint`, either with `=START`. Raises InvalidInput."""
     from forcegp.mechanics.known_forces import KNOWN_FORCES
-    from forcegp.models.physical_parameters import Coefficients
+    from forcegp.models.identification.physical_parameters import Coefficients
     from forcegp.robots import LinkInertia
 
     if not words:
@@ -43,7 +43,7 @@ def with_learned_forces(system: MechanicalSystem, learn: Sequence[Learned]) -> t
     from dataclasses import replace
 
     from forcegp.mechanics import Armature, CoulombJointFriction, LoadJointFriction, RotorInertia, ViscousJointFriction
-    from forcegp.models.physical_parameters import Coefficients
+    from forcegp.models.identification.physical_parameters import Coefficients
 
     make = {
         "viscous-joint-friction": (ViscousJointFriction, lambda: ViscousJointFriction.from_robot(system.robot)),

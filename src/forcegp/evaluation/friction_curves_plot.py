@@ -27,8 +27,8 @@ from forcegp.evaluation.force_scores import true_names
 from forcegp.evaluation.prediction_plot import legend_entries
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models import StructuredPosterior
-from forcegp.models.components import Curve, term_slices
 from forcegp.models.protocol import Posterior
+from forcegp.models.structured.components import Curve, term_slices
 from forcegp.priors import ContactFriction, ForcePrior, ToolForces
 
 if TYPE_CHECKING:

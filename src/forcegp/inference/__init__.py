@@ -3,6 +3,7 @@
 Knows mixing vectors, kernels, noise and targets; nothing of robots.
 """
 
+from forcegp.inference.block_cross_validation import LeaveOut, leave_blocks_out
 from forcegp.inference.engines import (
     ENGINES,
     Choice,
@@ -16,12 +17,11 @@ from forcegp.inference.engines import (
     engine_from_dict,
     engine_of,
 )
-from forcegp.inference.functionals import FunctionalPosterior
 from forcegp.inference.inducing import InducingPosterior, collapsed_bound
 from forcegp.inference.iterative import IterativePosterior
 from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.leave_out import LeaveOut, leave_blocks_out
 from forcegp.inference.likelihood import negative_log_likelihood
+from forcegp.inference.linear_functionals import FunctionalPosterior
 from forcegp.inference.optimization import OptimizationResult, OptimizerOptions, best_of, minimize_objective
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior, exact
 from forcegp.inference.terms import Terms

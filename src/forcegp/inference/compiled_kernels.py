@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.inference.cpp_library import cpp_library
+from forcegp.codegen.cpp_library import cpp_library
 
 if TYPE_CHECKING:
     from forcegp.inference.prepared_kernels import SharedCenters
