@@ -150,7 +150,7 @@ class Fit(FitOptions):
 
 
 def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> Any:
-    """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar that shows the restart, the iteration and the objective."""
+    """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
     from forcegp.models.search import ALL_ROWS, default_restarts
 
     options: OptimizerOptions | None = how.get("options")  # networks have none, but steps of their own

@@ -47,8 +47,8 @@ class Posterior(ABC):
     result: OptimizationResult
     target: MechanicalSystem | None = None
     """The system that predictions are for, where it is not that of the model (`with_system`)."""
-    engine: Engine | None = None
-    """What computed the posterior, stored with the model; None where there is no choice."""
+    engine: Any = None
+    """The Engine that computed the posterior, stored with the model; None where there is no choice."""
 
     @property
     def system(self) -> MechanicalSystem:

@@ -1,4 +1,4 @@
-"""`RobotStructure`: what a robot is, without its algorithms: joints, links, frames, inertias and the checks of inputs."""
+"""`RobotStructure`: what a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
 
 from __future__ import annotations
 
@@ -134,4 +134,5 @@ class RobotStructure:
         return merged_inertias(self.tree, self.layout, inertials)
 
     def check_parameters(self, link: str, parameters: object) -> None:
+        """:class:`~forcegp.errors.InvalidInput` unless these can be log-Cholesky parameters of ``link``."""
         check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

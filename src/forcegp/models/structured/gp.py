@@ -41,12 +41,8 @@ from forcegp.priors import ForcePrior, prior_to_dict
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
 
-MOVED = {
-    "observe": "fit_windows(dataset, observe, ...)",
-    "learn": "identify(dataset, learn, ...)",
-    "prior_strength": "identify(dataset, learn, prior_strength=...)",
-}
-"""Keywords that `fit` had in version 0.1 -> what does it now."""
+MOVED = {"observe", "learn", "prior_strength"}
+"""Keywords that `fit` had in version 0.1, when it was also `fit_windows` and `identify`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,11 +274,12 @@ class StructuredGP(StructuredModel):
         moved: Mapping[str, Any],
     ) -> StructuredPosterior:
         """`fit` with the keywords of version 0.1. Raises TypeError for any other keyword."""
-        for name in moved:
-            if name not in MOVED:
-                raise TypeError(f"StructuredGP.fit() got an unexpected keyword argument {name!r}")
-            message = f"fit({name}=...) is deprecated and will be removed; call {MOVED[name]}"
-            warnings.warn(message, DeprecationWarning, stacklevel=3)
+        unknown = moved.keys() - MOVED
+        if unknown:
+            raise TypeError(f"StructuredGP.fit() got an unexpected keyword argument {min(unknown)!r}")
+        now = "identify(dataset, learn, ...)" if moved.get("learn") else "fit_windows(dataset, observe, ...)"
+        message = f"fit({'=..., '.join(moved)}=...) is deprecated and will be removed; call {now}"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
         learning = moved.get("learn"), moved.get("prior_strength", 0.0)
         if moved.get("observe") is None:
             return self._fit_rows(dataset, points, search, engine, learning_points, *learning)
