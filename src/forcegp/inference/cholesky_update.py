@@ -28,7 +28,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.deflation import Deflation, deflate, whiten
-from forcegp.inference.kernels import LatentKernels, kernel_cross
+from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, deflated_covariance
 from forcegp.inference.posterior import ExactPosterior
 
@@ -205,7 +205,7 @@ def _cross_covariance(
     for start in range(0, more, height):
         part = slice(start, min(more, start + height))
         kernel = torch.stack(
-            [kernel_cross(k, z[part], old) for k, z, old in zip(kernels, features, old_features, strict=True)], dim=1
+            [k.cross(z[part], old) for k, z, old in zip(kernels.dense, features, old_features, strict=True)], dim=1
         )
         weighted = (kernel[..., None] * by_latent).reshape(len(kernel), latents, count * rank)
         cross[part.start * rank : part.stop * rank] = torch.bmm(C[part], weighted).reshape(-1, count * rank)

@@ -26,7 +26,7 @@ from typing_extensions import override
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.deflation import whiten
-from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
+from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import scaled_gradients
 from forcegp.inference.memory import require_memory
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
@@ -167,16 +167,16 @@ class FunctionalPosterior(LatentPosterior):
     def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 G_c k_c(Z, z) (Rasmussen & Williams 2006, eq. 2.26)
         V = torch.stack([self._seen(index, z) for index, z in enumerate(features)], dim=-1).transpose(0, 1)
-        prior = torch.stack([kernel_diagonal(k, z) for k, z in zip(self.kernels, features, strict=True)], dim=-1)
+        prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
         return torch.diag_embed(prior) - V.mT @ V
 
     @override
     def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return kernel_diagonal(self.kernels[index], z) - self._seen(index, z).square().sum(0)
+        return self.kernels.dense[index].diagonal(z) - self._seen(index, z).square().sum(0)
 
     def _seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "ND n"]:
         """L^-1 G_c k_c(Z, z)."""
-        cross = kernel_cross(self.kernels[index], self.features[index], z)
+        cross = self.kernels.dense[index].cross(self.features[index], z)
         return self.factor.solve_lower(self.functionals.through(index, cross))
 
     @override

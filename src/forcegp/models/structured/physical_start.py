@@ -34,7 +34,6 @@ from torch import Tensor
 
 from forcegp.errors import FitError, NumericalError
 from forcegp.inference import LatentKernels
-from forcegp.inference.kernels import kernel_diagonal
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, PhysicalParameters, inertials_of
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.robots import pseudo_inertia_from_parameters
@@ -103,7 +102,7 @@ class _Rows:
     def accelerations(self, kernels: LatentKernels, s: Float[Tensor, "k"]) -> tuple[Tensor, Tensor]:
         """a - m (N, nv) and R + W k W^T (N, nv, nv)."""
         features, W, residual, R = self.likelihood.terms({**self.noise, **self.physical.tensors(s)})
-        variances = [kernel_diagonal(kernel, z) for kernel, z in zip(kernels, features, strict=True)]
+        variances = [kernel.diagonal(z) for kernel, z in zip(kernels.dense, features, strict=True)]
         spread = torch.stack(variances, -1) if variances else W.new_zeros(len(W), 0)
         covariance = (W * spread[:, None, :]) @ W.mT + (torch.diag_embed(R) if R.dim() == 2 else R)
         return residual, covariance.expand(*residual.shape, residual.shape[-1])
