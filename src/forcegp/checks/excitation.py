@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.analytical.base_parameters import base_parameters, excitation
-from forcegp.checks.evidence import Evidence
+from forcegp.analytical.identifiability import base_parameters, excitation
+from forcegp.checks.check_input import Evidence
 from forcegp.checks.findings import Finding, listed
 from forcegp.errors import InvalidInput
 

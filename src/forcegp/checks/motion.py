@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.evidence import DEGREE, Evidence
+from forcegp.checks.check_input import DEGREE, Evidence
 from forcegp.checks.findings import Finding, listed
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from forcegp.checks.evidence import Evidence
+from forcegp.checks.check_input import Evidence
 from forcegp.checks.findings import Finding, plain
 
 MUCH = 0.2

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.evidence import GAP, Evidence, consecutive
+from forcegp.checks.check_input import GAP, Evidence, consecutive
 from forcegp.checks.findings import Finding
 from forcegp.data.filtering import JITTER
 

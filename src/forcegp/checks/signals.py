@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.evidence import Evidence, consecutive
+from forcegp.checks.check_input import Evidence, consecutive
 from forcegp.checks.findings import Finding, listed
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.evidence import Evidence
+from forcegp.checks.check_input import Evidence
 from forcegp.checks.findings import Finding, listed, plain
-from forcegp.checks.mistakes import Hypothesis
+from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH
 from forcegp.errors import DatasetError

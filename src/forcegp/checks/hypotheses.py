@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.evidence import DEGREE, Evidence
+from forcegp.checks.check_input import DEGREE, Evidence
 from forcegp.checks.findings import Finding, listed
 from forcegp.checks.gravity import estimated_gravity, with_gravity
 from forcegp.checks.torques import Correction, TorqueFit, fit_torques, inverse_dynamics, unexplained_share

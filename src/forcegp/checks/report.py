@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from forcegp.checks.evidence import Evidence
+from forcegp.checks.check_input import Evidence
 from forcegp.checks.excitation import excitation_findings
 from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
-from forcegp.checks.mistakes import Hypothesis, without_mistakes
+from forcegp.checks.hypotheses import Hypothesis, without_mistakes
 from forcegp.checks.motion import motion_findings
 from forcegp.checks.noise import noise_findings, numbers_of, torque_noise
 from forcegp.checks.robot_model import robot_findings

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
 from forcegp.data import Dataset, Preparation, motion_spectrum
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.spectrum import draw_cutoff, draw_time_steps
+from forcegp.evaluation.plots.style import (
     KNOWN_PHYSICS,
     LARGE,
     MEASUREMENT,
@@ -24,12 +28,6 @@ from forcegp.evaluation.figure_style import (
     short_joint_names,
     window,
 )
-from forcegp.evaluation.prediction_plot import legend_entries
-from forcegp.evaluation.spectrum_plot import draw_cutoff, draw_time_steps
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLUMNS = 3
 SECONDS = 5.0
