@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.preparation_options import CutoffOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns
@@ -37,7 +37,7 @@ class Check(CutoffOptions, RobotOptions):
       forcegp check log.h5 --robot arm.urdf --plots look --strict
     """
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to check (HDF5)."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Filter for the comparison of q, v, a and u. auto: where the spectrum shows that motion ends and noise begins."""
@@ -118,6 +118,6 @@ def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:
         ]
         for each in content["joints"]
     ]
-    units = report.evidence.log.units
+    units = report.inputs.log.units
     unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
     return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)

@@ -16,7 +16,7 @@ import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
 import forcegp.priors
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.fit_options import POINTS
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import resolved_noise
@@ -59,7 +59,7 @@ class Compare(LearningOptions):
         float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: a twentieth of the recording)")
     ] = None
     """Length of the stretches of time that are left out; longer than what one moment tells about the next."""
-    test: Annotated[Path | None, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
+    test: Annotated[Path | None, DATASET, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
     """Another recording to score the candidates on as well."""
     json: Json = False
     debug: Debug = False

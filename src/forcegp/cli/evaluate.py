@@ -12,7 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
-from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
 from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import (
@@ -41,9 +41,9 @@ class Evaluate(Command):
       forcegp evaluate run elsewhere.h5 --contact tool@0,0,0.1:plane:0,0,1,0.05
     """
 
-    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote."""
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to predict (HDF5)."""
     every: Annotated[int, arg(metavar="K")] = 1
     """Take every K-th row only."""

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
+from forcegp.cli.command import DATASET
 from forcegp.cli.fit_options import FitOptions
 
 
@@ -32,7 +33,9 @@ class IdentifyOptions(FitOptions):
     forward dynamics, where arms are light."""
     robust: Annotated[bool, arg(help_behavior_hint="")] = False
     """With the last two models: count outliers by their absolute value."""
-    test: Annotated[Path | None, arg(metavar="TEST.h5", constructor=Path, help_behavior_hint="(default: none)")] = None
+    test: Annotated[
+        Path | None, DATASET, arg(metavar="TEST.h5", constructor=Path, help_behavior_hint="(default: none)")
+    ] = None
     """With the last two models: score on this recording, too."""
     prior_strength: Annotated[
         float | None, arg(metavar="W", constructor=float, help_behavior_hint="(default: 0; 1 for the last two models)")

@@ -13,7 +13,7 @@ import forcegp
 import forcegp.data
 import forcegp.inference
 import forcegp.recordings
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import LOG, URDF, Debug, Json
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -44,11 +44,11 @@ class Import(PreparationOptions, RobotOptions):
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
     """
 
-    robot: Annotated[Path | None, arg(metavar="ARM.urdf", constructor=Path, help_behavior_hint="(default: none)")] = (
-        None
-    )
+    robot: Annotated[
+        Path | None, URDF, arg(metavar="ARM.urdf", constructor=Path, help_behavior_hint="(default: none)")
+    ] = None
     """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
-    logs: Positional[Annotated[tuple[Path, ...], arg(metavar="LOG...")]]
+    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""

@@ -11,6 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 import forcegp
 from forcegp.cli.backend_options import BackendOptions
+from forcegp.cli.command import DATASET
 from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.cli.robot_options import RobotOptions
@@ -22,7 +23,7 @@ KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction
 class LearningOptions(BackendOptions, RobotOptions):
     """What every command asks that learns from a dataset."""
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
     """The folder to write."""

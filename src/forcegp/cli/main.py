@@ -39,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
         with Terminal(json=command.json) as terminal:
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
+            command.check_inputs()
             terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.data
 import forcegp.evaluation
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns, facts
@@ -35,7 +35,7 @@ class Prepare(PreparationOptions, RobotOptions):
       forcegp prepare log.h5 --cutoff 20 --delay auto --robot arm.urdf --trim 0.1 --out data.h5
     """
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to prepare (HDF5), as forcegp import wrote it."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write."""

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
-from forcegp.cli.command import Command
+from forcegp.cli.command import IDENTIFIED, URDF, Command
 from forcegp.errors import FileFormatError, InvalidInput
 
 SYSTEM_FILE = "system.json"
@@ -22,7 +22,7 @@ SYSTEM_FILE = "system.json"
 class RobotOptions(Command):
     """What every command asks that needs a robot."""
 
-    robot: Annotated[Path | None, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
+    robot: Annotated[Path | None, URDF, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
     """Use this robot instead of the dataset's."""
     inertias: Annotated[Literal["strict", "nearest"], arg(metavar="strict|nearest")] = "strict"
     """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
@@ -42,7 +42,7 @@ class RobotOptions(Command):
     ] = None
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
     identified: Annotated[
-        Path | None, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: none)")
+        Path | None, IDENTIFIED, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: none)")
     ] = None
     """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
 

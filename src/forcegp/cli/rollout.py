@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
-from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import NONE, columns, facts, number, percent
 from forcegp.cli.terminal import Terminal
@@ -35,9 +35,9 @@ class Rollout(Command):
       forcegp rollout run test.h5 --start 0,240 --integrator projected --samples 20 --out rollout
     """
 
-    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote."""
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """A recording with equal time steps that the model has not seen (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: rollout.json, rollout.h5 and rollout.png."""

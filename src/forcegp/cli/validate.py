@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.validation
 from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
@@ -40,7 +40,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
 
     interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset (HDF5), raw or prepared."""
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder of results; an unfinished one is gone on with."""
