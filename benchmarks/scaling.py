@@ -93,7 +93,7 @@ def run() -> dict[str, float]:
 
 def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     """Time and memory over the number of rows."""
-    from forcegp.evaluation.figure_style import SERIES, SMALL, new_figure, quiet, save_figure
+    from forcegp.evaluation.plots.style import SERIES, SMALL, new_figure, quiet, save_figure
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2)

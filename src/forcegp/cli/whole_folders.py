@@ -9,6 +9,7 @@ import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,6 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
 def write_config(folder: Path, kind: str, content: Mapping[str, Any]) -> None:
     """`config.json`: what is needed to do it again, with versions and the list of files, which must be there by now."""
     files = sorted([CONFIG, *(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())])
-    from importlib.metadata import version
 
     versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
     write_json(folder / CONFIG, {"kind": kind, **content, "versions": versions, "files": files})

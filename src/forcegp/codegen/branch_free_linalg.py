@@ -9,8 +9,6 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from typing_extensions import override
 
-from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
-
 SWEEPS = {1: 0, 2: 2, 3: 5}
 """Rounds of Jacobi rotations by the number of rows: two columns need one, for more the convergence is quadratic."""
 
@@ -28,7 +26,8 @@ class StraightLineAlgebra(TorchFunctionMode):
         if func is torch.linalg.solve_triangular and not kwargs.get("upper", False) and kwargs.get("left", True):
             return solve_lower(*args)
         if func is torch.linalg.pinv and args[0].shape[-2] <= args[0].shape[-1]:
-            return pseudo_inverse(args[0], kwargs.get("rtol", REDUNDANCY_TOLERANCE))
+            default = max(args[0].shape[-2:]) * torch.finfo(args[0].dtype).eps  # that of torch.linalg.pinv
+            return pseudo_inverse(args[0], kwargs.get("rtol", default))
         return func(*args, **kwargs)
 
 

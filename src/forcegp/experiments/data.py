@@ -10,6 +10,7 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
 from forcegp.experiments.cells import Cell
 from forcegp.experiments.results import Results
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
 SIMULATION_COST = 0.1
@@ -38,8 +39,6 @@ def data_cell(seed: int, *, train_seconds: float, rows: int, test_seconds: float
 
 def simulate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Simulate both trajectories and keep them. Raises InvalidInput where more rows are wanted than there are."""
-    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-
     everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
     if spec["rows"] > len(everything):
         raise InvalidInput(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.cells import Cell
@@ -13,10 +14,8 @@ from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdo
 from forcegp.experiments.extrapolation_cells import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
+from forcegp.experiments.plots.extrapolation import extrapolation_figure
 from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
 TARGETS = {
@@ -101,8 +100,6 @@ class Extrapolation(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.extrapolation_plot import extrapolation_figure
-
         return {"extrapolation": extrapolation_figure(summary)}
 
     @override

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments import published
@@ -13,10 +14,8 @@ from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
 from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
+from forcegp.experiments.plots.learning_curves import learning_curves_figure
 from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
 HEADINGS = {
@@ -104,8 +103,6 @@ class Fig2b(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.learning_curves import learning_curves_figure
-
         return {"fig2b": learning_curves_figure(summary)}
 
     @override

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
 from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.fits import fit_cost
+from forcegp.experiments.plots.estimation import estimation_figure
 from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 AXES = ("com.x", "com.y", "com.z")
 
@@ -92,8 +91,6 @@ class Fig2c(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.estimation_plot import estimation_figure
-
         return {"fig2c": estimation_figure(summary)}
 
     @override

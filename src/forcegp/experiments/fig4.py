@@ -6,9 +6,10 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.cells import Cell
@@ -16,10 +17,8 @@ from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdo
 from forcegp.experiments.fig4_cells import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.plots.rollouts import rollouts_figure
 from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 BLACK_BOXES = ("gp", "neural-network")
 WITHOUT_CONSTRAINT = ("none", "projected")
@@ -118,8 +117,6 @@ class Fig4(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.rollouts_plot import rollouts_figure
-
         figures = {}
         for control in CONTROLS:
             arrays: dict[str, dict[str, dict[str, np.ndarray]]] = {variant: {} for variant in VARIANTS}

@@ -9,7 +9,10 @@ import os
 import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
 
 from forcegp import __version__
 from forcegp.errors import FileFormatError, InvalidInput
@@ -20,9 +23,6 @@ from forcegp.experiments.pages import page_of
 from forcegp.experiments.report import report
 from forcegp.experiments.results import KIND, Results, write_json, write_text
 from forcegp.parallel import Backend
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def reproduce(
@@ -127,8 +127,6 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 def save_vector(figure: Figure, path: Path) -> None:
     """SVG under a temporary name, then renamed; equal figures give equal files."""
-    import matplotlib as mpl
-
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
     try:
         with mpl.rc_context({"svg.hashsalt": "forcegp"}):

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import forcegp.evaluation
+import forcegp.validation
 from forcegp.data.whole_files import write_json, write_text
 from forcegp.errors import BackendError, InvalidInput
-from forcegp.evaluation.figure_style import save_figure
 from forcegp.evaluation.machine import machine
 from forcegp.parallel import Backend, Pool, Shared, backend_for
 from forcegp.validation.candidates import DEFAULT_MODELS, candidates
 from forcegp.validation.comparison import Cell, Comparison, cells_of, compute
-from forcegp.validation.figures import figures_of
 from forcegp.validation.kept_cells import KeptCells
 from forcegp.validation.page import page
-from forcegp.validation.preparation_words import preparation_lines
+from forcegp.validation.paired_tests import against_baseline, verdicts
+from forcegp.validation.preparation_summary import preparation_lines
 from forcegp.validation.summary import summary_of
-from forcegp.validation.verdicts import against_baseline, verdicts
 
 RESULTS, PAGE = "results.json", "report.md"
 
@@ -92,9 +92,9 @@ def validate(
         document = _document(comparison, cells, chosen, seeds)
         document |= {"configuration": configuration, "source": dict(source or {})}
         document["identifications"] = [_brief(_read(kept, comparison, cell)) for cell in identifications]
-        figures = figures_of(document)
+        figures = forcegp.validation.figures_of(document)
         for name, figure in figures.items():
-            save_figure(figure, kept.folder / f"{name}.png")
+            forcegp.evaluation.save_figure(figure, kept.folder / f"{name}.png")
         document["figures"] = sorted(figures)
         write_json(kept.folder / RESULTS, document)
         write_text(kept.folder / PAGE, page(document))

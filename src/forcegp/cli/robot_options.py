@@ -6,17 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
-from forcegp.cli.command import Command
+import forcegp
+from forcegp.cli.command import IDENTIFIED, URDF, Command
 from forcegp.errors import FileFormatError, InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.mechanics import MechanicalSystem
-    from forcegp.robots import Robot
 
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""
@@ -26,7 +22,7 @@ SYSTEM_FILE = "system.json"
 class RobotOptions(Command):
     """What every command asks that needs a robot."""
 
-    robot: Annotated[Path | None, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
+    robot: Annotated[Path | None, URDF, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
     """Use this robot instead of the dataset's."""
     inertias: Annotated[Literal["strict", "nearest"], arg(metavar="strict|nearest")] = "strict"
     """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
@@ -46,11 +42,11 @@ class RobotOptions(Command):
     ] = None
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
     identified: Annotated[
-        Path | None, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: none)")
+        Path | None, IDENTIFIED, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: none)")
     ] = None
     """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
 
-    def chosen_robot(self, recorded: Robot | None = None) -> Robot | None:
+    def chosen_robot(self, recorded: forcegp.Robot | None = None) -> forcegp.Robot | None:
         """The robot that the options ask for, else `recorded`; what no URDF holds is as recorded.
 
         None where there is neither. Raises InvalidInput for options that contradict each other or make no sense, and
@@ -68,13 +64,11 @@ class RobotOptions(Command):
             return recorded
         return self._made(recorded, changes)
 
-    def chosen_system(self, dataset: Dataset, path: Path) -> MechanicalSystem:
+    def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
         """What is known about the robot of `dataset`, which came from `path`: its own system, with what is replaced.
 
         Raises InvalidInput where it carries none and none is given, or where joints differ.
         """
-        from forcegp.mechanics import MechanicalSystem
-
         system = dataset.system
         found = self._identified_system()
         if found is not None and system is not None:
@@ -91,19 +85,19 @@ class RobotOptions(Command):
             )
         if found is not None:
             return found
-        return MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
 
-    def _made(self, recorded: Robot | None, changes: dict[str, Any]) -> Robot:
+    def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
         """A robot from a URDF file, or from the recorded one's text, with what the options change."""
-        from forcegp.robots import Robot
-
         if recorded is not None:
             changes = {"gravity": recorded.gravity.tolist(), "locked": recorded.locked} | changes
         if self.robot is not None:
-            robot = Robot.from_urdf(self.robot, inertias=self.inertias, **changes)
+            robot = forcegp.Robot.from_urdf(self.robot, inertias=self.inertias, **changes)
         else:
             assert recorded is not None, "checked by the caller"
-            robot = Robot.from_urdf_text(recorded.urdf_text, source=recorded.source, inertias=self.inertias, **changes)
+            robot = forcegp.Robot.from_urdf_text(
+                recorded.urdf_text, source=recorded.source, inertias=self.inertias, **changes
+            )
         # robots with other joints are refused by their names, which says more than the length of the armature
         if recorded is None or robot.joint_names != recorded.joint_names:
             return robot
@@ -124,14 +118,13 @@ class RobotOptions(Command):
             changes["armature"] = _named(self.armature, "--armature", "JOINT=VALUE")
         return changes
 
-    def _identified_system(self) -> MechanicalSystem | None:
+    def _identified_system(self) -> forcegp.MechanicalSystem | None:
         if self.identified is None:
             return None
         given = {"robot": self.robot, "lock": self.lock, "armature": self.armature, "gravity": self.gravity}
         contradicting = [f"--{name}" for name, value in given.items() if value]
         if contradicting:
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
-        from forcegp.mechanics import MechanicalSystem
 
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
         try:
@@ -140,7 +133,7 @@ class RobotOptions(Command):
             raise FileFormatError(
                 f"{path}: cannot be read ({error}); give a folder that `forcegp identify` wrote."
             ) from None
-        return MechanicalSystem.from_json(text)
+        return forcegp.MechanicalSystem.from_json(text)
 
 
 def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, unknown_name_message
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.force_errors import true_names
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.style import (
     LARGE,
     NORMAL,
     PREDICTION,
@@ -23,17 +26,11 @@ from forcegp.evaluation.figure_style import (
     quiet,
     short_joint_names,
 )
-from forcegp.evaluation.force_scores import true_names
-from forcegp.evaluation.prediction_plot import legend_entries
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.components import Curve, term_slices
 from forcegp.priors import ContactFriction, ForcePrior, ToolForces
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 LARGEST_GRID = 12
 BEYOND = 0.18

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from forcegp.evaluation.figure_style import LARGE, SMALL, new_figure, quiet
-from forcegp.experiments.learning_curves import COLORS
+from forcegp.evaluation.plots.style import LARGE, SMALL, new_figure, quiet
 from forcegp.experiments.model_names import MODELS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.learning_curves import COLORS
 
 Arrays = Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]
 TITLES = {

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.style import (
     KNOWN_PHYSICS,
     LARGE,
     NORMAL,
@@ -21,12 +22,7 @@ from forcegp.evaluation.figure_style import (
     quiet,
     window,
 )
-from forcegp.evaluation.prediction_plot import legend_entries
 from forcegp.models.protocol import Posterior
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 QUANTILE = 1.959963984540054
 """Of the standard normal distribution at 97.5 %."""

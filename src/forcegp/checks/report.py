@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from forcegp.checks.evidence import Evidence
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.excitation import excitation_findings
 from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
-from forcegp.checks.mistakes import Hypothesis, without_mistakes
+from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings
 from forcegp.checks.noise import noise_findings, numbers_of, torque_noise
 from forcegp.checks.robot_model import robot_findings
@@ -26,15 +27,21 @@ from forcegp.mechanics import MechanicalSystem
 class CheckReport:
     """The findings, worst first, and what they rest on.
 
-    `evidence` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
-    with the mistakes taken out that were found (None without a robot, or with contacts).
+    `inputs` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
+    with the errors corrected that were found (None without a robot, or with contacts).
     """
 
     __no_type_check__: ClassVar[bool] = True  # made by `check` alone
 
     findings: tuple[Finding, ...]
-    evidence: Evidence
+    inputs: CheckInput
     comparison: Hypothesis | None
+
+    @property
+    def evidence(self) -> CheckInput:
+        """Deprecated name of `inputs`."""
+        warnings.warn("CheckReport.evidence is now called inputs.", DeprecationWarning, stacklevel=2)
+        return self.inputs
 
     @property
     def severity(self) -> Severity:
@@ -52,8 +59,8 @@ class CheckReport:
         (see `forcegp.checks.torques`), the factor only where the torque rests on it; "noise_before" and "noise_after"
         the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
         """
-        nothing = [None] * self.evidence.log.nv
-        columns: dict[str, list[Any]] = {"joint": list(self.evidence.names)}
+        nothing = [None] * self.inputs.log.nv
+        columns: dict[str, list[Any]] = {"joint": list(self.inputs.names)}
         fit = None if self.comparison is None else self.comparison.fit
         rows = None if self.comparison is None else self.comparison.rows
         columns["unexplained"] = nothing if fit is None else plain(fit.unexplained)
@@ -61,10 +68,10 @@ class CheckReport:
         if fit is not None and rows is not None:
             columns["residual"] = plain(np.std(rows.u - fit.predicted, axis=0))
         columns["factor"] = nothing if fit is None else plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
-        report = {} if self.evidence.prepared is None else self.evidence.price
+        report = {} if self.inputs.prepared is None else self.inputs.price
         noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
         columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
-        torque = torque_noise(self.evidence, numbers_of(noise["after"])) if self.evidence.prepared is not None else None
+        torque = torque_noise(self.inputs, numbers_of(noise["after"])) if self.inputs.prepared is not None else None
         columns["noise_torque"] = nothing if torque is None else plain(torque)
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
@@ -74,7 +81,7 @@ class CheckReport:
         return {
             "severity": self.severity,
             "counts": counts,
-            "cutoff": None if self.evidence.prepared is None else self.evidence.price.get("cutoff"),
+            "cutoff": None if self.inputs.prepared is None else self.inputs.price.get("cutoff"),
             "joints": self.per_joint(),
             "findings": [finding.to_dict() for finding in self.findings],
         }
@@ -97,17 +104,17 @@ def check(
             f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
             f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
         )
-    evidence = Evidence.of(dataset, system, preparation or Preparation(cutoff="auto"))
-    findings = [*sampling_findings(evidence), *signal_findings(evidence), *motion_findings(evidence)]
+    inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
+    findings = [*sampling_findings(inputs), *signal_findings(inputs), *motion_findings(inputs)]
     comparison = None
-    if evidence.robot is not None:
-        findings += robot_findings(evidence.robot)
-    if evidence.prepared is not None:
-        if evidence.robot is None or evidence.contacts:
-            findings.append(not_compared(evidence))
+    if inputs.robot is not None:
+        findings += robot_findings(inputs.robot)
+    if inputs.prepared is not None:
+        if inputs.robot is None or inputs.contacts:
+            findings.append(not_compared(inputs))
         elif dataset.u.any():
-            comparison, mistakes = without_mistakes(evidence)
-            findings += [*mistakes, *torque_findings(evidence, comparison)]
-        findings += [*excitation_findings(evidence), *noise_findings(evidence)]
+            comparison, corrections = best_hypothesis(inputs)
+            findings += [*corrections, *torque_findings(inputs, comparison)]
+        findings += [*excitation_findings(inputs), *noise_findings(inputs)]
     ordered = sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
-    return CheckReport(findings=tuple(ordered), evidence=evidence, comparison=comparison)
+    return CheckReport(findings=tuple(ordered), inputs=inputs, comparison=comparison)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.figure_style import NORMAL, SERIES, SMALL, new_figure, quiet
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.evaluation.plots.style import NORMAL, SERIES, SMALL, new_figure, quiet
 
 
 def likelihood_figure(

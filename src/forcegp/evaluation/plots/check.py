@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
 from forcegp.data import Dataset, Preparation, motion_spectrum
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.spectrum import draw_cutoff, draw_time_steps
+from forcegp.evaluation.plots.style import (
     KNOWN_PHYSICS,
     LARGE,
     MEASUREMENT,
@@ -24,12 +28,6 @@ from forcegp.evaluation.figure_style import (
     short_joint_names,
     window,
 )
-from forcegp.evaluation.prediction_plot import legend_entries
-from forcegp.evaluation.spectrum_plot import draw_cutoff, draw_time_steps
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLUMNS = 3
 SECONDS = 5.0
@@ -41,15 +39,15 @@ def check_figure(report: CheckReport) -> Figure:
 
     Where torques were not compared, positions are drawn instead.
     """
-    evidence = report.evidence
-    nv = evidence.log.nv
+    inputs = report.inputs
+    nv = inputs.log.nv
     columns = min(nv, COLUMNS if nv != 4 else 2)
     grid = -(-nv // columns)
     figure = new_figure(10.0, 1.75 * grid + 3.4)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7))
     panels = halves[0].subplots(grid, columns, sharex=True, squeeze=False)
-    names = short_joint_names(evidence.names)
-    shown = window(evidence.log if evidence.compared is None else evidence.compared, 0.0, SECONDS)
+    names = short_joint_names(inputs.names)
+    shown = window(inputs.log if inputs.compared is None else inputs.compared, 0.0, SECONDS)
     shown = shown.rows(slice(None, None, max(1, len(shown) // MOST_ROWS)))
     drawn = [_draw_joint(panel, report, shown, joint) for joint, panel in zip(range(nv), panels.flat, strict=False)]
     for joint, panel in enumerate(panels.flat):
@@ -74,7 +72,7 @@ def check_figure(report: CheckReport) -> Figure:
     )
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]
     _draw_spectra(left, report, names)
-    draw_time_steps(right, evidence.log)
+    draw_time_steps(right, inputs.log)
     quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
     return figure
 
@@ -91,9 +89,7 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     measured, fitted = rows.u[:, joint], log.fit.at(tau, rows)[:, joint]
     mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
     if mended:
-        axes.plot(
-            rows.time, shown.u[:, joint], color=KNOWN_PHYSICS, linewidth=0.9, label="before the mistake is taken out"
-        )
+        axes.plot(rows.time, shown.u[:, joint], color=KNOWN_PHYSICS, linewidth=0.9, label="before the correction")
     axes.plot(rows.time, measured, color=MEASUREMENT, linewidth=2.2, label="measured, filtered")
     axes.plot(rows.time, tau[:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics")
     style = (0, (4, 1.5))
@@ -122,19 +118,19 @@ def _title(name: str, report: CheckReport, joint: int) -> str:
 
 def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     """Power of the accelerations of all joints, by differences of the positions, and the cut-off."""
-    evidence = report.evidence
-    spectrum = motion_spectrum(evidence.even)
+    inputs = report.inputs
+    spectrum = motion_spectrum(inputs.even)
     for joint, name in enumerate(names):
         power = np.maximum(spectrum.acceleration_density[:, joint], 1e-300)
         axes.loglog(spectrum.frequency, power, color=SERIES[joint % len(SERIES)], linewidth=0.9, label=name)
     shown = spectrum.acceleration_density[spectrum.acceleration_density > 0.0]
     if len(shown):
         axes.set_ylim(max(0.3 * float(shown.min()), 1e-12 * float(shown.max())), 5.0 * float(shown.max()))
-    preparation = Preparation() if evidence.prepared is None else evidence.prepared.preparation
+    preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
     title = "Acceleration as logged: no filter"
     if preparation.cutoff is not None:
         draw_cutoff(axes, float(preparation.cutoff), TRUTH)
         title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
     axes.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
     axes.legend(fontsize=SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
-    quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if evidence.rotates.all() else "power / Hz")
+    quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.style import (
     KNOWN_PHYSICS,
     LARGE,
     MEASUREMENT,
@@ -22,20 +24,15 @@ from forcegp.evaluation.figure_style import (
     short_joint_names,
     window,
 )
-from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
-from forcegp.evaluation.prediction_plot import legend_entries
-from forcegp.evaluation.tool_path_plot import (
+from forcegp.evaluation.plots.tool_path import (
     draw_tool_path,
     excerpt,
     finish_tool_path,
     fit_figure_to_path,
     tool_path_title,
 )
+from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models.protocol import Posterior
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def summary_figure(

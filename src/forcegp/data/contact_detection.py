@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
+import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.errors import ContactError
-
-if TYPE_CHECKING:
-    from forcegp.mechanics import Contact
 
 FARTHEST = 5e-3  # m
 LEAST_DISTANCE = 1e-3  # m
@@ -39,10 +36,6 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
 
     Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
-    import torch  # a Dataset is read without torch and mechanics unless it needs them
-
-    from forcegp.mechanics.state import State
-
     system = dataset.system
     if system is None or not system.contacts:
         raise ContactError(
@@ -51,7 +44,7 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
         )
     q, v, u, a = (torch.tensor(getattr(dataset, name)) for name in ("q", "v", "u", "a"))
     with torch.no_grad():
-        state = State.of(system.robot, q, v, u)
+        state = forcegp.mechanics.State.of(system.robot, q, v, u)
         columns = []
         for index, contact in enumerate(system.contacts):
             A, b, gradient = contact.constraint(state, system.baumgarte)
@@ -118,7 +111,9 @@ def _noise_along(dataset: Dataset, rows: Float[np.ndarray, "rows nv"]) -> Float[
     return np.sqrt(((rows * dataset.noise_std) ** 2).sum(axis=1))
 
 
-def _never_in_contact(index: int, contact: Contact, distance: Float[np.ndarray, " rows"]) -> ContactError:
+def _never_in_contact(
+    index: int, contact: forcegp.mechanics.Contact, distance: Float[np.ndarray, " rows"]
+) -> ContactError:
     return ContactError(
         f"contact {index} (frame {contact.frame!r}) acts in none of the {len(distance)} rows: the median distance of "
         f"its point from the surface is {np.median(np.abs(distance)):.3g} m. Check the surface, the contact's point "

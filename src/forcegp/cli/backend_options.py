@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import arg
 
+import forcegp.parallel
 from forcegp.cli.command import Command
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.parallel import Backend
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,14 +25,16 @@ class BackendOptions(Command):
     ] = None
     """The head of the Ray cluster, for --backend ray."""
 
-    def _backend(self, default: str | None = None) -> Backend:
+    def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
         """The backend that is asked for, or else the default: this process for one job, several for more.
 
         Raises InvalidInput for options that contradict each other.
         """
-        from forcegp.parallel import backend_for, backend_of
-
         if self.backend is None and self.address is not None:
             raise InvalidInput(f"--address is {self.address}, that of a cluster; add --backend ray.")
         name = self.backend or default
-        return backend_for(None, self.jobs) if name is None else backend_of(name, self.jobs, self.address)
+        return (
+            forcegp.parallel.backend_for(None, self.jobs)
+            if name is None
+            else forcegp.parallel.backend_of(name, self.jobs, self.address)
+        )

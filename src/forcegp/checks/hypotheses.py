@@ -1,7 +1,7 @@
-"""What may have been mistaken in a log: signs, joints, units, the direction of gravity.
+"""Hypotheses about errors in a log: wrong signs, exchanged joints, wrong units, a wrong direction of gravity.
 
-Each mistake is a hypothesis about what the log would be without it. The hypothesis under which inverse dynamics fits
-the torques best is told if it leaves far less unexplained than the log as it is; then the next is sought, on top of it.
+Each hypothesis corrects one error. The hypothesis under which inverse dynamics fits the torques best is reported if it
+leaves far less unexplained than the log as it is; then the next is sought, on top of it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.evidence import DEGREE, Evidence
+from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.findings import Finding, listed
 from forcegp.checks.gravity import estimated_gravity, with_gravity
 from forcegp.checks.torques import Correction, TorqueFit, fit_torques, inverse_dynamics, unexplained_share
@@ -25,7 +25,7 @@ SMALLEST = 1e-3
 """Unexplained shares below this are all the same: a log fits."""
 
 GAIN = np.log(4.0)
-"""What a mistake must explain: the product over all joints of what remains falls by this factor at least."""
+"""What a correction must explain: the product over all joints of what remains falls by this factor at least."""
 
 STILL_UNEXPLAINED = 0.6
 """A joint of which more remains even then has not been explained."""
@@ -33,17 +33,17 @@ STILL_UNEXPLAINED = 0.6
 EXPLAINED = 0.1
 """Where no more than this remains in any joint there is nothing to explain."""
 
-MOST_MISTAKES = 4
+MAX_CORRECTIONS = 4
 TILTED = np.deg2rad(15.0)
-"""Angle from which a direction of gravity is told."""
+"""Angle from which a direction of gravity is reported."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A log without one mistake: its robot, what was corrected, the rows compared, their inverse dynamics and the fit.
+    """A log with one error corrected: robot, correction, rows compared, their inverse dynamics and the fit.
 
-    `cost` is subtracted from what it explains: of two explanations the simpler one is told. `concerns` are the joints
-    that it must explain.
+    `cost` is subtracted from what it explains: of two explanations the simpler one is reported. `concerns` are the
+    joints that it must explain.
     """
 
     robot: Robot
@@ -62,16 +62,16 @@ class Hypothesis:
         return float(np.log(np.maximum(known, SMALLEST)).sum())
 
 
-def without_mistakes(evidence: Evidence) -> tuple[Hypothesis, list[Finding]]:
-    """The log without what was mistaken in it, and what that is. The robot must be known, without contacts."""
-    assert evidence.robot is not None
-    given = evidence.rows()
-    now = _hypothesis(evidence.robot, Correction.none(given.nv), given)
+def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Finding]]:
+    """The corrected log and one finding for each correction, chosen greedily. Needs a robot, without contacts."""
+    assert inputs.robot is not None
+    given = inputs.rows()
+    now = _hypothesis(inputs.robot, Correction.none(given.nv), given)
     found: list[Finding] = []
-    for _ in range(MOST_MISTAKES):
+    for _ in range(MAX_CORRECTIONS):
         if not np.nanmax(now.fit.unexplained, initial=0.0) > EXPLAINED:
             break
-        candidates = [*_candidates(now, given, evidence)]
+        candidates = [*_candidates(now, given, inputs)]
         best = max(candidates, key=lambda other: now.score - other.score - other.cost, default=None)
         if best is None or now.score - best.score - best.cost < GAIN or not _explains(now, best):
             break
@@ -82,7 +82,7 @@ def without_mistakes(evidence: Evidence) -> tuple[Hypothesis, list[Finding]]:
 
 
 def _explains(now: Hypothesis, best: Hypothesis) -> bool:
-    """Whether every joint that the mistake concerns is explained now, and none much worse than before."""
+    """Whether every joint that the correction concerns is explained now, and none much worse than before."""
     before, after = now.fit.unexplained, best.fit.unexplained
     concerned = [joint for joint in best.concerns if np.isfinite(after[joint])]
     better = all(after[joint] < STILL_UNEXPLAINED and after[joint] < before[joint] for joint in concerned)
@@ -90,12 +90,12 @@ def _explains(now: Hypothesis, best: Hypothesis) -> bool:
     return better and bool((after[known] < np.maximum(2.0 * before[known], 0.1)).all())
 
 
-def _candidates(now: Hypothesis, given: Dataset, evidence: Evidence) -> Iterator[Hypothesis]:
-    yield from _torque_signs(now, given, evidence.names)
-    yield from _torque_places(now, given, evidence.names)
-    yield from _degrees(now, given, evidence)
-    yield from _motion_signs(now, given, evidence.names)
-    yield from _motion_places(now, given, evidence.names)
+def _candidates(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+    yield from _torque_signs(now, given, inputs.names)
+    yield from _torque_places(now, given, inputs.names)
+    yield from _degrees(now, given, inputs)
+    yield from _motion_signs(now, given, inputs.names)
+    yield from _motion_places(now, given, inputs.names)
     yield from _gravity(now, given)
 
 
@@ -156,9 +156,9 @@ def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
     yield replace(better, finding=finding)
 
 
-def _degrees(now: Hypothesis, given: Dataset, evidence: Evidence) -> Iterator[Hypothesis]:
+def _degrees(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """All angles in degrees."""
-    largest = np.abs(now.rows.q * evidence.rotates).max()
+    largest = np.abs(now.rows.q * inputs.rotates).max()
     if largest < 1.0:
         return  # less than a degree of motion is not worth the question
     finding = Finding(
@@ -167,9 +167,9 @@ def _degrees(now: Hypothesis, given: Dataset, evidence: Evidence) -> Iterator[Hy
         seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken for "
         "radians.",
         remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
-        joints=tuple(name for name, turns in zip(evidence.names, evidence.rotates, strict=True) if turns),
+        joints=tuple(name for name, turns in zip(inputs.names, inputs.rotates, strict=True) if turns),
     )
-    factor = np.where(evidence.rotates, DEGREE, 1.0)
+    factor = np.where(inputs.rotates, DEGREE, 1.0)
     yield _hypothesis(now.robot, now.correction.motion(np.arange(len(factor)), factor), given, finding=finding)
 
 

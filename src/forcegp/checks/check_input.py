@@ -31,7 +31,7 @@ DEGREE = np.pi / 180.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Evidence:
+class CheckInput:
     """One log and, if known, its robot.
 
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
@@ -75,7 +75,7 @@ class Evidence:
         return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
 
     @classmethod
-    def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> Evidence:
+    def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> CheckInput:
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")

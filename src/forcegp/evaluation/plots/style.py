@@ -6,18 +6,17 @@ import os
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from PIL import Image
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-    from PIL.Image import Image
 
 # Okabe & Ito (2008): distinguishable with every kind of colour vision.
 PREDICTION = "#0072B2"
@@ -33,9 +32,6 @@ RESOLUTION = 150  # dots per inch
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of that size in inches on its own Agg canvas; touches no global state of pyplot."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(width, height), dpi=RESOLUTION, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
@@ -43,9 +39,6 @@ def new_figure(width: float, height: float) -> Figure:
 
 def speed_colors() -> ListedColormap:
     """Viridis (even for every kind of colour vision) without its yellow end, which vanishes on white."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
     return ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)), name="speed")
 
 
@@ -76,10 +69,8 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         raise
 
 
-def _render(figure: Figure) -> Image:
+def _render(figure: Figure) -> Image.Image:
     """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
-    from PIL import Image
-
     canvas = figure.canvas
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.style import (
     LARGE,
     MEASUREMENT,
     NORMAL,
@@ -21,11 +22,6 @@ from forcegp.evaluation.figure_style import (
 )
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models.protocol import Posterior
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:

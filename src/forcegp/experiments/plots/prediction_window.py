@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from forcegp.evaluation.figure_style import MEASUREMENT, SMALL, TRUTH, new_figure, quiet
-from forcegp.experiments.learning_curves import COLORS
+from forcegp.evaluation.plots.style import MEASUREMENT, SMALL, TRUTH, new_figure, quiet
 from forcegp.experiments.model_names import MODELS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.learning_curves import COLORS
 
 SHOWN_JOINTS = (0, 3, 6)
 INTERVAL = 1.96

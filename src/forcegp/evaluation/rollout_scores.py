@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from forcegp.evaluation.recorded_motions import RecordedMotions
+from forcegp.evaluation.recorded_segments import RecordedMotions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.rollout import Rollout
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.style import (
     NORMAL,
     QUIET,
     SMALL,
@@ -21,11 +22,6 @@ from forcegp.evaluation.figure_style import (
 )
 from forcegp.mechanics import MechanicalSystem, Plane
 from forcegp.models.protocol import Posterior
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
 
 PATH_SECONDS = 20.0
 """Length of the path that is drawn: more becomes a tangle."""
@@ -50,8 +46,6 @@ def draw_tool_path(axes: Axes, posterior: Posterior, dataset: Dataset, *, start:
 
     Drawn are at most PATH_SECONDS of the recording, from `start` seconds on.
     """
-    from matplotlib.collections import LineCollection
-
     dataset = _path_rows(dataset, start)
     position, speed, _ = tool_motion(posterior.system, dataset.q, dataset.v)
     segments = np.stack([position[:-1, :2], position[1:, :2]], axis=1)

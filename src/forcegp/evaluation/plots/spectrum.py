@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.data import (
     Dataset,
@@ -15,7 +17,7 @@ from forcegp.data import (
     motion_spectrum,
     power_density,
 )
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.style import (
     KNOWN_PHYSICS,
     LARGE,
     MEASUREMENT,
@@ -27,10 +29,6 @@ from forcegp.evaluation.figure_style import (
     quiet,
     short_joint_names,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 DECADES = 12.0
 """Most that an axis of powers shows below its top."""

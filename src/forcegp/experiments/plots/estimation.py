@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from forcegp.evaluation.figure_style import QUIET, SMALL, new_figure, quiet
+from matplotlib.figure import Figure
+
+from forcegp.evaluation.plots.style import QUIET, SMALL, new_figure, quiet
 from forcegp.experiments import published
 from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
-from forcegp.experiments.learning_curves import COLORS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.learning_curves import COLORS
 
 PANELS = (
     ("mass_error", "|mass error| of the tool [kg]", MASS_BOUND),

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from forcegp.evaluation.figure_style import QUIET, SERIES, SMALL, new_figure, quiet
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+from forcegp.evaluation.plots.style import QUIET, SERIES, SMALL, new_figure, quiet
 from forcegp.experiments import published
 from forcegp.experiments.model_names import MODELS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLORS = dict(
     zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET, SERIES[3], SERIES[5]), strict=True)
@@ -27,8 +27,6 @@ PANELS = (
 
 def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
     """Figure 2b: ours as solid lines with the range over seeds, the paper's as dashed lines."""
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-
     figure = new_figure(11.0, 4.4)
     panels = figure.subplots(1, len(PANELS))
     counts = sorted({int(count) for curve in summary["curves"].values() for count in curve})

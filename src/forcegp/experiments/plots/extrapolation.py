@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from forcegp.evaluation.figure_style import QUIET, SMALL, new_figure, quiet
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from forcegp.evaluation.plots.style import QUIET, SMALL, new_figure, quiet
 from forcegp.experiments.extrapolation_cells import REGIONS
-from forcegp.experiments.learning_curves import COLORS
 from forcegp.experiments.model_names import MODELS, NETWORKS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.learning_curves import COLORS
 
 
 def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.style import (
     LARGE,
     NORMAL,
     PREDICTION,
@@ -19,13 +21,9 @@ from forcegp.evaluation.figure_style import (
     quiet,
     short_joint_names,
 )
-from forcegp.evaluation.recorded_motions import RecordedMotions
-from forcegp.evaluation.rollout_errors import INTERVAL, RolloutErrors
+from forcegp.evaluation.recorded_segments import RecordedMotions
+from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors
 from forcegp.models.rollout import Rollout
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLUMNS = 4
 SMALLEST_SHOWN = 1e-16
