@@ -1,4 +1,4 @@
-"""`--learn-from` and `--window`: a raw log without accelerations, through the executable."""
+"""`--learn-from` and `--window`: a raw log without accelerations."""
 
 import json
 

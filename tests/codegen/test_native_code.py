@@ -41,7 +41,7 @@ def test_only_tensors_with_hidden_derivatives_are_refused():
     require_plain([x, x.clone().requires_grad_()], "code", "do without")
     with forward_ad.dual_level():
         require_plain([x], "code", "do without")
-        with pytest.raises(InvalidInput, match="code does not support forward-mode differentiation; do without"):
+        with pytest.raises(InvalidInput, match="forward-mode"):
             require_plain([x, forward_ad.make_dual(x, x)], "code", "do without")
 
     def through_code(y):

@@ -100,7 +100,7 @@ def test_many_rows_are_conditioned_on_exactly_with_parameters_from_some(train, m
 
 def test_more_rows_than_memory_holds_are_refused_before_the_first_fit(train, monkeypatch):
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
-    with pytest.raises(NotEnoughMemory, match=r"^3 exact posteriors of N=40 rows needs .* free: give fewer points"):
+    with pytest.raises(NotEnoughMemory, match=r"N=40 rows .*fewer points"):
         compare_priors(train, PRIORS, points=40, **QUICK)
 
 

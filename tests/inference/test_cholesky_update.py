@@ -53,7 +53,8 @@ def test_appending_is_conditioning_on_all_rows(shape, panel_bytes, monkeypatch):
     for part in (slice(7, 8), slice(8, 12)):
         grown = add(grown, rows_of(whole, part))
     if shape.get("latents") == 0:
-        assert grown.system.deflation.remainder.equal(condition(whole).system.deflation.remainder)
+        expected = condition(whole).system.deflation.remainder  # of all rows at once, so rounded otherwise
+        torch.testing.assert_close(grown.system.deflation.remainder, expected, rtol=1e-13, atol=1e-13)
     else:
         assert_same(grown, condition(whole))
 

@@ -162,5 +162,5 @@ def test_what_needs_single_rows_says_so():
     posterior = FunctionalPosterior.condition(
         given_problem.kernels, window_weights(given_problem), terms_of(given_problem)
     )
-    with pytest.raises(InvalidInput, match=r"leaving rows out needs .* which a FunctionalPosterior .* accelerations"):
+    with pytest.raises(InvalidInput, match=r"FunctionalPosterior .*accelerations"):
         exact(posterior, "leaving rows out")

@@ -129,7 +129,7 @@ def test_stored_and_loaded_it_predicts_the_same(data, states, engine, tmp_path):
 
 def test_too_little_memory_is_said_before_anything_is_allocated(data, monkeypatch):
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
-    with pytest.raises(NotEnoughMemory, match=r"N=60 rows.* needs .* MiB, 0 MiB are free: .*learning_points"):
+    with pytest.raises(NotEnoughMemory, match=r"N=60 rows.* 0 MiB .*learning_points"):
         fit(data)
 
 
@@ -201,21 +201,22 @@ def test_without_unknown_forces_every_engine_is_the_exact_one(data, states, engi
 
 
 def test_too_few_inducing_points_are_said(data):
-    with pytest.warns(NumericalWarning, match=r"15 inducing points leave out \S+ of the noise variance of a row"):
+    with pytest.warns(NumericalWarning, match=r"15 inducing points leave out \S+"):
         posterior = fit(data, Inducing(points=5))
     assert posterior.latent.left_out > 0.02
     assert "refined" not in posterior.settings
 
 
-def test_mini_batches_that_make_it_worse_change_nothing_and_say_so(data):
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("rate", [1.0, 5.0])
+def test_mini_batches_that_make_it_worse_change_nothing_and_say_so(data, rate, seed):
+    """At rate 5 every step multiplies length scales by 150 or divides them: some end where rounding hides the bound."""
     still = fit(data, Stochastic(points=60, steps=0))
-    with pytest.warns(
-        NumericalWarning, match=r"raise the bound on all rows from .* nothing was changed; .* smaller rate"
-    ):
-        tried = fit(data, Stochastic(points=60, steps=10, batch=10, rate=5.0))
+    with pytest.warns(NumericalWarning, match=rf"raise the bound on all rows .* nothing was changed; .* rate \({rate}"):
+        tried = fit(data, Stochastic(points=60, steps=10, batch=10, rate=rate, seed=seed))
     assert tried.settings["refined"].startswith("unchanged: 10 steps on 10 rows each would raise")
     for name, value in still.parameters.items():
-        torch.testing.assert_close(tried.parameters[name], value, rtol=0.0, atol=0.0)
+        assert torch.equal(tried.parameters[name], value)
 
 
 def test_far_rows_beyond_the_learning_rows_are_said(data):

@@ -321,15 +321,15 @@ def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(pos
     many = dataclasses.replace(few, **again, time=0.01 * np.arange(60_000), episode=np.zeros(60_000, int), truth={})
     wide = posterior.update(arm_data(28, seed=18))
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 2**30)
-    with pytest.raises(NotEnoughMemory, match=r"12 \+ 60000 rows needs .* GiB, 1.0 GiB are free: give a budget"):
+    with pytest.raises(NotEnoughMemory, match=r"12 \+ 60000 rows .*1\.0 GiB .*budget"):
         posterior.update(many)
-    with pytest.raises(NotEnoughMemory, match=r"budget=40000 needs .* GiB are free: give a smaller budget$"):
+    with pytest.raises(NotEnoughMemory, match=r"budget=40000 .*smaller budget"):
         posterior.update(many, budget=40_000)
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 40_000)
     with pytest.raises(NotEnoughMemory, match="give a budget"):
         posterior.update(few)
     assert posterior.update(few, budget=12).settings["points"] == 12
-    with pytest.raises(NotEnoughMemory, match=r"a smaller budget, or a posterior of fewer rows \(it has 40\)"):
+    with pytest.raises(NotEnoughMemory, match=r"smaller budget.*\(it has 40\)"):
         wide.update(few, budget=12)
 
 

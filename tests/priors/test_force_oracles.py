@@ -74,7 +74,7 @@ class TestPayload:
     def test_without_moments_the_mass_sits_at_the_origin_of_the_link(self, robot, rows):
         dynamics = MechanicalSystem(robot).dynamics(*rows)
         whole, point = Payload(FRAME), Payload(FRAME, moments=False)
-        torch.testing.assert_close(point.mixing(dynamics), whole.mixing(dynamics)[..., :1], rtol=0.0, atol=0.0)
+        torch.testing.assert_close(point.mixing(dynamics), whole.mixing(dynamics)[..., :1], rtol=1e-13, atol=1e-13)
         assert whole.latent_units(robot) == ("kg", "kg m", "kg m", "kg m")
         assert torch.equal(point.point_force(dynamics)[0, :, 0], torch.tensor(GRAVITY, dtype=torch.float64))
 
@@ -89,7 +89,7 @@ class TestToolForces:
         expected = torch.cat([J[:, :3].mT @ R, J[:, 3:].mT @ R], -1)
         torch.testing.assert_close(tool, expected, rtol=1e-10, atol=1e-10)
         at_contact = ToolForces(axes="tool", torque=True).mixing(dynamics)
-        torch.testing.assert_close(at_contact, tool, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(at_contact, tool, rtol=1e-13, atol=1e-13)
 
     def test_features_are_place_and_motion_along_the_axes(self, oracle, rows, dynamics, system):
         q, v, u = rows

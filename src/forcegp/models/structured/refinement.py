@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 
 import torch
 
-from forcegp.errors import NumericalWarning
+from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import (
     Inducing,
     InducingPosterior,
@@ -61,7 +62,11 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
             report=report,
         )
         with torch.no_grad():  # steps are noisy: what they came to is told by the bound on all rows
-            before, after = (float(objective(point)) for point in (start, result.parameters))
+            before = float(objective(start))
+            try:
+                after = float(objective(result.parameters))
+            except NumericalError:  # steps so wide that no bound can be computed where they ended
+                after = math.inf
         if not after <= before:
             told = f"{result.status} would raise the bound on all rows from {before:.1f} to {after:.1f} nats"
             if not after <= before + NOISE:
