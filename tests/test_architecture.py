@@ -17,11 +17,12 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 # The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
 ROOMS = {
     "errors": set(),
+    "atomic_files": {"errors"},
     "native_code": {"errors"},
     "parallel": {"errors"},
-    "robots": {"errors", "native_code"},
+    "robots": {"errors", "atomic_files", "native_code"},
     "mechanics": {"errors", "robots"},
-    "data": {"errors", "robots", "mechanics"},
+    "data": {"errors", "atomic_files", "robots", "mechanics"},
     "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
     "checks": {"errors", "robots", "mechanics", "data", "analytical"},
@@ -30,6 +31,7 @@ ROOMS = {
     "integration": {"errors", "robots", "mechanics"},
     "models": {
         "errors",
+        "atomic_files",
         "native_code",
         "parallel",
         "robots",

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Debug, Json
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.preparation_options import CutoffOptions
 from forcegp.cli.robot_choice import RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class Check(CutoffOptions, RobotOptions):
         from forcegp.evaluation.figure_style import save_figure
 
         assert self.plots is not None
-        with folder_written_whole(self.plots) as folder:
+        with atomic_folder(self.plots) as folder:
             folder.mkdir()
             save_figure(check_figure(report), folder / "check.png")
             write_json(folder / "check.json", content)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import POINTS, resolved_noise
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ class Compare(LearningOptions):
     ) -> None:
         from forcegp.models import save_posterior
 
-        with folder_written_whole(out) as folder:
+        with atomic_folder(out) as folder:
             folder.mkdir()
             for name, posterior in comparison.posteriors.items():
                 save_posterior(posterior, folder / folders[name])

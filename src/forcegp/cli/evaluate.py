@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ class Evaluate(Command):
             "normal_force_rests_on_prior": rests_on_prior,
         }
         if self.plots is not None:
-            with folder_written_whole(self.plots) as folder:
+            with atomic_folder(self.plots) as folder:
                 folder.mkdir()
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)

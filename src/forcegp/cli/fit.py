@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import (
@@ -23,8 +24,8 @@ from forcegp.cli.model_choice import (
     search_arguments,
     window_observation,
 )
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ class Fit(FitOptions):
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
         posterior = fit(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             command._write(folder, posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)

@@ -7,10 +7,11 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.friction_laws import friction_laws
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.robot_choice import SYSTEM_FILE
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> 
     except NonPhysicalInertia as error:
         identified, why_not = None, str(error)
     content["robot"] = "no" if identified is None else "yes"
-    with folder_written_whole(command.out) as folder:
+    with atomic_folder(command.out) as folder:
         folder.mkdir()
         (folder / "identification.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
         if identified is not None:

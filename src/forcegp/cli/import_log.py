@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from forcegp.cli.command import Debug, Json
+from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_choice import RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import require_free_file
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -127,8 +127,7 @@ class Import(PreparationOptions, RobotOptions):
         require_free_file(self.out, overwrite=self.overwrite)
         if self.write_mapping is not None:
             require_free_file(self.write_mapping, overwrite=self.overwrite)
-        from forcegp.data.hdf5 import file_written_whole
-        from forcegp.data.whole_files import write_text
+        from forcegp.atomic_files import atomic_file, write_text
         from forcegp.recordings import ImportOptions, import_recordings, mapping_text
 
         mapping = self._mapping(terminal)
@@ -143,7 +142,7 @@ class Import(PreparationOptions, RobotOptions):
             most_rows=self.max_rows,
         )
         system, preparation = self._system(), self._preparation()
-        with file_written_whole(self.out) as temporary, terminal.progress("importing") as report:
+        with atomic_file(self.out) as temporary, terminal.progress("importing") as report:
             done = import_recordings(self.logs, temporary, mapping, system=system, options=options, report=report)
             if not preparation.changes_nothing:
                 done |= _prepared(temporary, preparation, done["rows"])

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
+from forcegp.cli.output_folders import require_free_file, require_free_folder, write_config
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_choice import RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_file, require_free_folder, write_config
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class Prepare(PreparationOptions, RobotOptions):
         from forcegp.evaluation.spectrum_plot import preparation_figure
 
         assert self.plots is not None
-        with folder_written_whole(self.plots) as folder:
+        with atomic_folder(self.plots) as folder:
             folder.mkdir()
             save_figure(preparation_figure(dataset, prepared.preparation), folder / "spectra.png")
             write_config(folder, KIND, {"data": str(self.data), "preparation": prepared.report})

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ class Rollout(Command):
         cpu_seconds = time.process_time() - begun
         errors = rollout_errors(rollout, recorded, posterior.system)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             folder.mkdir()
             self._write(folder, rollout, recorded, errors, dataset, summary)
         terminal.note(f"figure: {self.out / 'rollout.png'}")

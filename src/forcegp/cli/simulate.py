@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import require_free_file
 
 if TYPE_CHECKING:
     from forcegp.data import Dataset

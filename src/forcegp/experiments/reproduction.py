@@ -5,13 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forcegp import __version__
+from forcegp.atomic_files import atomic_file
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.evaluation import save_figure
 from forcegp.experiments.cells import Progress, run_cells
@@ -126,13 +125,8 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def save_vector(figure: Figure, path: Path) -> None:
-    """SVG under a temporary name, then renamed; equal figures give equal files."""
+    """SVG; equal figures give equal files."""
     import matplotlib as mpl
 
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        with mpl.rc_context({"svg.hashsalt": "forcegp"}):
-            figure.savefig(temporary, format="svg", metadata={"Date": None})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_file(path) as temporary, mpl.rc_context({"svg.hashsalt": "forcegp"}):
+        figure.savefig(temporary, format="svg", metadata={"Date": None})
