@@ -29,9 +29,9 @@ from torch import Tensor
 from forcegp.atomic_files import write_text
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.machine import machine
 from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
+from forcegp.jobs.machine import machine
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
 from forcegp.models.structured_posterior import StructuredPosterior
 from forcegp.robots.devices import usable_device

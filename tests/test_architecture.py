@@ -20,6 +20,7 @@ ROOMS = {
     "atomic_files": {"errors"},
     "native_code": {"errors"},
     "parallel": {"errors"},
+    "jobs": {"errors", "atomic_files", "parallel"},
     "robots": {"errors", "atomic_files", "native_code"},
     "mechanics": {"errors", "robots"},
     "data": {"errors", "atomic_files", "robots", "mechanics"},

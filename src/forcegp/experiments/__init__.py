@@ -1,1 +1,1 @@
-"""The paper's figures and ours: typed configurations -> cells -> results. Import what you need from its modules."""
+"""The paper's figures and ours: typed configurations -> jobs -> results. Import what you need from its modules."""

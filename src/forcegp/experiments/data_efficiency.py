@@ -13,7 +13,7 @@ from forcegp.experiments import published
 from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_tables import only_test, plain_ticks, score_table
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,7 +41,7 @@ class DataEfficiency(ForceExperiment):
         return [*curves, *region]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         from forcegp.evaluation.figure_style import QUIET, SERIES, SMALL, new_figure, quiet
 
         figure = new_figure(8.6, 3.8)

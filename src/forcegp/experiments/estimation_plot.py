@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from forcegp.evaluation.figure_style import QUIET, SMALL, new_figure, quiet
 from forcegp.experiments import published
-from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.learning_curves import COLORS
 
 if TYPE_CHECKING:

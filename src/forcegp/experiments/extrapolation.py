@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
-from forcegp.experiments.extrapolation_cells import REGIONS, SIDES, TEST_X, TRAIN_X
+from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,15 +40,15 @@ class Extrapolation(Experiment):
     models: tuple[str, ...] = (*NETWORKS, *GAUSSIAN_PROCESSES, *ANALYTICAL)
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             out.append(data)
             out.append(
-                Cell(
+                Job(
                     _scale_name(seed),
-                    "forcegp.experiments.extrapolation_cells:scale",
+                    "forcegp.experiments.extrapolation_jobs:scale",
                     {"data": data.name},
                     (data.name,),
                     3.0,
@@ -61,26 +60,26 @@ class Extrapolation(Experiment):
                     settings = self.settings.of_network() if model in NETWORKS else self.settings.of(self.points)
                     spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
                     cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
-                    cell = Cell(
+                    job = Job(
                         _fit_name(model, region, seed),
-                        "forcegp.experiments.extrapolation_cells:fit",
+                        "forcegp.experiments.extrapolation_jobs:fit",
                         spec | settings,
                         (data.name,),
                         cost,
                     )
-                    out.append(cell)
+                    out.append(job)
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         regions: dict[str, Any] = {}
         for region in REGIONS:
             regions[region] = {}
             for model in self.models:
                 found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
                 regions[region][model] = {
-                    side: {score: spread(cell[side][score] for cell in found) for score in SCORES} for side in SIDES
-                } | {"points": spread(cell["points"] for cell in found)}
+                    side: {score: spread(job[side][score] for job in found) for score in SCORES} for side in SIDES
+                } | {"points": spread(job["points"] for job in found)}
         scales = [results.result(_scale_name(seed)) for seed in self.seeds]
         scale = {name: spread(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
         return {"points": self.points, "regions": regions, "scale": scale}
@@ -100,7 +99,7 @@ class Extrapolation(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         from forcegp.experiments.extrapolation_plot import extrapolation_figure
 
         return {"extrapolation": extrapolation_figure(summary)}

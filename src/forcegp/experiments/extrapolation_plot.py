@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from forcegp.evaluation.figure_style import QUIET, SMALL, new_figure, quiet
-from forcegp.experiments.extrapolation_cells import REGIONS
+from forcegp.experiments.extrapolation_jobs import REGIONS
 from forcegp.experiments.learning_curves import COLORS
 from forcegp.experiments.model_names import MODELS, NETWORKS
 
