@@ -24,6 +24,7 @@ import torch
 
 from benchmarks.large_data import RECORDINGS, in_own_process, peak_bytes, recording
 from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_posterior
+from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
 from forcegp.inference import ENGINES, Inducing, Stochastic
 from forcegp.models.structured.engine_selection import on_all_rows
@@ -86,7 +87,7 @@ def run() -> dict[str, float]:
             print(f"{engine:10} {count:8d} {found['cpu_s']:8.2f} {found['memory_mib']:11.0f}", flush=True)
         results[f"slope_{engine}"] = slope(list(counts), [found["cpu_s"] for found in measured[engine].values()])
     FOLDER.mkdir(parents=True, exist_ok=True)
-    (FOLDER / "scaling.json").write_text(json.dumps(measured, indent=1) + "\n")
+    write_json(FOLDER / "scaling.json", measured)
     draw(measured)
     return results
 

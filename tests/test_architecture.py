@@ -18,11 +18,13 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 # The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
 ROOMS = {
     "errors": set(),
+    "atomic_files": {"errors"},
     "codegen": {"errors"},
     "parallel": {"errors"},
-    "robots": {"errors", "codegen"},
+    "jobs": {"errors", "atomic_files", "parallel"},
+    "robots": {"errors", "atomic_files", "codegen"},
     "mechanics": {"errors", "robots"},
-    "data": {"errors", "robots", "mechanics"},
+    "data": {"errors", "atomic_files", "robots", "mechanics"},
     "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
     "checks": {"errors", "robots", "mechanics", "data", "analytical"},
@@ -31,6 +33,7 @@ ROOMS = {
     "integration": {"errors", "robots", "mechanics"},
     "models": {
         "errors",
+        "atomic_files",
         "codegen",
         "parallel",
         "robots",

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from forcegp.errors import InvalidInput
-from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import markdown_table, number, shown, spread
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_scenarios import SCENARIOS
@@ -14,6 +13,7 @@ from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 from forcegp.experiments.presets import PRESETS, experiments_of
 from forcegp.experiments.report import report
 from forcegp.experiments.reproduction import as_csv, read_document
+from forcegp.jobs import Job
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 COMMITTED = [
@@ -22,13 +22,13 @@ COMMITTED = [
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_cells_that_experiments_share_are_the_same(preset):
-    known: dict[str, Cell] = {}
+def test_jobs_that_experiments_share_are_the_same(preset):
+    known: dict[str, Job] = {}
     for experiment in PRESETS[preset]:
         experiment.require_possible()
-        for cell in experiment.cells():
-            assert known.setdefault(cell.name, cell) == cell
-    assert all(name in known for cell in known.values() for name in cell.after)
+        for job in experiment.jobs():
+            assert known.setdefault(job.name, job) == job
+    assert all(name in known for job in known.values() for name in job.inputs)
 
 
 def test_figure_2b_has_the_seeds_and_points_that_it_promises():
@@ -63,7 +63,7 @@ def test_the_committed_page_is_made_of_the_committed_numbers(preset):
     for experiment in experiments:
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
-        assert all((folder / f"{name}{ending}").exists() for name in document["figures"] for ending in (".png", ".svg"))
+        assert all((folder / f"{name}.png").exists() for name in document["figures"])
 
 
 def test_the_page_of_the_paper_is_committed():
@@ -72,7 +72,7 @@ def test_the_page_of_the_paper_is_committed():
 
 @pytest.mark.parametrize("preset", ["forces", "forces-smoke"])
 def test_trials_are_told_apart_by_their_names(preset):
-    """One name is one model on one scenario, in all experiments: they share cells, and no cell is of two trials."""
+    """One name is one model on one scenario, in all experiments: they share jobs, and no job is of two trials."""
     known: dict[str, Trial] = {}
     for experiment in PRESETS[preset]:
         assert isinstance(experiment, ForceExperiment)

@@ -225,12 +225,12 @@ def test_what_comes_back_from_disk_predicts_the_same(tmp_path, prior):
     assert_same(load_posterior(tmp_path / "free"), grown.with_contacts([]), data)
 
 
-def test_only_updated_models_need_the_newer_format(tmp_path):
+def test_only_updated_models_declare_rows_of_reference(tmp_path):
     data = arm_data(14, seed=15)
     posterior = fit(data)
-    for name, saved, version in (("old", posterior, 1), ("new", posterior.update(data.rows([12])), 3)):
+    for name, saved, features in (("old", posterior, []), ("new", posterior.update(data.rows([12])), ["reference"])):
         save_posterior(saved, tmp_path / name)
-        assert json.loads((tmp_path / name / "model.json").read_text())["format_version"] == version
+        assert json.loads((tmp_path / name / "model.json").read_text())["features"] == features
     assert not any(key.startswith("reference.") for key in load_file(tmp_path / "old" / "tensors.safetensors"))
     (tmp_path / "old" / "model.json").write_bytes((tmp_path / "new" / "model.json").read_bytes())
     with pytest.raises(FileFormatError, match=r"reference\.q"):

@@ -134,7 +134,7 @@ def test_a_stored_model_predicts_the_same_and_says_that_it_knows_windows(tmp_pat
     assert len(loaded.training) == 24
     assert loaded.settings["observe"] == posterior.settings["observe"]
     document = json.loads((tmp_path / "run" / "model.json").read_text())
-    assert document["format_version"] == 4
+    assert document["features"] == ["windows"]
     broken = replace(posterior.training, weights=posterior.training.weights[:-1])
     object.__setattr__(posterior.likelihood, "training", broken)
     try:

@@ -13,12 +13,13 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.preparation_options import CutoffOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import DatasetError
 
 KIND = "forcegp check"
@@ -77,7 +78,7 @@ class Check(CutoffOptions, RobotOptions):
 
     def _draw(self, terminal: Terminal, report: forcegp.CheckReport, content: Mapping[str, Any]) -> None:
         assert self.plots is not None
-        with folder_written_whole(self.plots) as folder:
+        with atomic_folder(self.plots) as folder:
             folder.mkdir()
             forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
             write_json(folder / "check.json", content)

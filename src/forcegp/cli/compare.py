@@ -16,13 +16,14 @@ import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
 import forcegp.priors
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.fit_options import POINTS
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import resolved_noise
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp compare"
@@ -144,7 +145,7 @@ class Compare(LearningOptions):
         content: Mapping[str, Any],
         folders: Mapping[str, str],
     ) -> None:
-        with folder_written_whole(out) as folder:
+        with atomic_folder(out) as folder:
             folder.mkdir()
             for name, posterior in comparison.posteriors.items():
                 forcegp.save_posterior(posterior, folder / folders[name])

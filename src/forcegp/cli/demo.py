@@ -16,19 +16,14 @@ import forcegp
 import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.evaluate import draw, score
 from forcegp.cli.fit import fit, fit_summary
+from forcegp.cli.output_folders import holds_only_own_files, require_free_folder, write_config
 from forcegp.cli.simulate import simulate
 from forcegp.cli.tables import NONE, NORMAL_FORCES, columns, multiplier_scores, nats, number, percent
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import (
-    folder_written_whole,
-    holds_only_own_files,
-    require_free_folder,
-    write_config,
-    write_json,
-)
 from forcegp.errors import InvalidInput
 from forcegp.experiments import published
 
@@ -81,7 +76,7 @@ class Demo(Command):
         replaceable = self.overwrite or holds_only_own_files(self.out, KIND)
         require_free_folder(self.out, kind=KIND, overwrite=replaceable)
         start = time.monotonic()
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             folder.mkdir()
             train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
             models, evaluations, fit_seconds = {}, {}, {}

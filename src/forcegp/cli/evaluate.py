@@ -12,8 +12,10 @@ from tyro.conf import Positional, UseAppendAction, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
 from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import (
     NORMAL_FORCES,
@@ -25,7 +27,6 @@ from forcegp.cli.tables import (
     number,
 )
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp evaluate"
@@ -89,7 +90,7 @@ class Evaluate(Command):
             "normal_force_rests_on_prior": rests_on_prior,
         }
         if self.plots is not None:
-            with folder_written_whole(self.plots) as folder:
+            with atomic_folder(self.plots) as folder:
                 folder.mkdir()
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)

@@ -12,12 +12,18 @@ import forcegp
 import forcegp.inference
 import forcegp.models
 import forcegp.robots
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit_options import ModelOptions
-from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
+from forcegp.cli.model_choice import (
+    make_model,
+    resolved,
+    search_arguments,
+    window_observation,
+)
+from forcegp.cli.output_folders import require_free_folder
 from forcegp.cli.tables import facts
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp fit"
@@ -63,7 +69,7 @@ class Fit(ModelOptions):
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
         posterior = fit(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             command._write(folder, posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)

@@ -12,7 +12,7 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 import forcegp.models
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.whole_folders import write_config
+from forcegp.cli.output_folders import write_config
 
 ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
 

@@ -14,15 +14,16 @@ from rich.text import Text
 import forcegp
 import forcegp.inference
 import forcegp.models
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit import fit, fit_summary
 from forcegp.cli.identify_options import IdentifyOptions
 from forcegp.cli.identify_regression import INERTIAS, identify_by_regression
 from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
 from forcegp.cli.model_choice import resolved_noise
+from forcegp.cli.output_folders import require_free_folder
 from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp identify"
@@ -90,7 +91,7 @@ class Identify(IdentifyOptions):
             found = replace(posterior.identification, progress=report)
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             told = json.dumps(content, indent=1, allow_nan=False) + "\n"
             urdf = posterior.system.robot.to_urdf()
             self._write(folder, posterior, KIND, {"identification.json": told, "identified.urdf": urdf})

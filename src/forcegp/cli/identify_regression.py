@@ -11,12 +11,13 @@ from rich.text import Text
 
 import forcegp
 import forcegp.analytical
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.identify_options import IdentifyOptions
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.robot_options import SYSTEM_FILE
 from forcegp.cli.tables import columns
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
 INERTIAS = {"least-squares": "free", "consistent": "consistent"}
@@ -57,7 +58,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     except NonPhysicalInertia as error:
         identified, why_not = None, str(error)
     content["robot"] = "no" if identified is None else "yes"
-    with folder_written_whole(command.out) as folder:
+    with atomic_folder(command.out) as folder:
         folder.mkdir()
         (folder / "identification.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
         if identified is not None:

@@ -13,12 +13,12 @@ import forcegp
 import forcegp.data
 import forcegp.inference
 import forcegp.recordings
+from forcegp.atomic_files import atomic_file, write_text
 from forcegp.cli.command import LOG, URDF, Debug, Json
+from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import require_free_file
-from forcegp.data.whole_files import write_text
 from forcegp.errors import InvalidInput
 
 COPIES = 10
@@ -140,7 +140,7 @@ class Import(PreparationOptions, RobotOptions):
             most_rows=self.max_rows,
         )
         system, preparation = self._system(), self._preparation()
-        with forcegp.data.file_written_whole(self.out) as temporary, terminal.progress("importing") as report:
+        with atomic_file(self.out) as temporary, terminal.progress("importing") as report:
             done = forcegp.import_recordings(
                 self.logs, temporary, mapping, system=system, options=options, report=report
             )

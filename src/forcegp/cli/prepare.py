@@ -13,12 +13,13 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.data
 import forcegp.evaluation
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.output_folders import require_free_file, require_free_folder, write_config
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns, facts
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_file, require_free_folder, write_config
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp prepare"
@@ -70,7 +71,7 @@ class Prepare(PreparationOptions, RobotOptions):
 
     def _draw(self, terminal: Terminal, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> None:
         assert self.plots is not None
-        with folder_written_whole(self.plots) as folder:
+        with atomic_folder(self.plots) as folder:
             folder.mkdir()
             forcegp.evaluation.save_figure(
                 forcegp.evaluation.preparation_figure(dataset, prepared.preparation), folder / "spectra.png"

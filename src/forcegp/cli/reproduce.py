@@ -32,7 +32,7 @@ class Reproduce(BackendOptions):
       forcegp reproduce all --preset paper --backend ray --address 10.0.0.1:6379
     """
 
-    interrupted: ClassVar[str] = "finished cells are kept, and the same command goes on from there"
+    interrupted: ClassVar[str] = "finished jobs are kept, and the same command goes on from there"
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""

@@ -13,11 +13,12 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import NONE, columns, facts, number, percent
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp rollout"
@@ -95,7 +96,7 @@ class Rollout(Command):
         cpu_seconds = time.process_time() - begun
         errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.system)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             folder.mkdir()
             self._write(folder, rollout, recorded, errors, dataset, summary)
         terminal.note(f"figure: {self.out / 'rollout.png'}")

@@ -15,8 +15,8 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.simulation
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import require_free_file
 
 
 @dataclass(frozen=True, kw_only=True)

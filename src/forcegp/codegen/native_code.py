@@ -22,7 +22,7 @@ class Language:
     """A language to compile from: who may compile it, in this order, unless the environment variable names another."""
 
     name: str
-    suffix: str
+    option: str  # of the compiler, for a source text that has no file name
     variable: str
     commands: tuple[str, ...]
     packages: str  # how to install one
@@ -44,14 +44,14 @@ class Language:
 
 C = Language(
     "C",
-    ".c",
+    "c",
     "CC",
     ("cc", "gcc", "clang"),
     "Debian, Ubuntu: apt install gcc; Fedora: dnf install gcc; macOS: xcode-select --install; conda: conda install gcc",
 )
 CPP = Language(
     "C++",
-    ".cpp",
+    "c++",
     "CXX",
     ("c++", "g++", "clang++"),
     "Debian, Ubuntu: apt install g++; Fedora: dnf install gcc-c++; macOS: xcode-select --install; conda: conda install "
@@ -62,17 +62,15 @@ CPP = Language(
 def compile_library(
     language: Language, source: str, options: Iterable[str], library: Path, *, purpose: str, instead: str
 ) -> None:
-    """Compile a source text, which is written beside it, to the shared library ``library``.
+    """Compile a source text to the shared library ``library``.
 
     ``purpose`` and ``instead`` say in errors what needs the compiler and what to do without one. Raises
     :class:`~forcegp.errors.CompilerError` where there is no compiler or it fails, OSError where files cannot be
     written.
     """
     compiler = language.compiler(purpose, instead)
-    text = library.with_suffix(language.suffix)
-    text.write_text(source, encoding="ascii")
-    command = [*compiler, *options, str(text), "-o", str(library)]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    command = [*compiler, *options, "-x", language.option, "-", "-o", str(library)]
+    done = subprocess.run(command, input=source, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode != 0:
         why = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
         raise CompilerError(

@@ -15,7 +15,6 @@ from .filtering import resample as resample
 from .filtering import uniform_step as uniform_step
 from .filtering import zero_phase_low_pass as zero_phase_low_pass
 from .frozen_dict import FrozenDict as FrozenDict
-from .hdf5 import file_written_whole as file_written_whole
 from .preparation import Preparation as Preparation
 from .preparation import Prepared as Prepared
 from .spectrum import MotionSpectrum as MotionSpectrum

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 import forcegp.mechanics
+from forcegp.atomic_files import atomic_file
 from forcegp.data.columns import finite_columns
 from forcegp.data.frozen_dict import frozen_json
-from forcegp.data.hdf5 import COMPRESSION, describe, file_written_whole
+from forcegp.data.hdf5 import COMPRESSION, describe
 from forcegp.data.units import validated_units
 from forcegp.errors import DatasetError
 
@@ -62,7 +63,7 @@ class DatasetWriter:
 
     def __enter__(self) -> DatasetWriter:
         with ExitStack() as stack:
-            temporary = stack.enter_context(file_written_whole(self.path))
+            temporary = stack.enter_context(atomic_file(self.path))
             self._file = stack.enter_context(h5py.File(temporary, "x"))
             self._pool = ThreadPoolExecutor(THREADS)
             stack.callback(self._pool.shutdown, cancel_futures=True)

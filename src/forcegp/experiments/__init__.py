@@ -1,4 +1,4 @@
-"""The paper's figures and ours: typed configurations -> cells -> results. Import what you need from its modules."""
+"""The paper's figures and ours: typed configurations -> jobs -> results. Import what you need from its modules."""
 
 import lazy_loader as lazy
 

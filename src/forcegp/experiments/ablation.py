@@ -10,12 +10,11 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments import published
-from forcegp.experiments.ablation_cells import PAPER_STEPS, SCHEDULES
-from forcegp.experiments.cells import Cell
+from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
 from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
 OURS = "ours"
 FILTERED_MODELS = ("s-gp-mean",)
@@ -42,12 +41,12 @@ class Ablation(Experiment):
         return max(self.points)
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         tolerance = self.settings.of(self.largest)["tolerance"]
         shared = {"points": self.largest, "iterations": self.settings.iterations, "tolerance": tolerance}
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             out.append(data)
             base = {**shared, "data": data.name, "seed": seed}
             for model in GAUSSIAN_PROCESSES:
@@ -57,9 +56,9 @@ class Ablation(Experiment):
                     spec = {**base, "model": model, "schedule": schedule, "steps": self.steps}
                     cost = fit_cost(model, self.largest, {"restarts": 4, "iterations": self.settings.iterations})
                     out.append(
-                        Cell(
+                        Job(
                             _schedule_name(model, schedule, seed),
-                            "forcegp.experiments.ablation_cells:search",
+                            "forcegp.experiments.ablation_jobs:search",
                             spec,
                             (data.name,),
                             cost,
@@ -70,9 +69,9 @@ class Ablation(Experiment):
                     spec = {**base, "model": model, "cutoff": cutoff, "train_seconds": self.data.train_seconds}
                     cost = 15.0 + fit_cost(model, self.largest, {"restarts": 1, "iterations": self.settings.iterations})
                     out.append(
-                        Cell(
+                        Job(
                             _filter_name(model, cutoff, seed),
-                            "forcegp.experiments.ablation_cells:filtered",
+                            "forcegp.experiments.ablation_jobs:filtered",
                             spec,
                             (data.name,),
                             cost,
@@ -82,28 +81,28 @@ class Ablation(Experiment):
                 fit = fit_name(model, self.largest, seed)
                 spec = {"fit": fit, "data": data.name, "seed": seed, "train_seconds": self.data.train_seconds}
                 out.append(
-                    Cell(
+                    Job(
                         f"ablation/overlap/{model}/seed{seed}",
-                        "forcegp.experiments.ablation_cells:overlap",
+                        "forcegp.experiments.ablation_jobs:overlap",
                         spec,
                         (fit,),
                         20.0,
                     )
                 )
-        spec = {**shared, "data": self.data.cell(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
+        spec = {**shared, "data": self.data.job(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
         out.append(
-            Cell("ablation/dense", "forcegp.experiments.ablation_cells:dense", spec, (spec["data"],), 0.5 * self.steps)
+            Job("ablation/dense", "forcegp.experiments.ablation_jobs:dense", spec, (spec["data"],), 0.5 * self.steps)
         )
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         schedules: dict[str, Any] = {}
         for model in GAUSSIAN_PROCESSES:
             found = {OURS: [results.result(fit_name(model, self.largest, seed)) for seed in self.seeds]}
             for schedule in SCHEDULES:
                 found[schedule] = [results.result(_schedule_name(model, schedule, seed)) for seed in self.seeds]
-            schedules[model] = {name: self._scores(cells) for name, cells in found.items()}
+            schedules[model] = {name: self._scores(jobs) for name, jobs in found.items()}
         filters = {
             model: {
                 "none" if cutoff is None else f"{cutoff:g}": self._scores(
@@ -115,21 +114,19 @@ class Ablation(Experiment):
         }
         overlap = {}
         for model in OVERLAP_MODELS:
-            cells = [results.result(f"ablation/overlap/{model}/seed{seed}") for seed in self.seeds]
+            jobs = [results.result(f"ablation/overlap/{model}/seed{seed}") for seed in self.seeds]
             other = [results.result(fit_name(model, self.largest, seed))["evaluation"] for seed in self.seeds]
-            overlap[model] = {
-                name: spread(cell[name] for cell in cells) for name in ("mae", "mae_noise_free", "shared")
-            }
-            overlap[model]["mae_other"] = spread(cell["mae"] for cell in other)
-            overlap[model]["mae_noise_free_other"] = spread(cell["mae_noise_free"] for cell in other)
+            overlap[model] = {name: spread(job[name] for job in jobs) for name in ("mae", "mae_noise_free", "shared")}
+            overlap[model]["mae_other"] = spread(job["mae"] for job in other)
+            overlap[model]["mae_noise_free_other"] = spread(job["mae_noise_free"] for job in other)
         summary = {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
         return summary | {"dense": results.result("ablation/dense")}
 
     @staticmethod
-    def _scores(cells: list[dict[str, Any]]) -> dict[str, Any]:
-        evaluations = [cell["evaluation"] for cell in cells]
+    def _scores(jobs: list[dict[str, Any]]) -> dict[str, Any]:
+        evaluations = [job["evaluation"] for job in jobs]
         scores = {name: spread(each[name] for each in evaluations) for name in ("mae", "mae_noise_free", "coverage_95")}
-        scores["nll"] = spread(cell["nll"] for cell in cells) if "nll" in cells[0] else None
+        scores["nll"] = spread(job["nll"] for job in jobs) if "nll" in jobs[0] else None
         scores["noise_std"] = spread(each["noise_std"] for each in evaluations)
         return scores
 
@@ -146,7 +143,7 @@ class Ablation(Experiment):
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {}
 
     @override

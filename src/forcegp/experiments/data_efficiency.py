@@ -15,7 +15,7 @@ from forcegp.experiments import published
 from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_tables import only_test, plain_ticks, score_table
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 
 PRIORS = {
     "joint forces on (q, v, u), the paper's": "joint",
@@ -40,7 +40,7 @@ class DataEfficiency(ForceExperiment):
         return [*curves, *region]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         figure = new_figure(8.6, 3.8)
         panels = figure.subplots(1, 2)
         for axes, score, heading in zip(

@@ -1,4 +1,4 @@
-"""What every experiment is: a typed configuration that knows its cells, its summary, its figures and its words."""
+"""What every experiment is: a typed configuration that knows its jobs, its summary, its figures and its words."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from forcegp.evaluation.summary_statistics import markdown_table as markdown_tab
 from forcegp.evaluation.summary_statistics import number as number
 from forcegp.evaluation.summary_statistics import shown as shown
 from forcegp.evaluation.summary_statistics import spread as spread
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.data import data_cell
-from forcegp.experiments.results import Results
+from forcegp.experiments.data import data_job
+from forcegp.jobs import Job, JobStore
 
 Row = dict[str, str | int | float | None]
 
@@ -31,9 +30,9 @@ class DataSettings:
     test_seconds: float
     every: int
 
-    def cell(self, seed: int) -> Cell:
-        """The cell with the trajectories of this seed."""
-        return data_cell(seed, **dataclasses.asdict(self))
+    def job(self, seed: int) -> Job:
+        """The job with the trajectories of this seed."""
+        return data_job(seed, **dataclasses.asdict(self))
 
 
 @dataclass(frozen=True)
@@ -69,19 +68,19 @@ class Experiment(ABC):
                 )
 
     @abstractmethod
-    def cells(self) -> list[Cell]:
-        """Everything that has to be computed, with the cells that several experiments share."""
+    def jobs(self) -> list[Job]:
+        """Everything that has to be computed, with the jobs that several experiments share."""
 
     @abstractmethod
-    def summary(self, results: Results) -> dict[str, Any]:
-        """What the finished cells say, as plain JSON values."""
+    def summary(self, results: JobStore) -> dict[str, Any]:
+        """What the finished jobs say, as plain JSON values."""
 
     @abstractmethod
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
         """The summary as a flat table, for CSV."""
 
     @abstractmethod
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         """File name without ending -> figure."""
 
     @abstractmethod

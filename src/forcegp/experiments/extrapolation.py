@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
-from forcegp.experiments.extrapolation_cells import REGIONS, SIDES, TEST_X, TRAIN_X
+from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
 from forcegp.experiments.plots.extrapolation import extrapolation_figure
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
 TARGETS = {
@@ -40,15 +39,15 @@ class Extrapolation(Experiment):
     models: tuple[str, ...] = (*NETWORKS, *GAUSSIAN_PROCESSES, *ANALYTICAL)
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             out.append(data)
             out.append(
-                Cell(
+                Job(
                     _scale_name(seed),
-                    "forcegp.experiments.extrapolation_cells:scale",
+                    "forcegp.experiments.extrapolation_jobs:scale",
                     {"data": data.name},
                     (data.name,),
                     3.0,
@@ -60,26 +59,26 @@ class Extrapolation(Experiment):
                     settings = self.settings.of_network() if model in NETWORKS else self.settings.of(self.points)
                     spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
                     cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
-                    cell = Cell(
+                    job = Job(
                         _fit_name(model, region, seed),
-                        "forcegp.experiments.extrapolation_cells:fit",
+                        "forcegp.experiments.extrapolation_jobs:fit",
                         spec | settings,
                         (data.name,),
                         cost,
                     )
-                    out.append(cell)
+                    out.append(job)
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         regions: dict[str, Any] = {}
         for region in REGIONS:
             regions[region] = {}
             for model in self.models:
                 found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
                 regions[region][model] = {
-                    side: {score: spread(cell[side][score] for cell in found) for score in SCORES} for side in SIDES
-                } | {"points": spread(cell["points"] for cell in found)}
+                    side: {score: spread(job[side][score] for job in found) for score in SCORES} for side in SIDES
+                } | {"points": spread(job["points"] for job in found)}
         scales = [results.result(_scale_name(seed)) for seed in self.seeds]
         scale = {name: spread(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
         return {"points": self.points, "regions": regions, "scale": scale}
@@ -99,7 +98,7 @@ class Extrapolation(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {"extrapolation": extrapolation_figure(summary)}
 
     @override

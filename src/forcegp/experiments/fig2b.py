@@ -10,12 +10,11 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments import published
-from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
 from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
 from forcegp.experiments.plots.learning_curves import learning_curves_figure
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
 SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
 HEADINGS = {
@@ -49,13 +48,13 @@ class Fig2b(Experiment):
         return self.seeds if points <= self.few_points else self.seeds_many_points
 
     @override
-    def cells(self) -> list[Cell]:
-        data = {seed: self.data.cell(seed) for seed in sorted({*self.seeds, *self.seeds_many_points})}
+    def jobs(self) -> list[Job]:
+        data = {seed: self.data.job(seed) for seed in sorted({*self.seeds, *self.seeds_many_points})}
         out = list(data.values())
         for model in self.models:
-            for seed, cell in data.items():
+            for seed, job in data.items():
                 points = [count for count in self.points if seed in self.seeds_of(count)]
-                out += fit_series(model, cell.name, seed, points, self.settings)
+                out += fit_series(model, job.name, seed, points, self.settings)
         for model in self.on_all_rows:
             out += [fit_to_all(model, data[seed].name, seed, self.settings) for seed in self.seeds_many_points]
         return out
@@ -69,15 +68,15 @@ class Fig2b(Experiment):
         ]
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         curves: dict[str, Any] = {}
         for model in self.models:
             curves[model] = {}
             for count in self.points:
                 found = [results.result(fit_name(model, count, seed)) for seed in self.seeds_of(count)]
-                scores = [{**cell["evaluation"], "cpu_seconds": cell["search"]["cpu_seconds"]} for cell in found]
+                scores = [{**job["evaluation"], "cpu_seconds": job["search"]["cpu_seconds"]} for job in found]
                 curves[model][str(count)] = {name: spread(score[name] for score in scores) for name in SCORES} | {
-                    "converged": sum(cell["search"]["converged"] for cell in found),
+                    "converged": sum(job["search"]["converged"] for job in found),
                     "seeds": len(found),
                 }
         many = {}
@@ -102,7 +101,7 @@ class Fig2b(Experiment):
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {"fig2b": learning_curves_figure(summary)}
 
     @override

@@ -9,12 +9,11 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
-from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.fits import fit_cost
 from forcegp.experiments.plots.estimation import estimation_figure
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
 AXES = ("com.x", "com.y", "com.z")
 
@@ -35,8 +34,8 @@ class Fig2c(Experiment):
     tolerance: float
 
     @override
-    def cells(self) -> list[Cell]:
-        data = {seed: self.data.cell(seed) for seed in sorted({self.seed, *self.seeds})}
+    def jobs(self) -> list[Job]:
+        data = {seed: self.data.job(seed) for seed in sorted({self.seed, *self.seeds})}
         out = list(data.values())
         search = {"iterations": self.iterations, "tolerance": self.tolerance}
         for model in MODELS:
@@ -45,16 +44,16 @@ class Fig2c(Experiment):
                 spec = {"model": model, "mean": mean, "data": where, "points": self.points, **search}
                 cost = 10.0 + fit_cost("s-gp", self.points, {"restarts": 1, **search}) * (model == "s-gp")
                 name = _trace_name(model, mean)
-                out.append(Cell(name, "forcegp.experiments.fig2c_cells:trace", spec, (where,), cost))
+                out.append(Job(name, "forcegp.experiments.fig2c_jobs:trace", spec, (where,), cost))
         for seed in self.seeds:
             spec = {"data": data[seed].name, "points": self.points_interval, **search}
             cost = 3.0 * fit_cost("s-gp", self.points_interval, {"restarts": 1, **search})
-            task = "forcegp.experiments.fig2c_cells:estimate"
-            out.append(Cell(_estimate_name(seed), task, spec, (data[seed].name,), cost))
+            task = "forcegp.experiments.fig2c_jobs:estimate"
+            out.append(Job(_estimate_name(seed), task, spec, (data[seed].name,), cost))
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         traces = {model: {mean: results.result(_trace_name(model, mean)) for mean in MEANS} for model in MODELS}
         for model in traces.values():
             for trace in model.values():
@@ -90,7 +89,7 @@ class Fig2c(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {"fig2c": estimation_figure(summary)}
 
     @override

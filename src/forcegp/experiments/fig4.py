@@ -12,13 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, spread
-from forcegp.experiments.fig4_cells import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
+from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
 from forcegp.experiments.plots.rollouts import rollouts_figure
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
 BLACK_BOXES = ("gp", "neural-network")
 WITHOUT_CONSTRAINT = ("none", "projected")
@@ -41,13 +40,13 @@ class Fig4(Experiment):
     models: tuple[str, ...] = (*BLACK_BOXES, *GAUSSIAN_PROCESSES[1:])
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             rolled = {"data": data.name, "starts": self.starts, "seconds": list(self.seconds)}
-            task = "forcegp.experiments.fig4_cells"
-            out += [data, Cell(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
+            task = "forcegp.experiments.fig4_jobs"
+            out += [data, Job(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
             for model in self.models:
                 if model == "neural-network":
                     series = [fit_to_all(model, data.name, seed, self.settings)]
@@ -58,11 +57,11 @@ class Fig4(Experiment):
                 for control in CONTROLS:
                     for variant in variants_of(model):
                         spec = {**rolled, "fit": fit, "control": control, "variant": variant}
-                        out.append(Cell(_name(control, variant, model, seed), f"{task}:roll", spec, (fit,), 10.0))
+                        out.append(Job(_name(control, variant, model, seed), f"{task}:roll", spec, (fit,), 10.0))
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         motions: dict[str, Any] = {
             control: {
                 variant: {
@@ -87,9 +86,9 @@ class Fig4(Experiment):
 
     def _together(self, found: list[dict[str, Any]]) -> dict[str, Any]:
         """Scores of all seeds' motions as one."""
-        out: dict[str, Any] = {"diverged": sum(cell["diverged"] for cell in found)}
+        out: dict[str, Any] = {"diverged": sum(job["diverged"] for job in found)}
         for second in self.seconds:
-            parts = [cell["scores"][f"{second:g}"] for cell in found]
+            parts = [job["scores"][f"{second:g}"] for job in found]
             out[f"{second:g}"] = {
                 "joint_error": _spread([error for part in parts for error in part["joint_error"]]),
                 "constraint": spread(value for part in parts for value in part["constraint_median"]),
@@ -116,14 +115,14 @@ class Fig4(Experiment):
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         figures = {}
         for control in CONTROLS:
             arrays: dict[str, dict[str, dict[str, np.ndarray]]] = {variant: {} for variant in VARIANTS}
             for _, variant, model, _ in _each({"motions": {control: summary["motions"][control]}}):
                 parts = []
                 for seed in self.seeds:
-                    with np.load(results.cell_folder(_name(control, variant, model, seed)) / ARRAYS) as stored:
+                    with np.load(results.place(_name(control, variant, model, seed)) / ARRAYS) as stored:
                         parts.append(dict(stored))
                 arrays[variant][model] = {
                     name: parts[0][name] if name == "time" else np.concatenate([part[name] for part in parts])

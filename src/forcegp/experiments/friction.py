@@ -11,11 +11,11 @@ from typing_extensions import override
 
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
 from forcegp.experiments.experiment import shown
-from forcegp.experiments.force_cells import MODEL, load
 from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
+from forcegp.experiments.force_jobs import MODEL, load
 from forcegp.experiments.force_scenarios import LABELS
 from forcegp.experiments.force_tables import dots_figure, only_test, score_table
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 
 TOOL = {
@@ -58,7 +58,7 @@ class Friction(ForceExperiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         groups = {
             LABELS[scenario]: {
                 trial["label"]: only_test(trial) for trial in summary["trials"] if trial["scenario"] == scenario
@@ -67,8 +67,8 @@ class Friction(ForceExperiment):
         }
         (pictured,) = [t for t in self.trials()[:: len(self.points)] if (t.scenario, t.label) == PICTURED]
         seed = self.seeds[0]
-        posterior = load_posterior(results.cell_folder(trial_name(pictured, seed)) / MODEL)
-        test = load(results, self.data_cell(pictured.scenario, seed, training=False).name)
+        posterior = load_posterior(results.place(trial_name(pictured, seed)) / MODEL)
+        test = load(results, self.data_job(pictured.scenario, seed, training=False).name)
         return {
             "friction-errors": dots_figure(groups, "mae_noise_free", "mean absolute error, noise-free [rad/s²]"),
             "friction-curves": friction_curves_figure(posterior, test),

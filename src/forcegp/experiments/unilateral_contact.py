@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.experiments.experiment import shown, spread
-from forcegp.experiments.force_cells import BLACK_BOX, KNOWN_PHYSICS
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
+from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS
 from forcegp.experiments.force_tables import score_table
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 
 MODELS = {
     "known physics alone": KNOWN_PHYSICS,
@@ -36,9 +36,9 @@ class UnilateralContact(ForceExperiment):
         return [Trial(label, "bullet", prior, points) for label, prior in MODELS.items() for points in self.points]
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
-        found = [results.result(self.data_cell("bullet", seed, training=True).name) for seed in self.seeds]
-        shares = {name: spread(cell[name] for cell in found) for name in ("in_contact_truth", "in_contact_detected")}
+    def summary(self, results: JobStore) -> dict[str, Any]:
+        found = [results.result(self.data_job("bullet", seed, training=True).name) for seed in self.seeds]
+        shares = {name: spread(job[name] for job in found) for name in ("in_contact_truth", "in_contact_detected")}
         return super().summary(results) | shares
 
     @override

@@ -16,7 +16,6 @@ import re
 import shlex
 import stat
 import sys
-import tempfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -25,6 +24,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from forcegp.atomic_files import atomic_file
 from forcegp.codegen.native_code import C, compile_library
 from forcegp.errors import CompilerError
 from forcegp.robots.dynamics_programs import Request, trace
@@ -165,12 +165,10 @@ def _require_own(path: Path, *, parent: bool = False) -> None:
 def compile_c(source: str, options: tuple[str, ...], path: Path) -> None:
     """Compile a source text to the library ``path``, whole or not at all."""
     try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".compiling-") as work:
-            library = Path(work) / "dynamics.so"
+        with atomic_file(path) as library:  # whoever else compiles the same meanwhile
             options = (*OPTIONS, *options)
             compile_library(C, source, options, library, purpose="compiled dynamics", instead="use the robot itself")
             library.chmod(0o700)
-            os.replace(library, path)  # whoever else compiles the same meanwhile
     except OSError as error:
         raise CompilerError(
             f"the folder {path.parent} for compiled dynamics cannot be written to ({error.strerror}); choose another: "

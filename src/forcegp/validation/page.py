@@ -62,7 +62,7 @@ def _done(document: Mapping[str, Any]) -> list[str]:
     force_noise = document["configuration"]["force_noise"]
     if force_noise is not None:
         lines.append(f"* Models with physics learn a noise of the joint forces as well, from {force_noise:g} on.")
-    if any("noise" in (cell["result"] or {}) for cell in document["identifications"]):
+    if any("noise" in (run["result"] or {}) for run in document["identifications"]):
         lines.append(
             "* Models that rest on an identification of all training rows do not learn their noise: they have that of "
             "accelerations and forces about stretches of training rows, each predicted by a system identified from the "
@@ -244,8 +244,8 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
             (f["error"], f"{f['split']}, seed {f['seed']}") for f in model["failures"]
         ).items():
             lines.append(f"* **{name}** failed in {len(runs)} of {_runs(model)} runs ({'; '.join(runs)}): {reason}")
-    failed = [cell for cell in document["identifications"] if cell["error"] is not None]
-    reasons = _grouped((f"{cell['name']}\n{cell['error']}", f"{cell['split']}, seed {cell['seed']}") for cell in failed)
+    failed = [run for run in document["identifications"] if run["error"] is not None]
+    reasons = _grouped((f"{run['name']}\n{run['error']}", f"{run['split']}, seed {run['seed']}") for run in failed)
     for reason, runs in reasons.items():
         name, _, error = reason.partition("\n")
         lines.append(f"* the {name} identification failed ({'; '.join(runs)}): {error}")

@@ -114,16 +114,16 @@ def paired(score: str, challenger: str, baseline: str, one: Sequence[float], oth
     return Paired(score, challenger, baseline, len(a), int((difference < 0.0).sum()), shown(mean), interval)
 
 
-def verdicts(summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def verdicts(summary: Mapping[str, Any], runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """The answers to all questions for which there are models of both kinds, as plain JSON values."""
     out = []
     for question, challengers, baselines in QUESTIONS:
         answers = []
         for score in SCORES:
-            names = [best_of(summary, cells, kinds, score) for kinds in (challengers, baselines)]
+            names = [best_of(summary, runs, kinds, score) for kinds in (challengers, baselines)]
             if names[0] is None or names[1] is None:
                 continue
-            answer = compared(score, names[0], names[1], cells)
+            answer = compared(score, names[0], names[1], runs)
             if answer is not None:
                 answers.append(answer.to_dict())
         if answers:
@@ -132,17 +132,17 @@ def verdicts(summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[st
 
 
 def against_baseline(
-    summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]]
+    summary: Mapping[str, Any], runs: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, Any] | None:
     """Every model against the best identified one (without any: the system as given), as plain JSON values.
 
     None where neither has finished a run.
     """
-    baseline = best_of(summary, cells, ("identified",), "nrmse") or best_of(summary, cells, ("given",), "nrmse")
+    baseline = best_of(summary, runs, ("identified",), "nrmse") or best_of(summary, runs, ("given",), "nrmse")
     if baseline is None:
         return None
     compare = {
-        name: {score: compared(score, name, baseline, cells) for score in SCORES}
+        name: {score: compared(score, name, baseline, runs) for score in SCORES}
         for name, model in summary.items()
         if name != baseline and model["runs"]
     }
@@ -156,28 +156,28 @@ def against_baseline(
 
 
 def best_of(
-    summary: Mapping[str, Any], cells: Mapping[str, Sequence[Mapping[str, Any]]], kinds: Sequence[str], score: str
+    summary: Mapping[str, Any], runs: Mapping[str, Sequence[Mapping[str, Any]]], kinds: Sequence[str], score: str
 ) -> str | None:
     """The model of these kinds with the lowest median, among those that failed least and diverged least."""
     found = []
     for name, model in summary.items():
-        values = list(runs_of(score, cells[name]).values())
+        values = list(runs_of(score, runs[name]).values())
         if model["kind"] in kinds and values:
-            missing = len(cells[name]) - len(values)
+            missing = len(runs[name]) - len(values)
             found.append((missing, _diverged(model) if score == "motion" else 0, float(np.median(values)), name))
     return min(found)[-1] if found else None
 
 
 def compared(
-    score: str, challenger: str, baseline: str, cells: Mapping[str, Sequence[Mapping[str, Any]]]
+    score: str, challenger: str, baseline: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Paired | None:
     """`paired` over the runs that both models finished."""
-    one, other = runs_of(score, cells[challenger]), runs_of(score, cells[baseline])
+    one, other = runs_of(score, runs[challenger]), runs_of(score, runs[baseline])
     shared = [run for run in one if run in other]
     found = paired(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
     if found is None or score == "motion":
         return found
-    ahead = _ahead(score, shared, cells[challenger], cells[baseline])
+    ahead = _ahead(score, shared, runs[challenger], runs[baseline])
     return replace(found, ahead=int(ahead.sum()), stretches=len(ahead))
 
 
@@ -191,19 +191,19 @@ def _ahead(
     out = []
     for split in dict.fromkeys(split for split, _ in runs):
         sides = []
-        for cells in (one, other):
-            kept = [cell["result"] for cell in cells if cell["split"] == split and (split, cell["seed"]) in runs]
+        for side in (one, other):
+            kept = [run["result"] for run in side if run["split"] == split and (split, run["seed"]) in runs]
             values = np.array([result["stretches"][score] for result in kept], dtype=np.float64)
             sides.append(np.median(values, axis=0))
         out.append(sides[0] < sides[1])
     return np.concatenate(out)
 
 
-def runs_of(score: str, cells: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], float]:
+def runs_of(score: str, runs: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], float]:
     """One number per run, by split and seed: over all joints, at the longest horizon where it is of motions."""
     out = {}
-    for cell in cells:
-        result = cell["result"]
+    for run in runs:
+        result = run["result"]
         if result is None:
             continue
         if score == "motion":
@@ -213,7 +213,7 @@ def runs_of(score: str, cells: Sequence[Mapping[str, Any]]) -> dict[tuple[str, i
         else:
             value = over_joints(score, result[score])
         if value is not None:
-            out[cell["split"], cell["seed"]] = float(value)
+            out[run["split"], run["seed"]] = float(value)
     return out
 
 

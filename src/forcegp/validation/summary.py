@@ -13,40 +13,38 @@ from forcegp.validation.scores import over_joints
 Result = Mapping[str, Any]
 
 
-def summary_of(cells: Mapping[str, Sequence[Mapping[str, Any]]], models: Mapping[str, Candidate]) -> dict[str, Any]:
+def summary_of(runs: Mapping[str, Sequence[Mapping[str, Any]]], models: Mapping[str, Candidate]) -> dict[str, Any]:
     """By model: what it is, spreads of its scores, and why runs failed.
 
-    `cells` holds what was kept of every model, one for each split and seed. Over joints see `scores.over_joints`.
-    Raises FileFormatError where cells used different mass matrices for their force errors.
+    `runs` holds what was kept of every model, one for each split and seed. Over joints see `scores.over_joints`.
+    Raises FileFormatError where runs used different mass matrices for their force errors.
     """
-    for split in {cell["split"] for each in cells.values() for cell in each}:
+    for split in {run["split"] for each in runs.values() for run in each}:
         used = {
-            cell["result"]["mass_matrix"]
-            for each in cells.values()
-            for cell in each
-            if cell["result"] is not None and cell["split"] == split
+            run["result"]["mass_matrix"]
+            for each in runs.values()
+            for run in each
+            if run["result"] is not None and run["split"] == split
         }
         if len(used) > 1:
             raise FileFormatError(
                 f"force errors of split {split!r} rest on different mass matrices ({'; '.join(sorted(used))}); "
-                "delete the folder of cells and run the same command again."
+                "delete the folder of jobs and run the same command again."
             )
-    return {name: _model(cells[name], models[name]) for name in models}
+    return {name: _model(runs[name], models[name]) for name in models}
 
 
-def _model(cells: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str, Any]:
-    results = [cell["result"] for cell in cells if cell["result"] is not None]
+def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str, Any]:
+    results = [run["result"] for run in runs if run["result"] is not None]
     failures = [
-        {"split": cell["split"], "seed": cell["seed"], "error": cell["error"]}
-        for cell in cells
-        if cell["result"] is None
+        {"split": run["split"], "seed": run["seed"], "error": run["error"]} for run in runs if run["result"] is None
     ]
     out: dict[str, Any] = {
         "kind": candidate.kind,
         "summary": candidate.summary,
         "runs": len(results),
         "failures": failures,
-        "warnings": sorted({warning for cell in cells for warning in cell["warnings"]}),
+        "warnings": sorted({warning for run in runs for warning in run["warnings"]}),
     }
     if not results:
         return out

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
+from forcegp.atomic_files import atomic_file
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 
@@ -56,17 +55,9 @@ def quiet(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a PNG under a temporary name and rename it. Raises InvalidInput if the folder does not exist."""
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InvalidInput(f"cannot write {path}: the folder {path.parent} does not exist; create it first.")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
+    """Write a PNG. Raises InvalidInput if the folder does not exist."""
+    with atomic_file(path) as temporary:
         _render(figure).save(temporary, format="png", optimize=True)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def _render(figure: Figure) -> Image.Image:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from forcegp.evaluation.plots.style import QUIET, SMALL, new_figure, quiet
 from forcegp.experiments import published
-from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.plots.learning_curves import COLORS
 
 PANELS = (

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.evaluation.plots.style import QUIET, SMALL, new_figure, quiet
-from forcegp.experiments.extrapolation_cells import REGIONS
+from forcegp.experiments.extrapolation_jobs import REGIONS
 from forcegp.experiments.model_names import MODELS, NETWORKS
 from forcegp.experiments.plots.learning_curves import COLORS
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.experiments.stored_cells import DATA, keep
+from tests.experiments.stored_jobs import DATA, keep
 from tests.models.arm import NOISE, arm_data
 
 from forcegp.data import farthest_rows, zero_phase_low_pass
-from forcegp.experiments import ablation_cells
+from forcegp.experiments import ablation_jobs
 from forcegp.experiments.fits import MODEL
 from forcegp.inference import OptimizerOptions
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData, save_posterior
@@ -30,7 +30,7 @@ def formulations():
         name: value + 0.3 * torch.randn(value.shape, generator=generator, dtype=torch.float64)
         for name, value in likelihood.kernels().initial_parameters().items()
     }
-    return ablation_cells._Deflated(likelihood, noise), ablation_cells._Dense(likelihood, noise), begin
+    return ablation_jobs._Deflated(likelihood, noise), ablation_jobs._Dense(likelihood, noise), begin
 
 
 def test_dense_and_deflated_likelihood_have_the_same_value_and_gradients(formulations):
@@ -67,15 +67,15 @@ def test_the_dense_likelihood_is_the_density_of_a_normal_distribution(formulatio
 
 def test_the_reported_difference_is_small_only_for_equal_objectives(formulations):
     ours, theirs, begin = formulations
-    assert ablation_cells._gradient_difference(ours, theirs, begin) < 1e-8
+    assert ablation_jobs._gradient_difference(ours, theirs, begin) < 1e-8
     louder = replace(theirs, noise={name: value + 1e-3 for name, value in theirs.noise.items()})
-    assert ablation_cells._gradient_difference(ours, louder, begin) > 1e-5
+    assert ablation_jobs._gradient_difference(ours, louder, begin) > 1e-5
 
 
 @pytest.mark.parametrize("cutoff", [None, 25.0])
 def test_a_filter_acts_on_the_training_accelerations_alone(run, motion, tmp_path, cutoff):
     spec = {"data": DATA, "seed": 1, "train_seconds": 2, "model": "s-gp-mean", "points": 15, "cutoff": cutoff}
-    found = ablation_cells.filtered(run, {**spec, **OPTIONS}, tmp_path)["evaluation"]
+    found = ablation_jobs.filtered(run, {**spec, **OPTIONS}, tmp_path)["evaluation"]
     data = motion
     if cutoff is not None:
         data = replace(motion, a=zero_phase_low_pass(motion.a, 240.0, cutoff), noise_std=None)
@@ -92,7 +92,7 @@ def test_the_window_counts_the_rows_that_were_trained_on(run, motion, tmp_path):
     posterior = StructuredGP(motion.system).fit(train, restarts=1, options=OptimizerOptions(iterations=0))
     keep(run, "fits/overlap", {}, {}, lambda folder: save_posterior(posterior, folder / MODEL))
     spec = {"seed": 1, "train_seconds": 2, "fit": "fits/overlap"}
-    found = ablation_cells.overlap(run, spec, tmp_path)
+    found = ablation_jobs.overlap(run, spec, tmp_path)
     assert found["shared"] == pytest.approx(20 / 160)
     window = motion.rows(slice(0, None, 3))
     mean = posterior.predict(window.q, window.v, window.u, covariance=False).mean.numpy()

@@ -1,18 +1,15 @@
-"""Folders that are written whole or not at all, and never over what forcegp did not write."""
+"""What commands write to: never over what forcegp did not write, and with what is needed to do it again."""
 
 from __future__ import annotations
 
 import json
-import os
 import platform
-import secrets
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from forcegp.atomic_files import write_json
 from forcegp.errors import InvalidInput
 
 CONFIG = "config.json"
@@ -52,36 +49,12 @@ def holds_only_own_files(path: Path, kind: str) -> bool:
     return {str(file.relative_to(path)) for file in path.rglob("*") if file.is_file()} <= listed
 
 
-@contextmanager
-def folder_written_whole(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write a folder at: it takes the place of `path` at the end, and vanishes on failure."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield temporary
-        if path.exists():
-            old = temporary.with_suffix(".old")
-            os.replace(path, old)
-            os.replace(temporary, path)
-            shutil.rmtree(old)
-        else:
-            os.replace(temporary, path)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-
-
 def write_config(folder: Path, kind: str, content: Mapping[str, Any]) -> None:
     """`config.json`: what is needed to do it again, with versions and the list of files, which must be there by now."""
     files = sorted([CONFIG, *(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())])
 
     versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
     write_json(folder / CONFIG, {"kind": kind, **content, "versions": versions, "files": files})
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Readable JSON; the file lies in a folder that is being written whole."""
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _written_by_forcegp(path: Path, kind: str) -> bool:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from tests.experiments.oracle import Tool
-from tests.experiments.stored_cells import DATA
+from tests.experiments.stored_jobs import DATA
 
-from forcegp.experiments import fig4_cells
-from forcegp.experiments.fig4_cells import BAUMGARTE, FREQUENCY, OFFSET, PERTURBATIONS
+from forcegp.experiments import fig4_jobs
+from forcegp.experiments.fig4_jobs import BAUMGARTE, FREQUENCY, OFFSET, PERTURBATIONS
 from forcegp.integration import SymplecticEuler, integrate
 
 SECONDS, STARTS = 0.2, 3
@@ -17,7 +17,7 @@ SECONDS, STARTS = 0.2, 3
 
 @pytest.fixture(scope="module")
 def recorded(motion):
-    return fig4_cells._Recorded(motion, STARTS, SECONDS)
+    return fig4_jobs._Recorded(motion, STARTS, SECONDS)
 
 
 def test_recorded_motions_are_pieces_of_the_trajectory(recorded, motion):
@@ -32,7 +32,7 @@ def test_recorded_motions_are_pieces_of_the_trajectory(recorded, motion):
 
 
 def test_the_true_dynamics_reproduce_the_recording(run, tmp_path):
-    found = fig4_cells.truth(run, {"data": DATA, "starts": STARTS, "seconds": [0.1, SECONDS]}, tmp_path)
+    found = fig4_jobs.truth(run, {"data": DATA, "starts": STARTS, "seconds": [0.1, SECONDS]}, tmp_path)
     errors = found["joint_error"]
     assert list(errors) == ["0", *(f"{size:g}" for size in PERTURBATIONS)]
     assert max(errors["0"]["0.2"]) < 1e-9
@@ -43,7 +43,7 @@ def test_the_true_dynamics_reproduce_the_recording(run, tmp_path):
 
 def test_displaced_starts_are_exactly_off_the_surface_and_as_near_as_can_be(motion, recorded):
     q = recorded.q[:, 0]
-    displaced = fig4_cells._displaced(motion.system, q)
+    displaced = fig4_jobs._displaced(motion.system, q)
     tool = Tool(motion.system)
     height = motion.system.contacts[0].surface.offset
     for before, after in zip(q.numpy(), displaced.numpy(), strict=True):
@@ -70,7 +70,7 @@ def test_the_feedback_is_that_of_its_formula_and_nothing_on_the_recording(record
 
 
 def test_the_feedback_pulls_a_displaced_motion_back(motion):
-    recorded = fig4_cells._Recorded(motion, 2, 0.5)
+    recorded = fig4_jobs._Recorded(motion, 2, 0.5)
     system, friction = replace(motion.system, baumgarte=BAUMGARTE), motion.metadata["config"]["viscous_coefficient"]
     contact = system.contacts[0]
 
@@ -79,7 +79,7 @@ def test_the_feedback_pulls_a_displaced_motion_back(motion):
         J = dynamics.state.kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
         return dynamics.acceleration(-friction * (J.mT @ (J @ v[..., None]))[..., 0])
 
-    start = fig4_cells._displaced(motion.system, recorded.q[:, 0])
+    start = fig4_jobs._displaced(motion.system, recorded.q[:, 0])
     begin = (start - recorded.q[:, 0]).abs().mean(-1)
 
     def error(feedback):

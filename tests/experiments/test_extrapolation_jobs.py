@@ -7,7 +7,7 @@ import pytest
 from tests.experiments.oracle import Tool
 
 from forcegp.errors import InvalidInput
-from forcegp.experiments.extrapolation_cells import REGIONS, TEST_X, TRAIN_X, split_by_region, tool_motion
+from forcegp.experiments.extrapolation_jobs import REGIONS, TEST_X, TRAIN_X, split_by_region, tool_motion
 
 
 @pytest.fixture(scope="module")

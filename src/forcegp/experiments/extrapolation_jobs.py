@@ -1,4 +1,4 @@
-"""The cells of the extrapolation: split rows by where and how fast the tool is, fit, and score on both sides."""
+"""The jobs of the extrapolation: split rows by where and how fast the tool is, fit, and score on both sides."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.experiments.fits import MODEL, fitted, search_report
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 from forcegp.models import save_posterior
 
 TRAIN_X, TEST_X = 0.0, 0.1
@@ -57,7 +57,7 @@ def split_by_region(train: Dataset, test: Dataset, region: str) -> dict[str, Dat
     }
 
 
-def fit(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Fit one model in the region and score it inside and outside."""
     everything = training_rows(results, spec["data"], None)
     parts = split_by_region(everything, scored_rows(results, spec["data"]), spec["region"])
@@ -72,7 +72,7 @@ def fit(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, An
     return {**scores, "points": len(train), "search": search_report(posterior)}
 
 
-def scale(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def scale(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Root mean square of what each model is left to learn, and the largest entry of H, on 2000 training rows."""
     train = training_rows(results, spec["data"], None)
     train = train.rows(slice(min(2000, len(train))))

@@ -15,6 +15,10 @@ def square(results, spec, folder):
     return {"value": spec["number"] ** 2, "process": os.getpid()}
 
 
+def times(store, spec, folder, shared, factor):
+    return {"value": spec["number"] * shared["factor"] * factor}
+
+
 def fail(results, spec, folder):
     (folder / "half.txt").write_text("never seen")
     raise FitError("no luck")

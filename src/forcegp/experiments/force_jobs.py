@@ -1,4 +1,4 @@
-"""Cells of the experiments on force priors: simulate one trajectory, fit one model, score it on several."""
+"""Jobs of the experiments on force priors: simulate one trajectory, fit one model, score it on several."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import torch
 from forcegp.data import Dataset, farthest_rows, rows_in_contact
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
-from forcegp.experiments.extrapolation_cells import TEST_X, TRAIN_X, tool_motion
+from forcegp.experiments.extrapolation_jobs import TEST_X, TRAIN_X, tool_motion
 from forcegp.experiments.fits import MODEL, search_report
-from forcegp.experiments.results import Results
 from forcegp.experiments.true_curves import true_curves
 from forcegp.inference import OptimizerOptions
+from forcegp.jobs import JobStore
 from forcegp.models import IndependentGP, StructuredGP, save_posterior
 from forcegp.priors import named_prior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
@@ -26,7 +26,7 @@ BLACK_BOX, KNOWN_PHYSICS = "independent-gp", "none"
 """Models of the trials that are no prior expressions: a Gaussian process per joint, and no unknown force at all."""
 
 
-def simulate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """One trajectory of a scenario: its `rows` that lie farthest apart, or every `every`-th.
 
     Where contacts can open, training rows are those that the data show to be in contact.
@@ -53,12 +53,12 @@ def simulate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[st
     return told | {"rows": len(kept)}
 
 
-def load(results: Results, name: str) -> Dataset:
-    """The rows of a data cell."""
-    return Dataset.load(results.cell_folder(name) / FILE)
+def load(results: JobStore, name: str) -> Dataset:
+    """The rows of a data job."""
+    return Dataset.load(results.place(name) / FILE)
 
 
-def fit(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Fit to the first `points` training rows and score on every test trajectory, under the contacts of its own."""
     train = load(results, spec["train"])
     if spec["region"]:

@@ -1,4 +1,4 @@
-"""The cells of figure 4: roll models out from rows of a test trajectory and compare with what was recorded."""
+"""The jobs of figure 4: roll models out from rows of a test trajectory and compare with what was recorded."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from forcegp.data import Dataset
 from forcegp.evaluation.recorded_segments import recorded_motions
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.fits import MODEL
-from forcegp.experiments.results import Results
 from forcegp.integration import Feedback, SymplecticEuler, integrate
+from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models import load_posterior
 
@@ -43,9 +43,9 @@ VARIANTS = {
 }
 
 
-def roll(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def roll(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Roll a fitted model out from evenly spaced rows of its test trajectory."""
-    posterior = load_posterior(results.cell_folder(spec["fit"]) / MODEL)
+    posterior = load_posterior(results.place(spec["fit"]) / MODEL)
     recorded = _Recorded(test_trajectory(results, spec["data"]), spec["starts"], max(spec["seconds"]))
     q0 = _displaced(posterior.system, recorded.q[:, 0]) if spec["variant"] == "off-surface" else recorded.q[:, 0]
     rollout = posterior.rollout(
@@ -64,7 +64,7 @@ def roll(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, A
     return {"scores": scores, "diverged": int((rollout.diverged_at >= 0).sum())}
 
 
-def truth(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def truth(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The true dynamics, friction included, from the recorded states with a tiny change, under the recorded torques."""
     trajectory = test_trajectory(results, spec["data"])
     recorded = _Recorded(trajectory, spec["starts"], max(spec["seconds"]))

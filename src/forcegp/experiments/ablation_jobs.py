@@ -1,4 +1,4 @@
-"""The cells of the ablation: other searches, the dense formulation, a filter, test rows among the training rows."""
+"""The jobs of the ablation: other searches, the dense formulation, a filter, test rows among the training rows."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.experiments.fits import MODEL
 from forcegp.experiments.model_names import MODELS
-from forcegp.experiments.results import Results
 from forcegp.inference import OptimizerOptions, minimize_objective
+from forcegp.jobs import JobStore
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData, load_posterior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -33,7 +33,7 @@ SCHEDULES = {
 WINDOW_ROWS, WINDOW_EVERY = 1000, 3
 
 
-def search(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def search(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """One model, one schedule of the search for its hyper-parameters."""
     train = training_rows(results, spec["data"], spec["points"])
     assert train.system is not None
@@ -50,7 +50,7 @@ def search(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str,
     return {"evaluation": scores, "nll": posterior.result.value, "cpu_seconds": posterior.result.cpu_seconds}
 
 
-def filtered(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def filtered(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """One model on accelerations that were low-pass filtered before the rows were chosen, with learned noise."""
     everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
     if spec["cutoff"] is not None:
@@ -65,20 +65,20 @@ def filtered(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[st
     return {"evaluation": evaluate(posterior, scored_rows(results, spec["data"])).to_dict()}
 
 
-def overlap(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def overlap(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """A fit tested on a window of its own training trajectory, as the reference implementation does."""
     everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
     rows = min(WINDOW_ROWS * WINDOW_EVERY, len(everything))
     first = (len(everything) - rows) // 2
     window = everything.rows(slice(first, first + rows, WINDOW_EVERY))
-    posterior = load_posterior(results.cell_folder(spec["fit"]) / MODEL)
+    posterior = load_posterior(results.place(spec["fit"]) / MODEL)
     trained = {tuple(row) for row in np.asarray(posterior.training.q).round(12).tolist()}
     shared = np.mean([tuple(row) in trained for row in window.q.round(12).tolist()])
     evaluation = evaluate(posterior, window)
     return {"mae": evaluation.mae, "mae_noise_free": evaluation.mae_noise_free, "shared": float(shared)}
 
 
-def dense(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def dense(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """CPU time of the paper's schedule in its dense formulation, and of our search to convergence, side by side."""
     train = training_rows(results, spec["data"], spec["points"])
     assert train.system is not None

@@ -1,4 +1,4 @@
-"""The cells of figure 2c: estimate the tool's mass and centre of mass from a wrong start."""
+"""The jobs of figure 2c: estimate the tool's mass and centre of mass from a wrong start."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 
 from forcegp.data import Dataset
 from forcegp.experiments.data import scored_rows, training_rows
-from forcegp.experiments.results import Results
 from forcegp.inference import OptimizerOptions
+from forcegp.jobs import JobStore
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Identification, StructuredGP, StructuredPosterior
 from forcegp.priors import JointForces, NoForces
@@ -33,7 +33,7 @@ PRIORS = {"s-gp": JointForces(), "analytical": NoForces()}
 NAMES = {f"{TOOL_LINK}.{name}": name for name in ("mass", "com.x", "com.y", "com.z")}
 
 
-def trace(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def trace(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """One search, with the errors of mass and centre [kg, m] and the MAE after every iteration."""
     train = training_rows(results, spec["data"], spec["points"])
     test = scored_rows(results, spec["data"])
@@ -52,7 +52,7 @@ def trace(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, 
     }
 
 
-def estimate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Errors and standard errors of S-GP + analytical mean."""
     train = training_rows(results, spec["data"], spec["points"])
     true = _values(train.system)
