@@ -1,4 +1,4 @@
-"""What every experiment is: a typed configuration that knows its cells, its summary, its figures and its words."""
+"""What every experiment is: a typed configuration with its cells, its summary, its figures and its text."""
 
 from __future__ import annotations
 
@@ -11,10 +11,6 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.summary_statistics import markdown_table as markdown_table
-from forcegp.evaluation.summary_statistics import number as number
-from forcegp.evaluation.summary_statistics import shown as shown
-from forcegp.evaluation.summary_statistics import spread as spread
 from forcegp.experiments.cells import Cell
 from forcegp.experiments.data import data_cell
 from forcegp.experiments.results import Results
@@ -74,7 +70,7 @@ class Experiment(ABC):
 
     @abstractmethod
     def summary(self, results: Results) -> dict[str, Any]:
-        """What the finished cells say, as plain JSON values."""
+        """The results of the finished cells, as plain JSON values."""
 
     @abstractmethod
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:

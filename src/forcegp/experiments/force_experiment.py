@@ -10,8 +10,9 @@ from typing import Any
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.summary_statistics import median_and_range
 from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, spread
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.force_scenarios import SCENARIOS
 from forcegp.experiments.results import Results
@@ -48,7 +49,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class ForceExperiment(Experiment):
-    """Trials on seeds; a subclass says which trials, and tells what came out."""
+    """Trials on seeds; a subclass defines the trials and describes the results."""
 
     data: DataSettings
     points: tuple[int, ...]
@@ -93,7 +94,7 @@ class ForceExperiment(Experiment):
         tests = {}
         for label in self._tests(trial):
             names = dict.fromkeys(name for cell in found for name in cell["tests"][label])
-            tests[label] = {name: spread(cell["tests"][label].get(name) for cell in found) for name in names}
+            tests[label] = {name: median_and_range(cell["tests"][label].get(name) for cell in found) for name in names}
         coverages = [curve["coverage"] for cell in found for curve in cell["curves"].values()]
         return {
             "label": trial.label,
@@ -102,12 +103,12 @@ class ForceExperiment(Experiment):
             "points": trial.points,
             "region": trial.region,
             "tests": tests,
-            "curve_coverage": spread(coverages),
-            "curve_coverage_of_seeds": spread(
+            "curve_coverage": median_and_range(coverages),
+            "curve_coverage_of_seeds": median_and_range(
                 _mean([curve["coverage"] for curve in cell["curves"].values()]) for cell in found if cell["curves"]
             ),
-            "leave_one_out": spread(cell["leave_one_out"] for cell in found),
-            "search_seconds": spread(cell["search"]["cpu_seconds"] for cell in found),
+            "leave_one_out": median_and_range(cell["leave_one_out"] for cell in found),
+            "search_seconds": median_and_range(cell["search"]["cpu_seconds"] for cell in found),
         }
 
     @override

@@ -28,7 +28,7 @@ class RawRecording:
     label: what people call it, a file or an array in it.
     first: its first row in the spool.
     time: (rows,) [s] from its first row on.
-    begin: what the log says at the first row, in s.
+    begin: the stamp of the log at the first row, in s.
     episodes: (n, 2) episode number of the log and row at which it begins; one row if the log numbers none.
     lowest, highest: (signals,) of each signal of the plan, in SI.
     jumps: rows before which a turning joint moves by more than half a turn, with the signal.

@@ -216,12 +216,12 @@ def _identify(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, 
         rows, _ = comparison.splits[cell.split].apply(comparison.rows)
     start = time.process_time()
     system = cell.work.identify(comparison.system, rows, comparison.friction)
-    told: dict[str, Any] = {"how": cell.work.summary, "training_rows": len(rows)}
+    content: dict[str, Any] = {"how": cell.work.summary, "training_rows": len(rows)}
     if cell.work.noise is not None:
         noise = cell.work.noise(comparison.system, rows, comparison.friction)
-        told["noise"] = {"acceleration": noise.acceleration.tolist(), "force": noise.force.tolist()}
+        content["noise"] = {"acceleration": noise.acceleration.tolist(), "force": noise.force.tolist()}
     seconds = time.process_time() - start
-    return {"cpu_seconds": seconds, **told, "system": system.to_dict()}
+    return {"cpu_seconds": seconds, **content, "system": system.to_dict()}
 
 
 def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any]:
@@ -289,8 +289,8 @@ def reference_mass(
     """
     found = _identification(comparison, kept, comparison.identification, split, 0)
     if found["result"] is None:
-        told = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
-        return mass_matrices(comparison.system, test), told
+        why = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
+        return mass_matrices(comparison.system, test), why
     system = MechanicalSystem.from_dict(found["result"]["system"])
     return mass_matrices(system, test), f"the system identified with seed 0 by {found['result']['how']}"
 

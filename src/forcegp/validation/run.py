@@ -17,7 +17,7 @@ from forcegp.validation.candidates import DEFAULT_MODELS, candidates
 from forcegp.validation.comparison import Cell, Comparison, cells_of, compute
 from forcegp.validation.kept_cells import KeptCells
 from forcegp.validation.page import page
-from forcegp.validation.paired_tests import against_baseline, verdicts
+from forcegp.validation.paired_tests import against_baseline, conclusions
 from forcegp.validation.preparation_summary import preparation_lines
 from forcegp.validation.summary import summary_of
 
@@ -168,7 +168,7 @@ def _document(
             {cell["result"]["mass_matrix"] for each in cells.values() for cell in each if cell["result"] is not None}
         ),
         "models": summary,
-        "verdicts": verdicts(summary, cells),
+        "verdicts": conclusions(summary, cells),
         "against_baseline": against_baseline(summary, cells),
         "cells": {name: [_brief(cell) for cell in each] for name, each in cells.items()},
     }
