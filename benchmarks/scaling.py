@@ -26,7 +26,7 @@ from benchmarks.large_data import RECORDINGS, in_own_process, peak_bytes, record
 from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_posterior
 from forcegp.data import farthest_rows
 from forcegp.inference import ENGINES, Inducing, Stochastic
-from forcegp.models.many_rows import on_all_rows
+from forcegp.models.structured.engine_selection import on_all_rows
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
 SEED, SECONDS = 903, 420.0

@@ -18,20 +18,20 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 # The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
 ROOMS = {
     "errors": set(),
-    "native_code": {"errors"},
+    "codegen": {"errors"},
     "parallel": {"errors"},
-    "robots": {"errors", "native_code"},
+    "robots": {"errors", "codegen"},
     "mechanics": {"errors", "robots"},
     "data": {"errors", "robots", "mechanics"},
     "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
     "checks": {"errors", "robots", "mechanics", "data", "analytical"},
     "priors": {"errors", "robots", "mechanics"},
-    "inference": {"errors", "native_code"},
+    "inference": {"errors", "codegen"},
     "integration": {"errors", "robots", "mechanics"},
     "models": {
         "errors",
-        "native_code",
+        "codegen",
         "parallel",
         "robots",
         "mechanics",
@@ -59,7 +59,7 @@ IMPORTED_WHERE_USED = {
     "rich": ("forcegp.cli",),
 }
 
-LONGEST_MODULE = 350  # lines
+LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
 
 

@@ -1,4 +1,4 @@
-"""The options that choose a robot: as objects, and through the real executable."""
+"""The options that choose a robot: as objects, and as words."""
 
 import re
 from dataclasses import replace

@@ -21,7 +21,7 @@ from forcegp.evaluation import (
     normal_force_rests_on_prior,
 )
 from forcegp.models import IndependentGP
-from forcegp.models.components import Curve
+from forcegp.models.structured.components import Curve
 from forcegp.priors import ContactFriction, JointForces, JointFriction, NoForces, Payload, ToolForces
 
 

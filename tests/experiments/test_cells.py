@@ -63,6 +63,7 @@ def test_a_defect_in_one_cell_does_not_cost_the_others(results, task, cause):
     assert not results.cell_folder("bad").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
 def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(results):
     with pytest.raises(BackendError, match=r"died 4 times while task dead .*1 of 2 cells are kept"):
@@ -72,7 +73,7 @@ def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(result
 
 def test_a_process_that_is_killed_is_replaced(results, tmp_path):
     cell = Cell("killed", f"{TOY}:die_once", {"marker": str(tmp_path / "marker")})
-    with pytest.warns(WorkerWarning, match="a process died while task killed was at work"):
+    with pytest.warns(WorkerWarning, match="task killed"):
         assert run_cells(results, [cell, square(2)]) == 2
     assert results.result("killed") == {"survived": True}
     assert not list((tmp_path / "out").glob("**/*.tmp"))
@@ -89,7 +90,7 @@ def test_other_settings_of_what_a_cell_is_made_from_are_seen(results):
     changed = Cell("square/3", f"{TOY}:square", {"number": 3, "more": 1})
     assert digests([changed, next_to(square(3))])["next/3"] != digests([square(3), next_to(square(3))])["next/3"]
     shutil.rmtree(results.cell_folder("square/3"))
-    with pytest.raises(FileFormatError, match=r"next/3/cell\.json was computed with other settings, or from cells"):
+    with pytest.raises(FileFormatError, match=r"next/3/cell\.json .*other settings"):
         run_cells(results, [changed, next_to(changed)])
 
 
@@ -98,13 +99,14 @@ def test_warnings_are_kept_with_the_cell(results):
     assert results.load("w")["warnings"] == ["look here"]
 
 
+@pytest.mark.nightly
 def test_kill_9_loses_only_the_cell_at_work_and_leaves_no_process(tmp_path):
     begun = tmp_path / "begun"
     script = (
         "from pathlib import Path\n"
         "from tests.experiments.test_cells import *\n"
         "if __name__ == '__main__':\n"
-        f"    slow = Cell('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=300))\n"
+        f"    slow = Cell('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
         f"    run_cells(Results.open(Path({str(tmp_path / 'out')!r}), 'smoke'), [square(2), slow])\n"
     )
     (tmp_path / "script.py").write_text(script)
@@ -128,8 +130,8 @@ def _alive(process: int) -> bool:
     return status.exists() and "State:\tZ" not in status.read_text()
 
 
-def _wait_until(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+def _wait_until(condition) -> None:
+    end = time.monotonic() + 600.0  # a guard against a hang
     while not condition():
         assert time.monotonic() < end, "it never happened"
         time.sleep(0.05)

@@ -74,10 +74,9 @@ class Fit(ModelOptions):
 def fit_with_progress(
     terminal: Terminal, model: Any, dataset: forcegp.Dataset, *, name: str = "fitting", **how: Any
 ) -> Any:
-    """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
-    options: forcegp.inference.OptimizerOptions | None = how.get(
-        "options"
-    )  # networks have none, but steps of their own
+    """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
+    # networks have no options, but steps of their own
+    options: forcegp.inference.OptimizerOptions | None = how.get("options")
     steps = model.steps if options is None else options.iterations + options.adam_steps
     wanted = how.get("restarts", 1)
     restarts = forcegp.models.default_restarts(how["points"]) if wanted is None else wanted
@@ -91,7 +90,8 @@ def fit_with_progress(
             note = f"{start}iteration {iteration}, objective {_short(value)}"
             report(restart * steps + min(iteration, steps), restarts * steps, note)
 
-        return model.fit(dataset, **how, progress=progress)
+        learn = model.identify if "learn" in how else model.fit_windows if "observe" in how else model.fit
+        return learn(dataset, **how, progress=progress)
 
 
 def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dict[str, Any]:

@@ -99,11 +99,18 @@ def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
     assert command.iterations is not None, "a resolved command has iterations"
     engine = {"engine": command.engine, "learning_points": command.learning_points}
     observe = window_observation(command.learn_from, command.window)
+    if observe is not None:
+        if command.engine not in ("auto", "exact") or command.learning_points is not None:
+            raise InvalidInput(
+                f"--engine and --learning-points mean nothing to --learn-from {command.learn_from}: windows are "
+                "conditioned on exactly, and all are learned from; leave both out, and give fewer --points if it takes "
+                "too long."
+            )
+        engine = {"observe": observe}
     options = forcegp.models.default_options(points)
     return {
         "seed": command.seed,
         **(engine if command.model in MEANT_FOR["engine"] else {}),
-        **({} if observe is None else {"observe": observe}),
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,

@@ -17,10 +17,10 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Numbers
 from forcegp.models import StructuredPosterior
-from forcegp.models.components import Curve, term_slices
 from forcegp.models.prediction import Gaussian
 from forcegp.models.protocol import Posterior
 from forcegp.models.search import SMALL_COVARIANCE
+from forcegp.models.structured.components import Curve, term_slices
 
 ROWS_PER_BLOCK = 1024
 ROUNDING = 1e-9

@@ -1,3 +1,5 @@
+from .block_cross_validation import LeaveOut as LeaveOut
+from .block_cross_validation import leave_blocks_out as leave_blocks_out
 from .engines import ENGINES as ENGINES
 from .engines import Choice as Choice
 from .engines import Engine as Engine
@@ -9,14 +11,12 @@ from .engines import Stochastic as Stochastic
 from .engines import choose_engine as choose_engine
 from .engines import engine_from_dict as engine_from_dict
 from .engines import engine_of as engine_of
-from .functionals import FunctionalPosterior as FunctionalPosterior
 from .inducing import InducingPosterior as InducingPosterior
 from .inducing import collapsed_bound as collapsed_bound
 from .iterative import IterativePosterior as IterativePosterior
 from .kernels import LatentKernels as LatentKernels
-from .leave_out import LeaveOut as LeaveOut
-from .leave_out import leave_blocks_out as leave_blocks_out
 from .likelihood import negative_log_likelihood as negative_log_likelihood
+from .linear_functionals import FunctionalPosterior as FunctionalPosterior
 from .memory import require_memory as require_memory
 from .optimization import OptimizationResult as OptimizationResult
 from .optimization import OptimizerOptions as OptimizerOptions

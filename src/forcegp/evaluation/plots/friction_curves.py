@@ -28,8 +28,8 @@ from forcegp.evaluation.plots.style import (
 )
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models import StructuredPosterior
-from forcegp.models.components import Curve, term_slices
 from forcegp.models.protocol import Posterior
+from forcegp.models.structured.components import Curve, term_slices
 from forcegp.priors import ContactFriction, ForcePrior, ToolForces
 
 LARGEST_GRID = 12
