@@ -1,4 +1,4 @@
-"""How few points a prior that knows where the force acts needs, on the paper's own task and beyond its data."""
+"""How few points a prior on the force at its point of action needs, on the paper's own task and beyond its data."""
 
 from __future__ import annotations
 

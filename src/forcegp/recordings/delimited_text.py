@@ -73,7 +73,7 @@ class DelimitedText(Source):
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
-        self._delimiter = delimiter or _told(lines, self.path)
+        self._delimiter = delimiter or _detected_delimiter(lines, self.path)
         self._lines_before = skipped
         fields = self._fields(lines[0])
         self._lines_per_row = 1
@@ -219,7 +219,7 @@ def _pieces(batches: Iterator[Columns], rows: int) -> Iterator[Columns]:
             yield {name: values[start : start + rows] for name, values in batch.items()}
 
 
-def _told(lines: Sequence[str], path: Path) -> str:
+def _detected_delimiter(lines: Sequence[str], path: Path) -> str:
     """The delimiter that stands equally often in the header and in the first row."""
     for letter in ("\t", ",", ";"):
         counts = {line.count(letter) for line in lines}

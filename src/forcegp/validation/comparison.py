@@ -53,8 +53,8 @@ class Comparison:
     identification: what `@identified` and the mass matrix of force errors take, a key of `IDENTIFICATIONS`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
-    measured_torque: whether predictions know that their u is as noisy (`Noise`); needs `force_noise`, or models that
-        rest on an identification that knows its noise.
+    measured_torque: whether predictions account for the noise of their u (`Noise`); needs `force_noise`, or models that
+        rest on an identification that estimates its noise.
     friction: laws that identifications estimate, as in `forcegp.analytical.identify_analytical`.
 
     Raises InvalidInput for parts that do not fit, and DatasetError for splits whose sides overlap.
@@ -210,7 +210,7 @@ def _training_rows(comparison: Comparison, cell: Cell) -> tuple[Dataset, Dataset
 
 
 def _identify(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any]:
-    assert isinstance(cell.work, Identification), "a cell of an identification knows how"
+    assert isinstance(cell.work, Identification), "the cell is that of an identification"
     rows, _ = _training_rows(comparison, cell)
     if cell.work.all_rows:
         rows, _ = comparison.splits[cell.split].apply(comparison.rows)
@@ -257,7 +257,7 @@ def _score(comparison: Comparison, kept: KeptCells, cell: Cell) -> dict[str, Any
 def identified_system(
     comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int
 ) -> tuple[MechanicalSystem | str, float, NoiseLevels | None]:
-    """The system of a finished identification, or why there is none, its CPU seconds and its noise if it knows it."""
+    """The system of a finished identification, or why there is none, its CPU seconds and, if estimated, its noise."""
     found = _identification(comparison, kept, name, split, seed)
     result = found["result"]
     if result is None:
@@ -270,7 +270,7 @@ def identified_system(
 def _identification(comparison: Comparison, kept: KeptCells, name: str, split: int, seed: int) -> dict[str, Any]:
     """What was kept for this seed, or for the first where the identification takes all rows.
 
-    Asked of the files, for a process of its own need not know ways to identify that somebody has added.
+    Asked of the files, for another process may lack a method of identification that the user has added.
     """
     names = [file_name(comparison.splits[split], each, IDENTIFICATION, name) for each in (seed, 0)]
     stored = kept.read(names[0]) or kept.read(names[1])
@@ -285,7 +285,7 @@ def reference_mass(
     """The mass matrices that turn errors of every model into forces, and whose they are, as part of a sentence.
 
     One and the same for all models and seeds of a split: of the system identified with the first seed, because a URDF
-    seldom knows rotor inertias; of the system as given where that identification failed.
+    seldom holds rotor inertias; of the system as given where that identification failed.
     """
     found = _identification(comparison, kept, comparison.identification, split, 0)
     if found["result"] is None:
