@@ -73,7 +73,6 @@ class Import:
     name: str
     line: int
     at_module_import: bool
-    for_types_only: bool
 
 
 def module_name(path: Path) -> str:
@@ -116,7 +115,7 @@ def imports(path: Path) -> Iterator[Import]:
     def visit(node: ast.AST, at_import: bool, types_only: bool) -> Iterator[Import]:
         if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("forcegp."):
             # `forcegp.data.Dataset` after `import forcegp.data`: the name is imported when this line runs
-            yield Import(defined_in(ast.unparse(node)), node.lineno, False, types_only)
+            yield Import(defined_in(ast.unparse(node)), node.lineno, False)
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -127,7 +126,7 @@ def imports(path: Path) -> Iterator[Import]:
             names = []
         for name in names:
             name = defined_in(name)
-            yield Import(name, node.lineno, at_import and not types_only, types_only)
+            yield Import(name, node.lineno, at_import and not types_only)
         in_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
         for child in ast.iter_child_nodes(node):
             guarded = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and child in node.body
@@ -195,7 +194,7 @@ def longest_module(name: str) -> str:
 def test_no_module_imports_itself_through_others():
     graph: dict[str, set[str]] = {}
     for module in MODULES.keys() - {"forcegp"}:
-        needed = [item.name for item in IMPORTS[module] if not item.for_types_only]
+        needed = [item.name for item in IMPORTS[module]]  # those under TYPE_CHECKING, too
         graph[module] = {source for name in needed if (source := longest_module(name))} - {module}
     try:
         TopologicalSorter(graph).prepare()
@@ -246,6 +245,11 @@ def test_help_needs_neither_torch_nor_numpy():
     loaded = modules_loaded_by(
         "import sys; sys.argv = ['forcegp', '--help']; from forcegp.cli.main import main; main()"
     )
+    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
+
+
+def test_a_missing_input_is_refused_before_anything_slow_is_imported():
+    loaded = modules_loaded_by("from forcegp.cli.main import main; assert main(['evaluate', 'nope', 'test.h5']) == 2")
     assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
 
 

@@ -31,7 +31,7 @@ class Reproduced:
         words = ("reproduce", "all", "--preset", preset, "--out", "out", "--docs", "docs", "--jobs", 1)
         done = forcegp(*words, folder=folder)
         assert done.returncode == 0, done.stderr
-        assert f"{page}.md tells what was found" in done.stdout
+        assert f"{page}.md reports the results" in done.stdout
         return cls(forcegp, folder, preset, page)
 
     @property

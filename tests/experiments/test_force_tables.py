@@ -5,7 +5,8 @@ import io
 import pytest
 from tests.experiments.stored_jobs import keep
 
-from forcegp.experiments.experiment import DataSettings, spread
+from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.experiments.experiment import DataSettings
 from forcegp.experiments.fits import FitSettings
 from forcegp.experiments.force_experiment import TEST_SEED, ForceExperiment, Trial, trial_name
 from forcegp.experiments.force_tables import dots_figure, only_test, score_table
@@ -113,7 +114,11 @@ def test_shares_of_contact_are_medians_over_seeds(results):
 
 
 def trial(label, **tests):
-    return {"label": label, "points": 5, "tests": {name: {"mae": spread(values)} for name, values in tests.items()}}
+    return {
+        "label": label,
+        "points": 5,
+        "tests": {name: {"mae": median_and_range(values)} for name, values in tests.items()},
+    }
 
 
 def test_tables_have_a_row_per_trial_and_test():
@@ -125,7 +130,7 @@ def test_tables_have_a_row_per_trial_and_test():
         "| two | 5 | 1.0000 | – |",
         "| two | 5 | 2.0000 | – |",
     ]
-    assert only_test(given[0]) == {"mae": spread([0.5, 0.7, 0.6])}
+    assert only_test(given[0]) == {"mae": median_and_range([0.5, 0.7, 0.6])}
     with pytest.raises(ValueError, match="too many values"):
         only_test(given[1])
 

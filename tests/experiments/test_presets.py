@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from forcegp.errors import InvalidInput
-from forcegp.experiments.experiment import markdown_table, number, shown, spread
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_scenarios import SCENARIOS
 from forcegp.experiments.pages import TRIAL_PRESETS, page_of
@@ -97,10 +97,10 @@ def test_what_differs_between_trials_shows_in_their_names(change):
 
 
 def test_spreads_and_tables():
-    assert spread([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
-    assert spread([1.0, None]) is None
-    assert shown(spread([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
-    assert shown(spread([0.5])) == "0.5000"
-    assert shown(None) == "–"
+    assert median_and_range([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
+    assert median_and_range([1.0, None]) is None
+    assert formatted(median_and_range([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
+    assert formatted(median_and_range([0.5])) == "0.5000"
+    assert formatted(None) == "–"
     assert [number(value) for value in (0.0, 1.2e-9, 0.08311, 23456.7)] == ["0.0000", "1.2e-09", "0.0831", "2.3e+04"]
     assert markdown_table(["a", "b"], [["x", "1"]]) == "| a | b |\n|---|---:|\n| x | 1 |"

@@ -25,7 +25,7 @@ LONGEST_TRIM = 0.1
 """Most that is trimmed from either end, as a share of the shortest stretch."""
 
 MOST_ROWS = 1000
-"""Rows on which torques are compared: neighbouring rows tell the same."""
+"""Rows on which torques are compared: neighbouring rows hold the same information."""
 
 DEGREE = np.pi / 180.0
 
@@ -36,9 +36,9 @@ class CheckInput:
 
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
-    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic` says that the
-    cut-off is that of the spectrum; `wraps` and `jumps` say where (rows, nv) a position of `log` jumps by a turn, or by
-    more than pi otherwise. `prepared` and `compared` are None where jumps forbid any derivative.
+    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the
+    cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
+    by more than pi otherwise. `prepared` and `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset
@@ -108,11 +108,11 @@ class CheckInput:
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:
     """The report of a preparation with a filter that this dataset went through; empty without one."""
-    told = dataset.metadata.get("preparation")
-    while isinstance(told, Mapping):
-        if told.get("cutoff") is not None:
-            return told
-        told = told.get("earlier")
+    report = dataset.metadata.get("preparation")
+    while isinstance(report, Mapping):
+        if report.get("cutoff") is not None:
+            return report
+        report = report.get("earlier")
     return {}
 
 

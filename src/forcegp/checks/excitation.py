@@ -29,14 +29,14 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
     if inputs.prepared is None:
         return []
     rows = inputs.prepared.dataset
-    still, one_way, told = [], [], []
+    still, one_way, motions = [], [], []
     for joint, name in enumerate(inputs.names):
         v = rows.v[:, joint]
         size = float(np.sqrt(np.square(v).mean()))
         signs = np.sign(v[np.abs(v) > HYSTERESIS * size])
         changes = int((np.diff(signs) != 0).sum())
         span = float(np.ptp(rows.q[:, joint]))
-        told.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
+        motions.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
         if span < STILL[bool(inputs.rotates[joint])]:
             still.append(name)
         elif changes < FEWEST_CHANGES:
@@ -51,7 +51,7 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
                 "friction and inertia do not show.",
                 remedy="Move every joint that is to be learned, or lock it in the robot (--lock JOINT=RAD).",
                 joints=tuple(still),
-                numbers={"joints": told},
+                numbers={"joints": motions},
             )
         )
     if one_way:
@@ -60,10 +60,10 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
                 severity="look",
                 subject="excitation",
                 seen=f"{listed(one_way)} changed direction less than twice: friction of both "
-                "directions cannot be told from gravity.",
+                "directions cannot be separated from gravity.",
                 remedy="Record motion to and fro.",
                 joints=tuple(one_way),
-                numbers={"joints": told},
+                numbers={"joints": motions},
             )
         )
     return [*found, *_held(inputs, still), *_base_parameters(inputs)]
@@ -133,7 +133,7 @@ def _base_parameters(inputs: CheckInput) -> list[Finding]:
             remedy=""
             if severity == "ok"
             else "Inertias of single links will be uncertain; record faster motion of all "
-            "joints at once, and keep the URDF's values where data say little.",
+            "joints at once, and keep the URDF's values where the data are not informative.",
             numbers=numbers,
         )
     ]

@@ -144,11 +144,11 @@ def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
         return
     correction = now.correction.torque(order, np.ones(len(names)))
     better = _hypothesis(now.robot, correction, given, cost=0.5, concerns=_places(moved))
-    told = ", ".join(f"that of {names[joint]} stands under {names[int(order[joint])]}" for joint in _places(moved))
+    text = ", ".join(f"that of {names[joint]} stands under {names[int(order[joint])]}" for joint in _places(moved))
     finding = Finding(
         severity="wrong",
         subject="joints exchanged",
-        seen=f"torques stand under wrong joints: {told} ({_remains(now.fit, better.fit, moved)}).",
+        seen=f"torques stand under wrong joints: {text} ({_remains(now.fit, better.fit, moved)}).",
         remedy="Correct the order of the torque columns.",
         joints=tuple(names[joint] for joint in _places(moved)),
         numbers={"order": [names[int(column)] for column in order]},
@@ -229,13 +229,13 @@ def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
         if angle < TILTED:
             continue
         gravity = size * direction
-        told = ", ".join(f"{value + 0.0:.3g}" for value in gravity)
+        text = ", ".join(f"{value + 0.0:.3g}" for value in gravity)
         finding = Finding(
             severity="wrong",
             subject="gravity",
-            seen=f"the torques fit gravity along ({told}) m/s² of the base far better than the assumed one, "
+            seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
             f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",
-            remedy=f"Give --gravity={told.replace(' ', '')}.",
+            remedy=f"Give --gravity={text.replace(' ', '')}.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
         cost = 1.5 if index == len(directions) - 1 else 1.0  # a base along its axes is the likelier one

@@ -34,7 +34,7 @@ FEW = 0.05
 
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2
-"""Time steps by which v must be late or early to be told."""
+"""Time steps by which v must be late or early to be reported."""
 
 
 def motion_findings(inputs: CheckInput) -> list[Finding]:
@@ -50,8 +50,8 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
         if name == "a" and found:
             break  # of wrong velocities nothing better can come
         fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
-        told = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
-        found += _merged([item for item in told if item is not None], even.nv)
+        findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
+        found += _merged([item for item in findings if item is not None], even.nv)
         if not found and name == "v":
             found_ok = [fit for fit in fits if fit is not None]
             if found_ok:
@@ -148,7 +148,7 @@ def _finding(
 
 
 def _merged(findings: list[Finding], nv: int) -> list[Finding]:
-    """One finding for all joints where they say the same."""
+    """One finding for all joints where they are the same."""
     kinds: dict[tuple, list[Finding]] = {}
     for item in findings:
         factor = item.numbers["factor"]

@@ -88,12 +88,12 @@ def _in_torques(inputs: CheckInput, after: np.ndarray) -> list[Finding]:
         loud = np.flatnonzero((noise > LARGE_TORQUE * spread) & (spread > 0.0))
     if not len(loud):
         return []
-    told = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
+    text = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
     return [
         Finding(
             severity="look",
             subject="noise",
-            seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {told} Nm or N.",
+            seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
             remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "
             "accelerations bears it.",
             joints=tuple(inputs.names[joint] for joint in loud),

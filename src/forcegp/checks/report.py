@@ -93,7 +93,7 @@ def check(
     """Look for what would spoil a model: wrong units, signs, joints, delays; dead channels; motion that shows nothing.
 
     `system` is the robot that was recorded (default: that of the dataset); without one, torques are not compared.
-    `preparation` says how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
+    `preparation` sets how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
     `trim` are not used. Nothing is changed.
 
     Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.

@@ -91,7 +91,7 @@ def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> list[Finding]
 
 
 def _repeated(inputs: CheckInput) -> list[Finding]:
-    """Rows in which every position is that of the row before although velocities say that the robot moves."""
+    """Rows in which every position is that of the row before although velocities show that the robot moves."""
     log = inputs.log
     follows = consecutive(log)[:-1]
     same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
@@ -114,17 +114,17 @@ def _repeated(inputs: CheckInput) -> list[Finding]:
 
 
 def _imported(metadata: Mapping[str, Any]) -> list[Finding]:
-    """What `forcegp import` met in the log files and mended, as `metadata["import"]` tells it."""
-    told = metadata.get("import")
-    if not isinstance(told, Mapping) or not told.get("recordings"):
+    """What `forcegp import` found in the log files and repaired, from `metadata["import"]`."""
+    report = metadata.get("import")
+    if not isinstance(report, Mapping) or not report.get("recordings"):
         return []
-    logs = told["recordings"]
+    logs = report["recordings"]
     repeated = sum(item.get("repeated_stamps_dropped", 0) for item in logs)
     gaps = sum(len(item.get("gaps", ())) for item in logs)
     uneven = max(float(item.get("largest_deviation_of_a_step", 0.0)) for item in logs)
     met = [f"{repeated} repeated time stamps (dropped)"] if repeated else []
     met += [f"{gaps} gaps (split there)"] if gaps else []
-    if told.get("resampled_to_step") is not None and uneven > JITTER:
+    if report.get("resampled_to_step") is not None and uneven > JITTER:
         met.append(f"time steps up to {100.0 * uneven:.0f} % off their median (resampled)")
     if not met:
         return []

@@ -162,7 +162,7 @@ def _clipped(inputs: CheckInput, joint: int) -> list[Finding]:
                     f"{at} "
                     f"rows of motion; the longest stretch, {length} rows, begins at row {start} at "
                     f"{log.time[start]:.3f} s.",
-                    remedy="The robot received another torque than the log says, or the sensor is at its end: leave "
+                    remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
                     "these stretches out, or move more gently.",
                     joints=(inputs.names[joint],),
                     numbers={"value": sign * extreme, "rows": at, "row": start},
@@ -216,7 +216,7 @@ def _resolution(inputs: CheckInput) -> list[Finding]:
     """Channels with few different values, and how coarse they are against their range."""
     found = []
     for name, quantity in QUANTITY.items():
-        told, joints, quanta = [], [], {}
+        quantized, joints, quanta = [], [], {}
         for joint, label in enumerate(inputs.names):
             values = np.unique(getattr(inputs.log, name)[:, joint])
             if len(values) < 3 or len(values) > 0.2 * len(inputs.log):
@@ -225,15 +225,15 @@ def _resolution(inputs: CheckInput) -> list[Finding]:
             quantum = float(np.median(steps[steps > 1e-9 * np.ptp(values)]))
             if quantum < COARSE[name] * np.ptp(values):
                 continue
-            told.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
+            quantized.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
             joints.append(label)
             quanta[label] = quantum
-        if told:
+        if quantized:
             found.append(
                 Finding(
                     severity="look",
                     subject="resolution",
-                    seen=f"the {quantity} was logged in coarse steps: {', '.join(told)}.",
+                    seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
                     remedy="Log more digits, or expect noise from this.",
                     joints=tuple(joints),
                     numbers={"quantity": name, "quantum": quanta},

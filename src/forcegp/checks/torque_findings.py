@@ -1,4 +1,4 @@
-"""What the comparison of torques with inverse dynamics says to people: factor, unit, delay, what is left."""
+"""Findings of the comparison of torques with inverse dynamics: factor, unit, delay, what is left."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SAME = 0.1
 
 UNEXPLAINED = 0.5
 LEAST_DELAY = 0.25
-"""Time steps below which a delay is not told."""
+"""Time steps below which a delay is not reported."""
 
 MUCH = 0.5
 """A delay that leaves less of what was unexplained is wrong to leave in."""
@@ -181,7 +181,7 @@ def _unit(inputs: CheckInput, joint: int) -> str:
 
 
 def not_compared(inputs: CheckInput) -> Finding:
-    """What is said where torques cannot be compared."""
+    """The finding where torques cannot be compared."""
     if inputs.contacts:
         return Finding(
             severity="ok",

@@ -30,7 +30,7 @@ COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 class Check(CutoffOptions, RobotOptions):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
-    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and says what to do. Nothing is
+    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is
     changed.
 
     For instance:
@@ -67,7 +67,7 @@ class Check(CutoffOptions, RobotOptions):
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
             self._draw(terminal, report, content)
-        terminal.say(*_shown(self.data, report))
+        terminal.show(*_shown(self.data, report))
         wrong = [finding for finding in report.findings if finding.severity == "wrong"]
         if self.strict and wrong:
             what = ", ".join(dict.fromkeys(finding.subject for finding in wrong))
@@ -95,9 +95,9 @@ def _shown(data: Path, report: forcegp.CheckReport) -> list[Any]:
     findings.add_column(no_wrap=True)
     findings.add_column(overflow="fold")
     for finding in report.findings:
-        told = Text(f"{finding.subject}: ", style="bold")
-        told.append(finding.seen, style="not bold")
-        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), told)
+        text = Text(f"{finding.subject}: ", style="bold")
+        text.append(finding.seen, style="not bold")
+        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
         if finding.remedy:
             findings.add_row("", Text(f"→ {finding.remedy}", style="dim"))
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")

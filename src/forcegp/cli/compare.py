@@ -31,7 +31,7 @@ KIND = "forcegp compare"
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(LearningOptions):
-    """Fit several priors on the unknown forces to the same rows, and say which of them the data support.
+    """Fit several priors on the unknown forces to the same rows, and report which of them the data support.
 
     Each --prior is one candidate, and may be a sum. Candidates are scored by the log density of stretches of time that
     are left out of the training rows, without another fit; with --test also on another recording.
@@ -59,7 +59,7 @@ class Compare(LearningOptions):
     block_seconds: Annotated[
         float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: a twentieth of the recording)")
     ] = None
-    """Length of the stretches of time that are left out; longer than what one moment tells about the next."""
+    """Length of the stretches of time that are left out; longer than the time over which motion is correlated."""
     test: Annotated[Path | None, DATASET, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
     """Another recording to score the candidates on as well."""
     json: Json = False
@@ -90,7 +90,7 @@ class Compare(LearningOptions):
             self._write(self.out, comparison, content, folders)
         if rows_note is not None:
             terminal.note(rows_note)
-        terminal.say(*self._report(comparison, folders))
+        terminal.show(*self._report(comparison, folders))
         return content
 
     def _priors(self, system: forcegp.MechanicalSystem) -> dict[str, forcegp.priors.ForcePrior]:
@@ -186,7 +186,7 @@ class Compare(LearningOptions):
 
 
 def _density(value: float) -> str:
-    """Three decimals, none where the whole number says enough: the table has to fit into 80 columns."""
+    """Three decimals, none for numbers of 100 and more: the table has to fit into 80 columns."""
     return f"{value:.3f}" if abs(value) < 100.0 else f"{value:.0f}"
 
 

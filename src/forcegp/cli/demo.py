@@ -18,10 +18,10 @@ import forcegp.inference
 import forcegp.models
 from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Command, Debug, Json
-from forcegp.cli.evaluate import draw, score
-from forcegp.cli.fit import fit, fit_summary
+from forcegp.cli.evaluate import draw, evaluate_with_progress
+from forcegp.cli.fit import fit_summary, fit_with_progress
 from forcegp.cli.output_folders import holds_only_own_files, require_free_folder, write_config
-from forcegp.cli.simulate import simulate
+from forcegp.cli.simulate import simulate_with_progress
 from forcegp.cli.tables import NONE, NORMAL_FORCES, columns, multiplier_scores, nats, number, percent
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
@@ -82,7 +82,7 @@ class Demo(Command):
             models, evaluations, fit_seconds = {}, {}, {}
             for name, (place, mean) in MODELS.items():
                 models[name], fit_seconds[name] = self._fitted(terminal, folder / place, train, name, mean)
-                evaluations[name] = score(terminal, models[name], test, f"predicting with {name}")
+                evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
             pictures = _draw_all(terminal, folder, models, test)
             terminal.note(f"drew {', '.join(pictures)}")
             results = self._results(models, evaluations, fit_seconds, time.monotonic() - start)
@@ -97,7 +97,7 @@ class Demo(Command):
 
     def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> forcegp.Dataset:
         start = time.monotonic()
-        dataset = simulate(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
+        dataset = simulate_with_progress(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
         dataset.save(folder / f"{name}.h5")
         terminal.note(f"simulated {name}: {len(dataset)} rows, seed {seed} ({time.monotonic() - start:.1f} s)")
         return dataset
@@ -108,7 +108,7 @@ class Demo(Command):
         """The fitted model, and the seconds that the fit alone took."""
         assert train.system is not None
         start = time.monotonic()
-        posterior = fit(
+        posterior = fit_with_progress(
             terminal,
             forcegp.StructuredGP(train.system, mean=mean),
             train,
@@ -163,7 +163,7 @@ class Demo(Command):
         rows.insert(0, ["known physics alone", *known, *[NONE] * 4])
         rows.append(["noise floor", number(first.noise_floor), NONE, number(0.0), *[NONE] * 4])
         title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
-        terminal.say(
+        terminal.show(
             columns(title, header, rows),
             *([_multiplier_line(evaluations)] if first.multiplier_mae is not None else []),
             f"{self.out}/summary.png shows it; results.json, models and data lie beside it ({wall_seconds:.0f} s).",

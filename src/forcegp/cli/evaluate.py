@@ -74,7 +74,7 @@ class Evaluate(Command):
         posterior = carried_over(terminal, posterior, dataset, self.system)
         if self.contact:
             posterior = posterior.with_system(posterior.system.with_contacts(parse_contacts(self.contact)))
-        evaluation = score(terminal, posterior, dataset)
+        evaluation = evaluate_with_progress(terminal, posterior, dataset)
         forces = forcegp.evaluation.force_scores(posterior, dataset)
         rests_on_prior = forcegp.evaluation.normal_force_rests_on_prior(posterior)
         scores = {
@@ -99,12 +99,12 @@ class Evaluate(Command):
             terminal.note(f"plots: {self.plots}")
 
         learned = NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
-        told = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
-        terminal.say(*_report(posterior, evaluation, dataset, self.data, told))
+        forces_table = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
+        terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
         return scores
 
 
-def score(
+def evaluate_with_progress(
     terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, name: str = "predicting"
 ) -> forcegp.Evaluation:
     """`forcegp.evaluation.evaluate` with a progress bar; warnings go to stderr."""

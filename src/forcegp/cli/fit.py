@@ -67,17 +67,19 @@ class Fit(ModelOptions):
         model = make_model(command, system.to(self.device), dataset)
         observe = window_observation(command.learn_from, command.window)
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
-        posterior = fit(terminal, model, dataset, points=points, **search_arguments(command, points))
+        posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
         with atomic_folder(self.out) as folder:
             command._write(folder, posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)
-        terminal.say(*_report(self.out, summary))
+        terminal.show(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 
 
-def fit(terminal: Terminal, model: Any, dataset: forcegp.Dataset, *, name: str = "fitting", **how: Any) -> Any:
+def fit_with_progress(
+    terminal: Terminal, model: Any, dataset: forcegp.Dataset, *, name: str = "fitting", **how: Any
+) -> Any:
     """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
     # networks have no options, but steps of their own
     options: forcegp.inference.OptimizerOptions | None = how.get("options")
@@ -124,7 +126,7 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
     }
 
 
-def _told_points(summary: Mapping[str, Any]) -> str:
+def _points_used(summary: Mapping[str, Any]) -> str:
     """How many points were conditioned on, and where parameters were found on fewer of them, on how many."""
     points, learning = summary["points"], summary["learning_points"]
     if learning == points:
@@ -138,7 +140,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     status = summary["status"]  # names failed evaluations, too, and the number of starts
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
-        f"{run}: {summary['model']}, learned from {_told_points(summary)}",
+        f"{run}: {summary['model']}, learned from {_points_used(summary)}",
         {
             **({"engine": summary["engine"]} if "engine" in summary else {}),
             "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",

@@ -61,7 +61,7 @@ class ModelOptions(FitOptions):
     engine: Annotated[Literal["auto", "exact", "iterative", "inducing", "stochastic"], arg(metavar="NAME")] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. iterative: by conjugate gradients.
     inducing: through fewer points, for friction curves and the like. stochastic: the same, on mini-batches. auto: by
-    the number of points, the features and the free memory, and says why. See docs/large-data.md."""
+    the number of points, the features and the free memory, and reports why. See docs/large-data.md."""
     learning_points: Annotated[
         int | None,
         arg(metavar="N", constructor=int, help_behavior_hint="(default: all points up to 1500, else 600)"),
@@ -93,4 +93,4 @@ class ModelOptions(FitOptions):
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/gpu.md. The folder that is written can be used on any machine."""
     measured_torque: bool = False
-    """u comes from sensors as noisy as --force-noise says, and predictions know it. Not for commanded torques."""
+    """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""

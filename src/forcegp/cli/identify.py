@@ -16,7 +16,7 @@ import forcegp.inference
 import forcegp.models
 from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.fit import fit, fit_summary
+from forcegp.cli.fit import fit_summary, fit_with_progress
 from forcegp.cli.identify_options import IdentifyOptions
 from forcegp.cli.identify_regression import INERTIAS, identify_by_regression
 from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
@@ -38,7 +38,7 @@ COEFFICIENT_NAMES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Identify(IdentifyOptions):
-    """Estimate physical parameters of the robot along with the unknown forces, and say how sure they are.
+    """Estimate physical parameters of the robot along with the unknown forces, and report their standard errors.
 
     The estimates start from the URDF and always belong to a body that can exist (but those of least-squares). The
     folder holds identified.urdf, identification.json, and the model as `forcegp fit` writes it, or system.json for
@@ -71,7 +71,7 @@ class Identify(IdentifyOptions):
         dataset, rows_note = self._rows(dataset, system)
         prior = forcegp.NoForces() if self.model == "analytical" else forcegp.JointForces()
         model = forcegp.StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
-        posterior = fit(
+        posterior = fit_with_progress(
             terminal,
             model,
             dataset,
@@ -92,14 +92,14 @@ class Identify(IdentifyOptions):
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
         with atomic_folder(self.out) as folder:
-            told = json.dumps(content, indent=1, allow_nan=False) + "\n"
+            identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
             urdf = posterior.system.robot.to_urdf()
-            self._write(folder, posterior, KIND, {"identification.json": told, "identified.urdf": urdf})
+            self._write(folder, posterior, KIND, {"identification.json": identification, "identified.urdf": urdf})
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:
             terminal.note(rows_note)
-        terminal.say(*_report(self, found, summary))
+        terminal.show(*_report(self, found, summary))
         del content["history"]
         return {"run": str(self.out), "data": str(self.data), **summary, **content}
 

@@ -21,7 +21,7 @@ class IdentifyOptions(FitOptions):
     viscous-joint-friction, coulomb-joint-friction, armature: of all joints, or of FORCE:JOINT,JOINT; from the URDF's
     coefficients, or from FORCE=START. The next two models estimate all of it instead."""
     model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
-    """structured: Gaussian processes carry the forces that nobody knows. analytical: there are none but noise.
+    """structured: Gaussian processes model the unknown forces. analytical: there are none but noise.
     least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
     """
     friction: Annotated[str, arg(metavar="NAME,NAME")] = "viscous,coulomb"

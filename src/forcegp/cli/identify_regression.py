@@ -67,7 +67,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
         write_config(folder, kind, command._given())
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
-    terminal.say(*_report(command, found, content, identified))
+    terminal.show(*_report(command, found, content, identified))
     return {"run": str(command.out), "data": str(command.data), **content}
 
 
@@ -114,13 +114,13 @@ def _report(
     if rows:
         tables.append(columns("friction and rotors", ["", "identified", "std. error"], rows))
     base = found.base
-    told = (
+    summary = (
         f"{base.rank} base parameters, condition number {base.condition:.3g}; "
         f"{content['rows']} rows, {content['cpu_seconds']:.1f} s CPU"
         f"{'' if content['converged'] else ', not converged'}."
     )
     weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
-    lines = [told, f"Directions that the prior decides, not the data: {weak or 'none'}."]
+    lines = [summary, f"Directions that the prior decides, not the data: {weak or 'none'}."]
     if found.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(found.thickened)}.")
     if identified is not None:

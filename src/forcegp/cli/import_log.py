@@ -33,10 +33,10 @@ Seconds = Annotated[float | None, arg(metavar="S", constructor=float, help_behav
 class Import(PreparationOptions, RobotOptions):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
-    Say which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or in
-    a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
+    State which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or
+    in a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
     pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered unless
-    --cutoff and its sisters say so.
+    --cutoff, --delay, --every or --trim is given.
 
     For instance:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
@@ -55,11 +55,11 @@ class Import(PreparationOptions, RobotOptions):
     mapping: Annotated[
         Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: beside)")
     ] = None
-    """What the columns mean; flags replace what it says. Default: log.yaml or forcegp.yaml beside the log."""
+    """What the columns mean; flags replace its entries. Default: log.yaml or forcegp.yaml beside the log."""
     write_mapping: Annotated[
         Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: no)")
     ] = None
-    """Write what flags and --mapping said together."""
+    """Write the mapping that results from flags and --mapping."""
     time: Columns = None
     """Time stamps."""
     step: Annotated[float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: --time)")] = None
@@ -90,7 +90,7 @@ class Import(PreparationOptions, RobotOptions):
     """Text without names of columns: how many numbers make a row, for all files or for each: 1,7,7."""
     delimiter: Annotated[
         str | None,
-        arg(metavar="comma|tab|semicolon|blanks|LETTER", constructor=str, help_behavior_hint="(default: told)"),
+        arg(metavar="comma|tab|semicolon|blanks|LETTER", constructor=str, help_behavior_hint="(default: detected)"),
     ] = None
     """What separates the columns of a text."""
     side_by_side: bool = False
@@ -148,7 +148,7 @@ class Import(PreparationOptions, RobotOptions):
                 done |= _prepared(temporary, preparation, done["rows"])
         if self.write_mapping is not None:
             write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
-        _tell(terminal, self.out, done)
+        _report(terminal, self.out, done)
         return {"out": str(self.out), **done}
 
     def _system(self) -> forcegp.MechanicalSystem | None:
@@ -168,7 +168,7 @@ class Import(PreparationOptions, RobotOptions):
         if path is None:
             found = {forcegp.recordings.beside(log) for log in self.logs} - {None}
             if len(found) > 1:
-                raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); say --mapping.")
+                raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); give --mapping.")
             path = next(iter(found), None)
             if path is not None:
                 terminal.note(f"the columns are mapped by {path}")
@@ -196,7 +196,7 @@ class Import(PreparationOptions, RobotOptions):
 
 
 def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[str, Any]:
-    """Prepare the dataset in a file, in its place, and return what to tell of it.
+    """Prepare the dataset in a file, in its place, and return what was done.
 
     Raises NotEnoughMemory where the whole of it does not fit into memory, which filters need.
     """
@@ -214,23 +214,23 @@ def _list(paths: set[Path | None]) -> str:
     return ", ".join(sorted(str(path) for path in paths))
 
 
-def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
+def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
     """What was guessed, repaired and left out, and what came out."""
     for found in done["guessed"]:
         terminal.note(f"found by name: {found}")
     for recording in done["recordings"]:
-        told = list(recording["notes"])
+        notes = list(recording["notes"])
         if recording["repeated_stamps_dropped"]:
-            told.append(f"{_counted(recording['repeated_stamps_dropped'], 'row')} with a repeated time stamp dropped")
+            notes.append(f"{_counted(recording['repeated_stamps_dropped'], 'row')} with a repeated time stamp dropped")
         if recording["gaps"]:
             count, longest = len(recording["gaps"]), max(recording["gaps"])
-            told.append(f"{_counted(count, 'gap')} of up to {longest:.4g} s {'splits' if count == 1 else 'split'} it")
+            notes.append(f"{_counted(count, 'gap')} of up to {longest:.4g} s {'splits' if count == 1 else 'split'} it")
         if recording["rows_in_stretches_too_short"]:
-            told.append(
+            notes.append(
                 f"{_counted(recording['rows_in_stretches_too_short'], 'row')} in stretches of fewer than 5 left out"
             )
-        if told:
-            terminal.note(f"{recording['name']}: {'; '.join(told)}")
+        if notes:
+            terminal.note(f"{recording['name']}: {'; '.join(notes)}")
     if done["resampled_to_step"] is not None:
         worst = max(recording["largest_deviation_of_a_step"] for recording in done["recordings"])
         terminal.note(
@@ -248,7 +248,7 @@ def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
         how = "filtered and differentiated anew"
     seconds = sum(recording["seconds"] for recording in done["recordings"])
     rows, episodes = _counted(done["rows"], "row"), _counted(len(done["episodes"]), "episode")
-    terminal.say(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
+    terminal.show(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
 
 
 def _counted(count: int, what: str) -> str:

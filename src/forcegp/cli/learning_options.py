@@ -60,7 +60,7 @@ class LearningOptions(BackendOptions, RobotOptions):
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
     rows: Annotated[RowsChoice, arg(metavar="auto|in-contact|all")] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
-    every row. auto: in-contact where the tool leaves the surface at times, and says so."""
+    every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
 
@@ -75,7 +75,7 @@ class LearningOptions(BackendOptions, RobotOptions):
         return system
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
-        """The rows to learn from, and what to say of them after the fit."""
+        """The rows to learn from, and a note to print after the fit."""
         return rows_to_learn(dataset, system, self.rows)
 
     def _given(self) -> dict[str, Any]:

@@ -165,5 +165,5 @@ def resolved_noise(given: str, dataset: forcegp.Dataset, force: float | None = N
 
 
 def _known_noise(given: str, dataset: forcegp.Dataset) -> forcegp.Noise | None:
-    """A network's noise: None where neither SIGMA nor the dataset tells, for then it estimates it."""
+    """A network's noise: None where neither SIGMA nor the dataset states it: the network then estimates it."""
     return None if given == "dataset" and dataset.noise_std is None else resolved_noise(given, dataset)

@@ -24,7 +24,7 @@ class CutoffOptions(Command):
     """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
 
     def _preparation(self) -> forcegp.Preparation:
-        """What the options say. Raises InvalidInput, naming the option, for what is no number."""
+        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
         if self.cutoff in ("none", "auto"):
             cutoff = None if self.cutoff == "none" else "auto"
         else:

@@ -1,4 +1,4 @@
-"""`forcegp prepare`: filter, align, differentiate and thin out a raw log, and say what that costs."""
+"""`forcegp prepare`: filter, align, differentiate and thin out a raw log, and report what that costs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KIND = "forcegp prepare"
 
 @dataclass(frozen=True, kw_only=True)
 class Prepare(PreparationOptions, RobotOptions):
-    """Filter, align, differentiate and thin out a raw log, and say what that costs.
+    """Filter, align, differentiate and thin out a raw log, and report what that costs.
 
     The low-pass filter runs forwards and backwards, so that nothing is delayed; v and a are computed anew.
 
@@ -66,7 +66,7 @@ class Prepare(PreparationOptions, RobotOptions):
         prepared.dataset.save(self.out)
         if self.plots is not None:
             self._draw(terminal, dataset, prepared)
-        terminal.say(*_report(self.out, dataset, prepared))
+        terminal.show(*_report(self.out, dataset, prepared))
         return {"out": str(self.out), "data": str(self.data), **prepared.report}
 
     def _draw(self, terminal: Terminal, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> None:
@@ -92,8 +92,10 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
     values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
     delays = report["delay"]
     if any(delays) or "delay" in report["why"]:
-        told = ", ".join(f"{1e3 * delay:.1f}" for delay in (delays if len(set(delays)) > 1 else delays[:1]))
-        values["delay of u"] = f"{told} ms" + (f"; {report['why']['delay']}" if "delay" in report["why"] else "")
+        milliseconds = ", ".join(f"{1e3 * delay:.1f}" for delay in (delays if len(set(delays)) > 1 else delays[:1]))
+        values["delay of u"] = f"{milliseconds} ms" + (
+            f"; {report['why']['delay']}" if "delay" in report["why"] else ""
+        )
     tables: list[Any] = [facts(f"{out}: prepared", values)]
     if cutoff is None:
         return tables

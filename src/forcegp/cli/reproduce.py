@@ -77,7 +77,7 @@ class Reproduce(BackendOptions):
                 backend=backend,
                 progress=report,
             )
-        terminal.say(
+        terminal.show(
             f"{out / forcegp.experiments.page_name(experiments, self.preset)} reports the results; figures, JSON and "
             f"CSV are in {out / forcegp.experiments.page_of(self.preset).name}."
         )
@@ -85,7 +85,7 @@ class Reproduce(BackendOptions):
         return {"out": str(out), "preset": self.preset, "figures": summaries}
 
     def _command(self) -> str:
-        """What has to be said for the same numbers."""
+        """The command line that gives the same numbers."""
         words = ["forcegp reproduce", self.figure, "--preset", self.preset]
         for name, numbers in (("--points", self.points), ("--seeds", self.seeds)):
             words += [name, *map(str, numbers)] if numbers else []

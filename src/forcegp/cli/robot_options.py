@@ -26,7 +26,7 @@ class RobotOptions(Command):
     """Use this robot instead of the dataset's."""
     inertias: Annotated[Literal["strict", "nearest"], arg(metavar="strict|nearest")] = "strict"
     """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
-    inertia that a body can have, and say how far it is."""
+    inertia that a body can have, and warn how far it is."""
     lock: Annotated[
         UseAppendAction[tuple[str, ...]],
         arg(metavar="JOINT=RAD", help_behavior_hint="(repeatable; default: as recorded)"),
@@ -98,7 +98,7 @@ class RobotOptions(Command):
             robot = forcegp.Robot.from_urdf_text(
                 recorded.urdf_text, source=recorded.source, inertias=self.inertias, **changes
             )
-        # robots with other joints are refused by their names, which says more than the length of the armature
+        # robots with other joints are refused by their names: clearer than an armature of the wrong length
         if recorded is None or robot.joint_names != recorded.joint_names:
             return robot
         kept = dict(zip(recorded.joint_names, recorded.armature.tolist(), strict=True))

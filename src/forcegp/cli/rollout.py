@@ -24,7 +24,7 @@ from forcegp.errors import InvalidInput
 KIND = "forcegp rollout"
 DEFAULT_STARTS = 10
 MOMENTS = (0.1, 0.25, 0.5, 1.0)
-"""Parts of the duration at which the table tells the errors."""
+"""Parts of the duration at which the table shows the errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ class Rollout(Command):
             folder.mkdir()
             self._write(folder, rollout, recorded, errors, dataset, summary)
         terminal.note(f"figure: {self.out / 'rollout.png'}")
-        terminal.say(*_report(summary))
+        terminal.show(*_report(summary))
         return summary
 
     def _starts(self) -> int | list[int]:
@@ -229,12 +229,12 @@ def _report(summary: Mapping[str, Any]) -> list[Any]:
     count = len(summary["rows"])
     title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
     ended = sum(row >= 0 for row in summary["diverged_at"])
-    told = {"integrator": summary["integrator"], "diverged": f"{ended} of {count}"}
+    values = {"integrator": summary["integrator"], "diverged": f"{ended} of {count}"}
     if summary["integrator"] == "projected" and contacts:
         moved = summary["initial_correction"]
-        told["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
-    told["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
-    return [columns(title, header, rows), facts("", told)]
+        values["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
+    values["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
+    return [columns(title, header, rows), facts("", values)]
 
 
 def _millimetres(metres: float | None) -> str:

@@ -66,10 +66,10 @@ class Simulate(Command):
         """Simulate and save."""
         require_free_file(self.out, overwrite=self.overwrite)
         start = time.monotonic()
-        dataset = simulate(terminal, self.scenario, **self._config())
+        dataset = simulate_with_progress(terminal, self.scenario, **self._config())
         dataset.save(self.out)
         seconds = time.monotonic() - start
-        terminal.say(
+        terminal.show(
             f"{self.out}: {len(dataset)} rows ({self.episodes} x {self.seconds:g} s), seed {self.seed}, "
             f"noise {self.noise:g} rad/s², simulated in {seconds:.1f} s"
         )
@@ -95,7 +95,7 @@ class Simulate(Command):
         return fields
 
 
-def simulate(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
+def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
     chosen = forcegp.simulation.SCENARIOS[scenario]
     config = chosen.config(**options)
@@ -110,7 +110,7 @@ def _import_silently(name: str) -> None:
     with open(os.devnull, "wb") as nothing:  # noqa: PTH123  # a device, not a path
         os.dup2(nothing.fileno(), 2)
     try:
-        with contextlib.suppress(ImportError):  # the simulation says what to install
+        with contextlib.suppress(ImportError):  # the error of the simulation names what to install
             __import__(name)
     finally:
         os.dup2(stderr, 2)

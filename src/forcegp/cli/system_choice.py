@@ -19,12 +19,12 @@ def carried_over(
     """The posterior for the chosen system.
 
     A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data,
-    which is said on stderr. Raises InvalidInput where the data know no system or the model cannot move there.
+    which is reported on stderr. Raises InvalidInput where the data carry no system or the model cannot move there.
     """
     if choice == "model":
         return posterior
     if dataset.system is None:
-        raise InvalidInput("--system data: the data know no robot and contacts; leave the option out.")
+        raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
     if "learned" not in posterior.settings:
         return posterior.with_system(dataset.system)
     terminal.note("--system data: contacts of the data; the robot stays the identified one")

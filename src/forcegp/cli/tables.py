@@ -85,15 +85,15 @@ def multiplier_scores(evaluation: forcegp.Evaluation) -> str:
 
 
 def force_facts(scores: forcegp.evaluation.ForceScores, normal_forces: str) -> dict[str, str]:
-    """One line per force that the truth knows: its errors relative to its size, and whether the intervals hold.
+    """One line per force whose true value is given: its errors relative to its size, and whether the intervals hold.
 
-    `normal_forces` says what the multiplier rests on.
+    `normal_forces` is a remark on what determines the multiplier.
     """
     values = {f"{name}, at the joints": _force_scores(score) for name, score in scores.joint_force.items()}
     values |= {f"{name}, at its point": _force_scores(score) for name, score in scores.point_force.items()}
     if scores.multiplier is not None:
-        told = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
-        values["contact force (multiplier)"] = told
+        text = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
+        values["contact force (multiplier)"] = text
     return values
 
 
@@ -115,7 +115,7 @@ def number(value: float | None) -> str:
 
 
 def nats(value: float | None) -> str:
-    """Two decimals: differences below a hundredth of a nat tell nothing."""
+    """Two decimals: differences below a hundredth of a nat are not significant."""
     return NONE if value is None else f"{value:.2f}"
 
 

@@ -1,4 +1,4 @@
-"""Where a command speaks: results on stdout, everything else on stderr; with --json, only JSON on stdout."""
+"""Output of a command: results on stdout, everything else on stderr; with --json, only JSON on stdout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEAST_SHARE = 0.02
 """Of the work that must be done before the remaining time is guessed from it."""
 
 
-class Report(Protocol):
+class ProgressCallback(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
 
     def __call__(self, done: int, total: int, note: str = "") -> None:  # noqa: D102
@@ -81,29 +81,29 @@ class Terminal:
             with os.fdopen(os.dup(self._stdout), "w", encoding="utf-8") as stdout:
                 stdout.write(text)
 
-    def say(self, *renderables: RenderableType) -> None:
-        """Show people the result; silent with --json."""
+    def show(self, *renderables: RenderableType) -> None:
+        """Print the result; nothing with --json."""
         if not self.json:
             for renderable in renderables:
                 self.out.print(renderable)
 
     def note(self, text: str) -> None:
-        """Tell people on stderr what was done."""
+        """Report on stderr what was done."""
         self.err.print(text, style="dim", markup=False)
 
     def warn(self, text: str) -> None:
-        """Warn people on stderr."""
+        """Print a warning on stderr."""
         self.err.print(f"warning: {' '.join(text.split())}", style="yellow", markup=False)
 
     @contextmanager
-    def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[Report]:
+    def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[ProgressCallback]:
         """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
         if self.err.is_terminal:
             yield from self._bar(what, may_end_early)
         else:
             yield _PlainProgress(self, what, may_end_early).report
 
-    def _bar(self, what: str, may_end_early: bool) -> Iterator[Report]:
+    def _bar(self, what: str, may_end_early: bool) -> Iterator[ProgressCallback]:
         columns = (
             SpinnerColumn(),
             TextColumn("{task.description}"),

@@ -108,7 +108,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
                 progress=report,
             )
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
-        terminal.say(*self._report(validation.document))
+        terminal.show(*self._report(validation.document))
         brief = ("models", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
         return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
 
@@ -190,11 +190,11 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             for name, model in document["models"].items()
             if model["failures"]
         ]
-        told = [
+        answers = [
             Text(f"{item['question']} {answer['sentence'].replace('**', '')}")
             for item in document["verdicts"]
             for answer in item["answers"]
             if answer["score"] == "force_rms"
         ]
         page = Text(f"The page: {self.out / 'report.md'}")
-        return [columns(title, header, rows, long_names=True), *failed, *told, page]
+        return [columns(title, header, rows, long_names=True), *failed, *answers, page]

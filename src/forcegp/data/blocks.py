@@ -1,7 +1,7 @@
 """Stretches of time: rows that belong together because they were measured one after the other.
 
 Neighbouring rows of one motion are nearly equal, so a row that is left out alone is still known from its neighbours.
-Leaving whole stretches out asks what a model says about a part of the motion that it has not seen (block
+Leaving whole stretches out tests the prediction of a part of the motion that it has not seen (block
 cross-validation; Burman, Chow & Nolan 1994, "A cross-validatory method for dependent data").
 """
 

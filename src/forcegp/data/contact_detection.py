@@ -1,4 +1,4 @@
-"""Which rows of a log were recorded while a contact acted: told from the motion alone, not from any force."""
+"""Which rows of a log were recorded while a contact acted: detected from the motion alone, not from any force."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
     3. is where contact happens: not farther than 5 mm from the surface, and not farther from the median distance of the
        rows that pass 1 and 2 than 1 mm or 20 robust standard deviations of them, whichever is more.
 
-    Rows of an impact break 2 and do not count. A point at rest, or gliding along just above its surface, cannot be told
-    from one in contact.
+    Rows of an impact break 2 and do not count. A point at rest, or gliding along just above its surface, cannot be
+    distinguished from one in contact.
 
     Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """

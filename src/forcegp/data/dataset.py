@@ -40,7 +40,7 @@ class Dataset:
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     system: the robot and what it touches, or None.
     noise_std: standard deviation of the noise on `a`, if known: (nv,), or (rows, nv) where it differs between rows.
-    truth: as far as a simulation knows them, noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
+    truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: anything that JSON can hold; frozen.

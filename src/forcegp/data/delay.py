@@ -58,7 +58,7 @@ class Delay:
         return self.common if sure else 0.0
 
     @property
-    def told(self) -> str:
+    def reason(self) -> str:
         """The common delay and what became of it, for people."""
         if not np.isfinite(self.common):
             return "the torques show no common delay"
@@ -100,8 +100,8 @@ def estimate_delay(
         residual[:, joint] = profiles[joint, 0, STEPS] / spread[STEPS], profiles[joint, 0].min() / spread[STEPS]
     seconds = np.array([[lowest(profile, parts.shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
-    told = profiles[np.isfinite(residual[0])]
-    likelihoods = np.log(told + TINY * told.max(initial=0.0)).sum(axis=0)
+    finite = profiles[np.isfinite(residual[0])]
+    likelihoods = np.log(finite + TINY * finite.max(initial=0.0)).sum(axis=0)
     common = np.array([lowest(profile, parts.shifts) for profile in likelihoods])
     likelihood = likelihoods[0]
     return Delay(
@@ -110,7 +110,7 @@ def estimate_delay(
         seconds=seconds[:, 0],
         std=_jackknife(seconds[:, 1:]),
         residual=residual,
-        remains=float(np.exp((likelihood.min() - likelihood[STEPS]) / max(len(told), 1))),
+        remains=float(np.exp((likelihood.min() - likelihood[STEPS]) / max(len(finite), 1))),
     )
 
 

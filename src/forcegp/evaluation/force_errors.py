@@ -1,4 +1,4 @@
-"""How well a model knows every force by itself: its components, their force at the tool, and the normal force."""
+"""Errors of every force by itself: its components, their force at the tool, and the normal force."""
 
 from __future__ import annotations
 
@@ -97,10 +97,10 @@ class ForceScore:
 
 @dataclass(frozen=True)
 class ForceScores:
-    """Scores of every force that the truth knows.
+    """Scores of every force that the truth holds.
 
     `joint_force` (in Nm or N) and `point_force` (in N, world axes) by component; `multiplier` of lambda, None where
-    model or truth do not speak of it.
+    model or truth lack it.
     """
 
     rows: int
@@ -121,7 +121,7 @@ class ForceScores:
 def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
     """Score the components of a model, and lambda, against the truth that the Dataset holds.
 
-    A component is compared with "Q_U.<its name>" and "force.<its name>", or with those that `TRUE_NAMES` says. Not
+    A component is compared with "Q_U.<its name>" and "force.<its name>", or with those in `TRUE_NAMES`. Not
     where two components of the model claim the same truth, since only their sum is true, and not without an analytical
     mean, where the processes hold the known forces, too. Raises InvalidInput for data of other joints.
     """
@@ -148,7 +148,7 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
 
 
 def true_names(components: Sequence[str], dataset: Dataset) -> dict[str, str]:
-    """Component -> what the truth of the Dataset calls it; without those that the truth does not know alone."""
+    """Component -> what the truth of the Dataset calls it; without those that the truth does not hold alone."""
     found: dict[str, str] = {}
     for name in components:
         for kept in (name, TRUE_NAMES.get(name)):

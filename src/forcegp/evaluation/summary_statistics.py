@@ -1,4 +1,4 @@
-"""Numbers over several seeds, and how a page shows them: median and range, and tables in Markdown."""
+"""Median and range over seeds, and their format in Markdown tables."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 
-def spread(values: Iterable[float | None]) -> dict[str, Any] | None:
+def median_and_range(values: Iterable[float | None]) -> dict[str, Any] | None:
     """Median and range over seeds, with the values; None where there are none (or not for every seed)."""
     given = list(values)
     if not given or any(value is None for value in given):
@@ -16,8 +16,8 @@ def spread(values: Iterable[float | None]) -> dict[str, Any] | None:
     return {"median": statistics.median(numbers), "min": min(numbers), "max": max(numbers), "values": numbers}
 
 
-def shown(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
-    """`.0831 (.0825–.0847)` of a spread, `.0831` of a number, a dash of nothing."""
+def formatted(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
+    """`.0831 (.0825–.0847)` of a median with its range, `.0831` of a number, a dash of nothing."""
     if value is None:
         return "–"
     if isinstance(value, Mapping):

@@ -21,7 +21,7 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
     lambda: any function of those inputs may then be added to the normal force, and accelerations show nothing of it.
     So it is for a free force at every joint, and for a Cartesian force that is not kept to the tangents. Friction
     curves that each have an input of their own, and constants (a payload), are no such processes: one state does not
-    tell them apart, but all together do.
+    separate them, but all together do.
     """
     if not isinstance(posterior, StructuredPosterior) or not posterior.model.system.contacts:
         return False

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
 from forcegp.jobs import Job, JobStore
@@ -116,18 +117,23 @@ class Ablation(Experiment):
         for model in OVERLAP_MODELS:
             jobs = [results.result(f"ablation/overlap/{model}/seed{seed}") for seed in self.seeds]
             other = [results.result(fit_name(model, self.largest, seed))["evaluation"] for seed in self.seeds]
-            overlap[model] = {name: spread(job[name] for job in jobs) for name in ("mae", "mae_noise_free", "shared")}
-            overlap[model]["mae_other"] = spread(job["mae"] for job in other)
-            overlap[model]["mae_noise_free_other"] = spread(job["mae_noise_free"] for job in other)
+            overlap[model] = {
+                name: median_and_range(job[name] for job in jobs) for name in ("mae", "mae_noise_free", "shared")
+            }
+            overlap[model]["mae_other"] = median_and_range(job["mae"] for job in other)
+            overlap[model]["mae_noise_free_other"] = median_and_range(job["mae_noise_free"] for job in other)
         summary = {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
         return summary | {"dense": results.result("ablation/dense")}
 
     @staticmethod
     def _scores(jobs: list[dict[str, Any]]) -> dict[str, Any]:
         evaluations = [job["evaluation"] for job in jobs]
-        scores = {name: spread(each[name] for each in evaluations) for name in ("mae", "mae_noise_free", "coverage_95")}
-        scores["nll"] = spread(job["nll"] for job in jobs) if "nll" in jobs[0] else None
-        scores["noise_std"] = spread(each["noise_std"] for each in evaluations)
+        scores = {
+            name: median_and_range(each[name] for each in evaluations)
+            for name in ("mae", "mae_noise_free", "coverage_95")
+        }
+        scores["nll"] = median_and_range(job["nll"] for job in jobs) if "nll" in jobs[0] else None
+        scores["noise_std"] = median_and_range(each["noise_std"] for each in evaluations)
         return scores
 
     @override
@@ -164,9 +170,9 @@ class Ablation(Experiment):
         rows = []
         for model, variants in summary["schedules"].items():
             paper = "–" if place is None else f"{published.FIG2B_MAE[model][place]:.4f}"
-            rows.append([MODELS[model].label, paper, *(shown(variants[name]["mae"]) for name in columns)])
+            rows.append([MODELS[model].label, paper, *(formatted(variants[name]["mae"]) for name in columns)])
         likelihoods = [
-            [MODELS[model].label, *(shown(variants[name]["nll"], 0) for name in SCHEDULES)]
+            [MODELS[model].label, *(formatted(variants[name]["nll"], 0) for name in SCHEDULES)]
             for model, variants in summary["schedules"].items()
         ]
         return (
@@ -200,15 +206,15 @@ class Ablation(Experiment):
             name: "no filter" if name == "none" else f"{name} Hz" for name in next(iter(summary["filters"].values()))
         }
         rows = [
-            [MODELS[model].label, *(f"{shown(variants[n]['mae_noise_free'])}" for n in names)]
+            [MODELS[model].label, *(f"{formatted(variants[n]['mae_noise_free'])}" for n in names)]
             for model, variants in summary["filters"].items()
         ]
         noise = [
-            [f"{MODELS[model].label}: learned noise std", *(shown(variants[n]["noise_std"], 3) for n in names)]
+            [f"{MODELS[model].label}: learned noise std", *(formatted(variants[n]["noise_std"], 3) for n in names)]
             for model, variants in summary["filters"].items()
         ]
         return (
-            "**Is the acceleration filtered?** The text speaks of a low-pass filter, the reference implementation has "
+            "**Is the acceleration filtered?** The text mentions a low-pass filter, the reference implementation has "
             "none. A zero-phase Butterworth filter (order 4) on the noisy training accelerations before rows are "
             "chosen, noise level learned, one start; MAE against the noise-free accelerations [rad/s²]:\n\n"
             + markdown_table(["model", *names.values()], [*rows, *noise])
@@ -218,8 +224,8 @@ class Ablation(Experiment):
         rows = [
             [
                 MODELS[model].label,
-                shown(scores["shared"], 3),
-                *(shown(scores[name]) for name in ("mae", "mae_other", "mae_noise_free", "mae_noise_free_other")),
+                formatted(scores["shared"], 3),
+                *(formatted(scores[name]) for name in ("mae", "mae_other", "mae_noise_free", "mae_noise_free_other")),
             ]
             for model, scores in summary["overlap"].items()
         ]
@@ -235,7 +241,7 @@ class Ablation(Experiment):
         return (
             f"**What can be reached?** With noise of {published.NOISE_STD} rad/s² a perfect model has an MAE of "
             "0.1 √(2/π) = 0.0798 against noisy accelerations. Close to it, the noise-free error, which is in the "
-            "tables of figure 2b, too, tells more."
+            "tables of figure 2b, too, shows more."
         )
 
 

@@ -23,7 +23,7 @@ def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float,
     """`rows` training rows of one trajectory, in the order of farthest-point sampling, and a test trajectory.
 
     A model that is trained on N points takes the first N rows, as in the paper. The test trajectory is kept whole (for
-    roll-outs); `every` says which of its rows are scored.
+    roll-outs); `every` sets which of its rows are scored.
     """
     spec = {
         "seed": seed,

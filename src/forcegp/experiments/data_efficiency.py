@@ -1,4 +1,4 @@
-"""How few points a prior that knows where the force acts needs, on the paper's own task and beyond its data."""
+"""How few points a prior on the force at its point of action needs, on the paper's own task and beyond its data."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.plots.style import QUIET, SERIES, SMALL, new_figure, quiet
+from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments import published
-from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_tables import only_test, plain_ticks, score_table
 from forcegp.jobs import JobStore
@@ -78,7 +78,7 @@ class DataEfficiency(ForceExperiment):
             [
                 f"The paper's scenario, analytical mean, {len(self.seeds)} seeds. The paper's best model has an MAE of "
                 f"{best} with 1000 points. A perfect one has the mean of the noise: 0.0798 in the long run, on these "
-                f"test rows {shown(only_test(inside[0]).get('mae_of_truth'))}.",
+                f"test rows {formatted(only_test(inside[0]).get('mae_of_truth'))}.",
                 score_table(inside, columns),
                 "**Extrapolation**: trained on rows with the tool at x < 0, tested at x > 0.1 m.",
                 score_table(outside, columns[:4]),

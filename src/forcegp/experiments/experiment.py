@@ -1,4 +1,4 @@
-"""What every experiment is: a typed configuration that knows its jobs, its summary, its figures and its words."""
+"""What every experiment is: a typed configuration with its jobs, its summary, its figures and its text."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.summary_statistics import markdown_table as markdown_table
-from forcegp.evaluation.summary_statistics import number as number
-from forcegp.evaluation.summary_statistics import shown as shown
-from forcegp.evaluation.summary_statistics import spread as spread
 from forcegp.experiments.data import data_job
-from forcegp.jobs import Job, JobStore
+from forcegp.jobs import Job
 
 Row = dict[str, str | int | float | None]
 
@@ -73,7 +69,7 @@ class Experiment(ABC):
 
     @abstractmethod
     def summary(self, results: JobStore) -> dict[str, Any]:
-        """What the finished jobs say, as plain JSON values."""
+        """The results of the finished jobs, as plain JSON values."""
 
     @abstractmethod
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
@@ -77,10 +78,11 @@ class Extrapolation(Experiment):
             for model in self.models:
                 found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
                 regions[region][model] = {
-                    side: {score: spread(job[side][score] for job in found) for score in SCORES} for side in SIDES
-                } | {"points": spread(job["points"] for job in found)}
+                    side: {score: median_and_range(job[side][score] for job in found) for score in SCORES}
+                    for side in SIDES
+                } | {"points": median_and_range(job["points"] for job in found)}
         scales = [results.result(_scale_name(seed)) for seed in self.seeds]
-        scale = {name: spread(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
+        scale = {name: median_and_range(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
         return {"points": self.points, "regions": regions, "scale": scale}
 
     @override
@@ -115,18 +117,20 @@ class Extrapolation(Experiment):
             rows = []
             for model, scores in summary["regions"][region].items():
                 outside = scores["outside"]
-                shares = [shown(outside["nlpd"], 1), shown(outside["coverage_95"], 3)]
-                errors = [shown(scores[side]["mae_noise_free"]) for side in SIDES]
+                shares = [formatted(outside["nlpd"], 1), formatted(outside["coverage_95"], 3)]
+                errors = [formatted(scores[side]["mae_noise_free"]) for side in SIDES]
                 points = f"{scores['points']['median']:.0f}"
-                rows.append([MODELS[model].label, points, *errors, *shares, shown(outside["constraint_error"])])
+                rows.append([MODELS[model].label, points, *errors, *shares, formatted(outside["constraint_error"])])
             parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table(header, rows)]
         scale = summary["scale"]
         parts.append(
             "What each model was left to learn, root mean square over training rows. A Gaussian process falls back to "
             "zero away from its data, so this is the size that its errors can reach there; a force error reaches the "
-            f"acceleration through H, whose largest entry on these data is {shown(scale['largest_H'], 0)} /(kg m²)."
+            f"acceleration through H, whose largest entry on these data is {formatted(scale['largest_H'], 0)} /(kg m²)."
         )
-        parts.append(markdown_table(["what", "size"], [[text, shown(scale[key], 2)] for key, text in TARGETS.items()]))
+        parts.append(
+            markdown_table(["what", "size"], [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()])
+        )
         return "\n\n".join(parts)
 
 

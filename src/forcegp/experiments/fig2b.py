@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range
 from forcegp.experiments import published
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
 from forcegp.experiments.plots.learning_curves import learning_curves_figure
@@ -75,14 +76,16 @@ class Fig2b(Experiment):
             for count in self.points:
                 found = [results.result(fit_name(model, count, seed)) for seed in self.seeds_of(count)]
                 scores = [{**job["evaluation"], "cpu_seconds": job["search"]["cpu_seconds"]} for job in found]
-                curves[model][str(count)] = {name: spread(score[name] for score in scores) for name in SCORES} | {
+                curves[model][str(count)] = {
+                    name: median_and_range(score[name] for score in scores) for name in SCORES
+                } | {
                     "converged": sum(job["search"]["converged"] for job in found),
                     "seeds": len(found),
                 }
         many = {}
         for model in self.on_all_rows:
             found = [results.result(all_name(model, seed))["evaluation"] for seed in self.seeds_many_points]
-            many[model] = {name: spread(score[name] for score in found) for name in SCORES[:-1]}
+            many[model] = {name: median_and_range(score[name] for score in found) for name in SCORES[:-1]}
         floor = results.result(fit_name(self.models[0], self.points[0], self.seeds[0]))["evaluation"]["noise_floor"]
         return {"curves": curves, "all_rows": {"rows": self.data.rows, "models": many}, "noise_floor": floor}
 
@@ -122,7 +125,7 @@ class Fig2b(Experiment):
                     rows.append([f"{MODELS[model].label}, paper", *cells])
                 label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
                 digits = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}.get(score, 4)
-                rows.append([label, *(shown(scores[score], digits) for scores in curve.values())])
+                rows.append([label, *(formatted(scores[score], digits) for scores in curve.values())])
             parts += [f"**{HEADINGS[score]}**", markdown_table(["N", *map(str, self.points)], rows)]
         unconverged = [
             f"{MODELS[model].label} N = {count}: {scores['converged']} of {scores['seeds']}"
@@ -139,7 +142,7 @@ class Fig2b(Experiment):
         for model, scores in summary["all_rows"]["models"].items():
             paper = published.MAE_10000.get(model)
             digits = {"nlpd": 2, "coverage_95": 3}
-            cells = [shown(scores[name], digits.get(name, 4)) for name in SCORES[:-1]]
+            cells = [formatted(scores[name], digits.get(name, 4)) for name in SCORES[:-1]]
             rows.append([MODELS[model].label, "–" if paper is None else f"{paper:.2f}", *cells])
         header = ["model", "MAE, paper", "MAE", "noise-free", "\\|A a − b\\|", "NLPD", "coverage"]
         parts.append(markdown_table(header, rows))

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.fits import fit_cost
 from forcegp.experiments.plots.estimation import estimation_figure
@@ -63,8 +64,8 @@ class Fig2c(Experiment):
         intervals = {
             name: {
                 "inside": sum(_inside(each["error"][name], each["std"][name]) for each in estimates),
-                "error": spread(abs(each["error"][name]) for each in estimates),
-                "std": spread(each["std"][name] for each in estimates),
+                "error": median_and_range(abs(each["error"][name]) for each in estimates),
+                "std": median_and_range(each["std"][name] for each in estimates),
             }
             for name in names
         }
@@ -99,7 +100,7 @@ class Fig2c(Experiment):
             for mean, trace in means.items():
                 last = [number(trace[name][-1]) for name in ("mass_error", "center_error", "mae")]
                 found = "never" if trace["found_at"] is None else str(trace["found_at"])
-                std = [shown(trace["std"]["mass"]), " ".join(shown(trace["std"][axis]) for axis in AXES)]
+                std = [formatted(trace["std"]["mass"]), " ".join(formatted(trace["std"][axis]) for axis in AXES)]
                 iterations = f"{len(trace['mass_error']) - 1}{'' if trace['converged'] else ' (limit)'}"
                 rows.append([f"{MODELS[model]}, {MEANS[mean]}", iterations, found, *last[:2], *std, last[2]])
         header = [
@@ -113,7 +114,7 @@ class Fig2c(Experiment):
             "MAE [rad/s²]",
         ]
         intervals = [
-            [name, shown(entry["error"]), shown(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
+            [name, formatted(entry["error"]), formatted(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
             for name, entry in summary["intervals"].items()
         ]
         start = summary["traces"]["s-gp"]["analytical"]

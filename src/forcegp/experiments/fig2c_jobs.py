@@ -104,5 +104,5 @@ def _uncertainty(posterior: StructuredPosterior) -> dict[str, Any]:
 
 
 def _identification(posterior: StructuredPosterior) -> Identification:
-    assert posterior.identification is not None, "the fit was told what to learn"
+    assert posterior.identification is not None, "the fit was given parameters to learn"
     return posterior.identification

@@ -13,8 +13,9 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.metrics import interval_coverage
+from forcegp.evaluation.summary_statistics import markdown_table, number
 from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import MODEL, FitSettings, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
 from forcegp.experiments.plots.prediction_window import prediction_window_figure

@@ -1,4 +1,4 @@
-"""Figure 4: where the models say that the robot goes, from the same initial states, over seconds."""
+"""Figure 4: motions that the models predict, from the same initial states, over seconds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, spread
+from forcegp.evaluation.summary_statistics import markdown_table, median_and_range, number
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
@@ -21,7 +22,7 @@ from forcegp.jobs import Job, JobStore
 
 BLACK_BOXES = ("gp", "neural-network")
 WITHOUT_CONSTRAINT = ("none", "projected")
-"""Variants of models that know no constraint, and so cannot be stabilised by it."""
+"""Variants of models without a constraint, and so cannot be stabilised by it."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class Fig4(Experiment):
             parts = [job["scores"][f"{second:g}"] for job in found]
             out[f"{second:g}"] = {
                 "joint_error": _spread([error for part in parts for error in part["joint_error"]]),
-                "constraint": spread(value for part in parts for value in part["constraint_median"]),
+                "constraint": median_and_range(value for part in parts for value in part["constraint_median"]),
                 "constraint_largest": max(max(part["constraint_largest"]) for part in parts),
             }
         return out
@@ -150,7 +151,7 @@ class Fig4(Experiment):
                 ["change [rad]", *(f"joint error after {second} s [rad]" for second in seconds)],
                 [[size, *(_error(errors[second]) for second in seconds)] for size, errors in summary["truth"].items()],
             ),
-            "So the open loop, which the paper shows for 1 s, tells about a model only while its own errors have not "
+            "So the open loop, which the paper shows for 1 s, tests a model only while its own errors have not "
             f"grown so. “With feedback” adds M(q recorded) (ω² (q recorded − q) + 2 ω (v recorded − v)) with ω = "
             f"{FREQUENCY:g} rad/s to the recorded torques, the same for every model.",
         ]

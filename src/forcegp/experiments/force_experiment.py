@@ -10,7 +10,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, spread
+from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.force_scenarios import SCENARIOS
 from forcegp.jobs import Job, JobStore
@@ -47,7 +48,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class ForceExperiment(Experiment):
-    """Trials on seeds; a subclass says which trials, and tells what came out."""
+    """Trials on seeds; a subclass defines the trials and describes the results."""
 
     data: DataSettings
     points: tuple[int, ...]
@@ -90,7 +91,7 @@ class ForceExperiment(Experiment):
         tests = {}
         for label in self._tests(trial):
             names = dict.fromkeys(name for job in found for name in job["tests"][label])
-            tests[label] = {name: spread(job["tests"][label].get(name) for job in found) for name in names}
+            tests[label] = {name: median_and_range(job["tests"][label].get(name) for job in found) for name in names}
         coverages = [curve["coverage"] for job in found for curve in job["curves"].values()]
         return {
             "label": trial.label,
@@ -99,12 +100,12 @@ class ForceExperiment(Experiment):
             "points": trial.points,
             "region": trial.region,
             "tests": tests,
-            "curve_coverage": spread(coverages),
-            "curve_coverage_of_seeds": spread(
+            "curve_coverage": median_and_range(coverages),
+            "curve_coverage_of_seeds": median_and_range(
                 _mean([curve["coverage"] for curve in job["curves"].values()]) for job in found if job["curves"]
             ),
-            "leave_one_out": spread(job["leave_one_out"] for job in found),
-            "search_seconds": spread(job["search"]["cpu_seconds"] for job in found),
+            "leave_one_out": median_and_range(job["leave_one_out"] for job in found),
+            "search_seconds": median_and_range(job["search"]["cpu_seconds"] for job in found),
         }
 
     @override

@@ -33,16 +33,16 @@ def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
     """
     config = KukaSurfaceConfig(seconds=spec["seconds"], seed=spec["seed"], **spec["scenario"])
     everything = simulate_kuka_surface(config)
-    told: dict[str, Any] = {"rows_available": len(everything)}
+    counts: dict[str, Any] = {"rows_available": len(everything)}
     if "in_contact" in everything.truth:
-        told["in_contact_truth"] = float(everything.truth["in_contact"].mean())
+        counts["in_contact_truth"] = float(everything.truth["in_contact"].mean())
     if spec["rows"] is None:
         kept = everything.rows(slice(None, None, spec["every"]))
     else:
         usable = everything
         if "in_contact" in everything.truth:
             usable = rows_in_contact(everything)
-            told["in_contact_detected"] = len(usable) / len(everything)
+            counts["in_contact_detected"] = len(usable) / len(everything)
         if spec["rows"] > len(usable):
             raise InvalidInput(
                 f"{spec['rows']} rows are asked for, but {spec['seconds']:g} s of motion have {len(usable)}; ask for "
@@ -50,7 +50,7 @@ def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
             )
         kept = farthest_rows(usable, spec["rows"])
     kept.save(folder / FILE)
-    return told | {"rows": len(kept)}
+    return counts | {"rows": len(kept)}
 
 
 def load(results: JobStore, name: str) -> Dataset:
@@ -90,7 +90,7 @@ def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
 
 
 def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
-    """Errors of the acceleration and, where the model speaks of them, of the forces; plain JSON values."""
+    """Errors of the acceleration and, where the model has them, of the forces; plain JSON values."""
     assert test.system is not None, "simulated data carry their system"
     if posterior.predicts_forces:
         posterior = posterior.with_system(test.system)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
-from forcegp.experiments.experiment import markdown_table, shown
+from forcegp.evaluation.summary_statistics import formatted, markdown_table
 
 COLUMNS = {
     "mae": ("MAE", 4),
@@ -34,7 +34,7 @@ def score_table(trials: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> 
         [
             trial["label"],
             str(trial["points"]),
-            *(shown(scores.get(name), COLUMNS[name][1]) for name in columns),
+            *(formatted(scores.get(name), COLUMNS[name][1]) for name in columns),
         ]
         for trial in trials
         for scores in trial["tests"].values()

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.experiments.experiment import shown
+from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
 from forcegp.experiments.force_jobs import MODEL, load
 from forcegp.experiments.force_scenarios import LABELS
@@ -90,7 +90,7 @@ class Friction(ForceExperiment):
             trials = [trial for trial in summary["trials"] if trial["scenario"] == scenario]
             parts += [f"**{LABELS[scenario][0].upper()}{LABELS[scenario][1:]}**", score_table(trials, columns)]
             curves = [
-                f"{trial['label']} {shown(trial['curve_coverage_of_seeds'], 3)}"
+                f"{trial['label']} {formatted(trial['curve_coverage_of_seeds'], 3)}"
                 for trial in trials
                 if trial["curve_coverage_of_seeds"] is not None
             ]

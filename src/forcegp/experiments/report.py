@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from forcegp.experiments.experiment import Experiment, markdown_table
+from forcegp.evaluation.summary_statistics import markdown_table
+from forcegp.experiments.experiment import Experiment
 from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 
 

@@ -37,8 +37,8 @@ def reproduce(
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
     Writes the page (`page_name`) and, in the folder of its name (`page_of`), `<name>.json`, `<name>.csv` and the
-    figures as PNG, into `out` and, if given, into `docs`, too. `command` is what the page says that it was
-    written by.
+    figures as PNG, into `out` and, if given, into `docs`, too. `command` is the command that the page
+    names as its source.
     Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and as
     `JobStore.open` and `run_jobs`.
     """

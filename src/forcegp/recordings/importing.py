@@ -29,7 +29,7 @@ from forcegp.recordings.time_stamps import Stamps, read_stamps
 ROUND_RATE = 1e-3
 """A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
 
-Report = Callable[[int, int, str], None]
+Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ def import_recordings(
     *,
     system: forcegp.mechanics.MechanicalSystem | None = None,
     options: ImportOptions | None = None,
-    report: Report = lambda done, total, note: None,
+    report: Progress = lambda done, total, note: None,
 ) -> dict[str, Any]:
     """Write the dataset that these logs hold and return what was done, which is also `metadata["import"]`.
 

@@ -15,7 +15,7 @@ BEYOND = 0.1
 """Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
 
 TURNS = 4.0 * np.pi
-"""rad: positions of a joint beyond this that are not said to be in rad are taken for degrees."""
+"""rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees."""
 
 STRONGER = 3.0
 """Times the limit of the URDF that a force may be before it is warned of."""
@@ -26,7 +26,7 @@ def require_plausible_positions(
 ) -> None:
     """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees.
 
-    `stated` says that the unit of q was given, which is then believed where no URDF contradicts it.
+    `stated`: the unit of q was given, which is then believed where no URDF contradicts it.
     Raises DatasetError naming the joint, its range and what to do.
     """
     limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}

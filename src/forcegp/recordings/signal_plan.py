@@ -78,7 +78,7 @@ class SignalPlan:
 def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Robot | None) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot if there is one.
 
-    Signals that the mapping does not name are looked for by the names of the joints (`guessed` says what was found).
+    Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
     Raises InvalidInput for columns, joints and numbers of them that do not fit.
     """
     joints = _joints(mapping, robot)
@@ -96,7 +96,7 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Ro
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
         if signal not in found:
             raise InvalidInput(
-                f"no columns for {signal} ({why}); say which with --{signal}. "
+                f"no columns for {signal} ({why}); name them with --{signal}. "
                 f"{source.path} has {_some(source.columns())}"
             )
     if not joints:
@@ -107,7 +107,7 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Ro
         name = guessed_time(source, used)
         if name is None:
             raise InvalidInput(
-                "no column for the time; say which with --time, or --step for the time between rows. "
+                "no column for the time; name it with --time, or --step for the time between rows. "
                 f"{source.path} has {_some(source.columns())}"
             )
         guessed.append(f"time = {name}")

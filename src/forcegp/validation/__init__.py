@@ -1,4 +1,4 @@
-"""Models side by side on rows that none of them has seen: splits, scores, verdicts and one page of results."""
+"""Models side by side on rows that none of them has seen: splits, scores, paired tests and one page of results."""
 
 import lazy_loader as lazy
 

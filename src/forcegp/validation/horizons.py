@@ -27,7 +27,7 @@ GAP = 1.5
 
 @dataclass(frozen=True, eq=False)
 class HeldOutMotions:
-    """The motions to predict, and the horizons [s] that they last for; `notes` say what could not be had."""
+    """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing."""
 
     motions: RecordedMotions | None
     horizons: tuple[float, ...]

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from forcegp.evaluation.summary_statistics import markdown_table, number, shown
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, number
 from forcegp.validation.paired_tests import SCORES
 
 ALT_TEXTS = {
@@ -17,12 +17,12 @@ ALT_TEXTS = {
 
 
 def page(document: Mapping[str, Any]) -> str:
-    """Markdown: what was done, the verdicts, tables with the best marked, and what failed."""
+    """Markdown: what was done, the conclusions, tables with the best marked, and what failed."""
     models = document["models"]
     finished = {name: model for name, model in models.items() if model["runs"]}
     source = document["source"]
     parts = [f"# Validation{' of ' + source['title'] if source.get('title') else ''}", *_done(document)]
-    parts += ["## Verdicts", _verdicts(document["verdicts"])]
+    parts += ["## Conclusions", _conclusions(document["verdicts"])]
     parts += _against_baseline(document["against_baseline"])
     if finished:
         parts += ["## All joints", _overall(finished, document)]
@@ -49,7 +49,7 @@ def _done(document: Mapping[str, Any]) -> list[str]:
         lines += [f"* {note[0].upper()}{note[1:]}" for note in split["notes"]]
     lines.append(
         f"* Every model learns from the same {document['points']} rows: those that lie farthest apart among two thirds "
-        f"of the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. Tables tell the median "
+        f"of the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. Tables show the median "
         "over runs (seeds and splits) and the range from the best to the worst."
     )
     lines.append(
@@ -81,7 +81,7 @@ def _done(document: Mapping[str, Any]) -> list[str]:
     return ["\n".join(lines)]
 
 
-def _verdicts(found: Sequence[Mapping[str, Any]]) -> str:
+def _conclusions(found: Sequence[Mapping[str, Any]]) -> str:
     if not found:
         return "There are no two finished models to compare for any question."
     lines = []
@@ -90,7 +90,7 @@ def _verdicts(found: Sequence[Mapping[str, Any]]) -> str:
         lines += [f"  * {answer['sentence']}" for answer in item["answers"]]
     lines.append(
         "\nOf each kind the model with the lowest median is taken, which favours kinds with many models a little. "
-        "Pairs share their training rows and held-out rows; intervals are Student's over runs, which say nothing about "
+        "Pairs share their training rows and held-out rows; intervals are Student's over runs, which do not hold for "
         "other recordings."
     )
     return "\n".join(lines)
@@ -104,23 +104,23 @@ def _against_baseline(found: Mapping[str, Any] | None) -> list[str]:
     for name, answers in found["models"].items():
         given = [answers[score] for score in scores]
         rows.append([name, *(_against(answer) for answer in given)])
-    told = []
-    for verdict, words in (("better", "Better than it by every score"), ("worse", "Worse than it by every score")):
+    sentences = []
+    for outcome, words in (("better", "Better than it by every score"), ("worse", "Worse than it by every score")):
         names = [
             name
             for name, answers in found["models"].items()
-            if all(answer["verdict"] == verdict for answer in answers.values() if answer is not None)
+            if all(answer["verdict"] == outcome for answer in answers.values() if answer is not None)
         ]
-        told.append(f"{words}: {', '.join(names) if names else 'none'}.")
+        sentences.append(f"{words}: {', '.join(names) if names else 'none'}.")
     never = [
         name
         for name, answers in found["models"].items()
         if not any(answer["verdict"] == "better" for answer in answers.values() if answer is not None)
     ]
-    told.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
+    sentences.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
     header = ["model", *(f"{SCORES[score]}{', difference' if score == 'nlpd' else ', ratio'}" for score in scores)]
     text = "Paired over runs, with 95 % intervals; bold where the interval shows the model to be better."
-    return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(told)]
+    return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(sentences)]
 
 
 def _against(answer: Mapping[str, Any] | None) -> str:
@@ -152,7 +152,7 @@ def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
     for name, model in models.items():
         cells = [_marked(model[s], 3, low("least", s)) for s in ("nrmse", "force_rms", "force_mae", "nlpd")]
         cells += [_percent(model[s], low("nearest", s)) for s in ("coverage_95", "coverage_50")]
-        rows.append([_named(name, model), *cells, shown(model["cpu_seconds"], 1)])
+        rows.append([_named(name, model), *cells, formatted(model["cpu_seconds"], 1)])
     return markdown_table(header, rows)
 
 
@@ -281,7 +281,7 @@ def _least(values: Iterable[Mapping[str, Any] | None]) -> float | None:
 
 def _marked(value: Mapping[str, Any] | None, digits: int, best: float | None) -> str:
     """With the median in bold where it is the best."""
-    text = shown(value, digits)
+    text = formatted(value, digits)
     if value is None or best is None or value["median"] != best:
         return text
     median = number(value["median"], digits)

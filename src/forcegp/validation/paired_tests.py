@@ -1,6 +1,6 @@
-"""Which model is better? Paired over runs, in which both saw the same training rows and predicted the same others.
+"""Which model is better? PairedTest over runs, in which both saw the same training rows and predicted the same others.
 
-With the difference d of one run (of logarithms for errors, so that it is a ratio; of nats for densities), n runs say
+With the difference d of one run (of logarithms for errors, so that it is a ratio; of nats for densities), n runs show
 that one model is better if the 95 % interval of the mean of d excludes 0: mean -+ t(0.975, n - 1) s / sqrt(n)
 (Student's paired test). Runs differ by their training rows; that recordings differ as well, only several splits show.
 """
@@ -40,7 +40,7 @@ QUESTIONS: Sequence[tuple[str, tuple[str, ...], tuple[str, ...]]] = (
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedTest:
     """Challenger against baseline in one score.
 
     `value` is the geometric mean of the ratios of errors (0.8: a fifth less), or the mean difference in nats; the
@@ -59,7 +59,7 @@ class Paired:
     stretches: int = 0
 
     @property
-    def verdict(self) -> str:
+    def outcome(self) -> str:
         """`better`, `worse` or `undecided`."""
         equal = _equal(self.score)
         if self.interval is None or self.interval[0] <= equal <= self.interval[1]:
@@ -68,23 +68,24 @@ class Paired:
 
     @property
     def sentence(self) -> str:
-        """The verdict with its numbers."""
-        said = {"better": "**Yes**", "worse": "**No**", "undecided": "**Undecided**"}[self.verdict]
-        spread = "one run, so no interval"
+        """The outcome with its numbers."""
+        answer = {"better": "**Yes**", "worse": "**No**", "undecided": "**Undecided**"}[self.outcome]
+        interval = "one run, so no interval"
         if self.interval is not None:
-            spread = f"95 % interval {_told(self.score, self.interval[0])} to {_told(self.score, self.interval[1])}"
+            low, high = (_formatted(self.score, end) for end in self.interval)
+            interval = f"95 % interval {low} to {high}"
         if self.score == "nlpd":
-            pair = f"{self.challenger} − {self.baseline} = {_told(self.score, self.value)} nats"
+            pair = f"{self.challenger} − {self.baseline} = {_formatted(self.score, self.value)} nats"
         else:
-            pair = f"{self.challenger} / {self.baseline} = {_told(self.score, self.value)}"
+            pair = f"{self.challenger} / {self.baseline} = {_formatted(self.score, self.value)}"
         better = f"better in {self.wins} of {self.runs} runs"
         if self.stretches:
             better += f" and in {self.ahead} of {self.stretches} held-out stretches of time"
-        return f"{said} by the {SCORES[self.score]}: {pair} ({spread}; {better})."
+        return f"{answer} by the {SCORES[self.score]}: {pair} ({interval}; {better})."
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
-        return {**asdict(self), "verdict": self.verdict, "sentence": self.sentence}
+        return {**asdict(self), "verdict": self.outcome, "sentence": self.sentence}
 
 
 def _equal(score: str) -> float:
@@ -92,11 +93,13 @@ def _equal(score: str) -> float:
     return 0.0 if score == "nlpd" else 1.0
 
 
-def _told(score: str, value: float) -> str:
+def _formatted(score: str, value: float) -> str:
     return f"{value:+.3g}" if score == "nlpd" else f"{value:.3g}"
 
 
-def paired(score: str, challenger: str, baseline: str, one: Sequence[float], other: Sequence[float]) -> Paired | None:
+def paired_test(
+    score: str, challenger: str, baseline: str, one: Sequence[float], other: Sequence[float]
+) -> PairedTest | None:
     """Compare the scores of two models run by run, the lower the better; None without runs, or with an error of 0."""
     a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
     in_nats = score == "nlpd"
@@ -111,10 +114,10 @@ def paired(score: str, challenger: str, baseline: str, one: Sequence[float], oth
     if len(a) > 1:
         half = student.ppf(0.5 + 0.5 * CERTAINTY, len(a) - 1) * float(difference.std(ddof=1)) / math.sqrt(len(a))
         interval = (shown(mean - half), shown(mean + half))
-    return Paired(score, challenger, baseline, len(a), int((difference < 0.0).sum()), shown(mean), interval)
+    return PairedTest(score, challenger, baseline, len(a), int((difference < 0.0).sum()), shown(mean), interval)
 
 
-def verdicts(summary: Mapping[str, Any], runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def conclusions(summary: Mapping[str, Any], jobs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """The answers to all questions for which there are models of both kinds, as plain JSON values."""
     out = []
     for question, challengers, baselines in QUESTIONS:
@@ -169,12 +172,12 @@ def best_of(
 
 
 def compared(
-    score: str, challenger: str, baseline: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]
-) -> Paired | None:
-    """`paired` over the runs that both models finished."""
-    one, other = runs_of(score, runs[challenger]), runs_of(score, runs[baseline])
+    score: str, challenger: str, baseline: str, jobs: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> PairedTest | None:
+    """`paired_test` over the runs that both models finished."""
+    one, other = runs_of(score, jobs[challenger]), runs_of(score, jobs[baseline])
     shared = [run for run in one if run in other]
-    found = paired(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
+    found = paired_test(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
     if found is None or score == "motion":
         return found
     ahead = _ahead(score, shared, runs[challenger], runs[baseline])

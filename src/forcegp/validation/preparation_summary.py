@@ -7,7 +7,7 @@ from typing import Any
 
 
 def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
-    """What `metadata["preparation"]` of a Dataset says (`data.Preparation`), as sentences, the last step first."""
+    """`metadata["preparation"]` of a Dataset (`data.Preparation`) as sentences, the last step first."""
     report = metadata.get("preparation")
     if not isinstance(report, Mapping):
         return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
@@ -29,8 +29,8 @@ def _step(report: Mapping[str, Any]) -> str:
     delay = [float(value) for value in report.get("delay") or []]
     if any(delay):
         same = len(set(delay)) == 1
-        told = f"{1e3 * delay[0]:.3g}" if same else ", ".join(f"{1e3 * value:.3g}" for value in delay)
-        parts.append(f"u taken from {told} ms later")
+        delays = f"{1e3 * delay[0]:.3g}" if same else ", ".join(f"{1e3 * value:.3g}" for value in delay)
+        parts.append(f"u taken from {delays} ms later")
     cutoff = report.get("cutoff")
     if cutoff is None:
         parts.append("no filter")

@@ -19,7 +19,7 @@ from forcegp.validation.candidates import DEFAULT_MODELS, candidates
 from forcegp.validation.comparison import Comparison
 from forcegp.validation.jobs import jobs_of, kept
 from forcegp.validation.page import page
-from forcegp.validation.paired_tests import against_baseline, verdicts
+from forcegp.validation.paired_tests import against_baseline, conclusions
 from forcegp.validation.preparation_summary import preparation_lines
 from forcegp.validation.summary import summary_of
 
@@ -116,7 +116,7 @@ def _document(
             {run["result"]["mass_matrix"] for each in runs.values() for run in each if run["result"] is not None}
         ),
         "models": summary,
-        "verdicts": verdicts(summary, runs),
+        "verdicts": conclusions(summary, runs),
         "against_baseline": against_baseline(summary, runs),
         "runs": {name: [_brief(run) for run in each] for name, each in runs.items()},
     }

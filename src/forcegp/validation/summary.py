@@ -1,4 +1,4 @@
-"""What the finished pieces of a comparison say: medians and ranges over seeds and splits, as plain JSON values."""
+"""Results of the finished pieces of a comparison: medians and ranges over seeds and splits, as plain JSON values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from forcegp.errors import FileFormatError
-from forcegp.evaluation.summary_statistics import spread
+from forcegp.evaluation.summary_statistics import median_and_range
 from forcegp.validation.candidates import Candidate
 from forcegp.validation.scores import over_joints
 
@@ -49,10 +49,10 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
     if not results:
         return out
     for score in ("nrmse", "rmse", "mae", "force_rms", "force_mae"):
-        out[score] = spread(over_joints(score, result[score]) for result in results)
+        out[score] = median_and_range(over_joints(score, result[score]) for result in results)
         out[f"{score}_per_joint"] = _per_joint(results, lambda result, score=score: result[score])
     for score in ("nlpd", "cpu_seconds"):
-        out[score] = spread(result[score] for result in results)
+        out[score] = median_and_range(result[score] for result in results)
     out["nlpd_per_joint"] = _per_joint(results, lambda result: result["nlpd_per_joint"])
     levels = results[0]["levels"]
     for level in (0.5, 0.95):
@@ -63,7 +63,7 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
     out["calibration"] = {
         "levels": levels,
         "covered": [
-            spread(over_joints("coverage", result["coverage"][place]) for result in results)
+            median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
             for place in range(len(levels))
         ],
     }
@@ -72,7 +72,7 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
 
 
 def _covered(results: Sequence[Result], place: int) -> dict[str, Any] | None:
-    return spread(over_joints("coverage", result["coverage"][place]) for result in results)
+    return median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
 
 
 def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
@@ -87,10 +87,10 @@ def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
         "motions": sum(run["motions"] for run in given),
         "integrator": given[0]["integrator"],
         "dt": given[0]["dt"],
-        "rms": [spread(run["rms"][at] for run, at in zip(given, here, strict=True)) for here in places],
+        "rms": [median_and_range(run["rms"][at] for run, at in zip(given, here, strict=True)) for here in places],
         "rms_per_joint": [
             [
-                spread(run["rms_per_joint"][at][joint] for run, at in zip(given, here, strict=True))
+                median_and_range(run["rms_per_joint"][at][joint] for run, at in zip(given, here, strict=True))
                 for joint in range(len(given[0]["rms_per_joint"][0]))
             ]
             for here in places
@@ -100,4 +100,4 @@ def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
 
 
 def _per_joint(results: Sequence[Result], values: Callable[[Result], Sequence[float | None]]) -> list[Any]:
-    return [spread(values(result)[joint] for result in results) for joint in range(len(values(results[0])))]
+    return [median_and_range(values(result)[joint] for result in results) for joint in range(len(values(results[0])))]

@@ -98,7 +98,7 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     drawn = [measured, fitted, *([shown.u[:, joint]] if mended else [])]
     low, high = min(values.min() for values in drawn), max(values.max() for values in drawn)
     space = 0.3 * max(float(high - low), 1e-9)
-    axes.set_ylim(low - space, high + space)  # inverse dynamics alone may be far off: a wrong unit, say
+    axes.set_ylim(low - space, high + space)  # inverse dynamics alone may be far off: for example with a wrong unit
     return joint_units(shown, "u")[joint]
 
 

@@ -79,7 +79,7 @@ def friction_curves_figure(
     """Every curve with its 95 % band over the velocities that were visited in training, and a little beyond.
 
     Shown are processes of one feature, and of tool forces the force along each axis over the velocity along it, at
-    rest along the others, as the force that resists. Where `dataset` knows the true parts of the unknown force, dots
+    rest along the others, as the force that resists. Where `dataset` holds the true parts of the unknown force, dots
     show them at its rows (of tool forces: at rows that move nearly along that axis). `latents` chooses among the
     names of `posterior.latent_names`; None takes the first LARGEST_GRID. Raises InvalidInput if there is no curve.
     """
@@ -240,7 +240,7 @@ def _visited(posterior: StructuredPosterior, panel: CurvePanel) -> Float[np.ndar
 def _truth(
     posterior: StructuredPosterior, dataset: Dataset, panels: Sequence[CurvePanel]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Feature and true value of the processes at rows of the Dataset, as far as its truth knows them."""
+    """Feature and true value of the processes at rows of the Dataset, as far as its truth holds them."""
     if posterior.carries_known_forces:
         return {}
     named = true_names(list(dict.fromkeys(panel.component for panel in panels)), dataset)

@@ -15,7 +15,7 @@ def likelihood_figure(
 ) -> Figure:
     """One curve per model, `{name: posterior.result.history}`; the last value of each is written beside it.
 
-    `objective` says what the values are, with their unit in brackets: `posterior.objective`.
+    `objective` names the values, with their unit in brackets: `posterior.objective`.
     Raises InvalidInput without any history.
     """
     if not histories or not all(len(history) for history in histories.values()):

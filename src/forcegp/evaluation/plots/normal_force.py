@@ -34,10 +34,10 @@ ERROR_ROWS = 2000
 def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
     """One row per contact: force over `seconds` of the first episode; errors in standard deviations beside it.
 
-    The force is |s_p| lambda in N, positive where the surface pushes along its gradient. Where the Dataset knows
+    The force is |s_p| lambda in N, positive where the surface pushes along its gradient. Where the Dataset holds
     "lambda", it is drawn, with a histogram of (prediction - truth) / standard deviation over up to ERROR_ROWS rows of
     the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
-    Raises InvalidInput without contacts, and for models that do not speak of forces.
+    Raises InvalidInput without contacts, and for models without forces.
     """
     if not posterior.system.contacts or not posterior.predicts_forces:
         raise InvalidInput(
@@ -91,7 +91,7 @@ def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
     with torch.no_grad():
         multiplier = posterior.predict(q, v, u).multiplier
-        assert multiplier is not None, "models that speak of forces predict lambda"
+        assert multiplier is not None, "models with forces predict lambda"
         dynamics = posterior.dynamics(q, v, u)
         size = torch.linalg.vector_norm(dynamics.normals, dim=-1)
         own = size if rows.system is None else torch.linalg.vector_norm(rows.system.dynamics(q, v, u).normals, dim=-1)

@@ -87,7 +87,7 @@ def window(dataset: Dataset, start: float, seconds: float) -> Dataset:
 
 
 def short_joint_names(names: Sequence[str]) -> list[str]:
-    """`lbr_iiwa_joint_1`, `lbr_iiwa_joint_2` -> `joint 1`, `joint 2`: what all names begin with tells nothing."""
+    """`lbr_iiwa_joint_1`, `lbr_iiwa_joint_2` -> `joint 1`, `joint 2`: the common beginning of all names is left out."""
     columns = list(zip(*names, strict=False)) if len(names) > 1 else []
     different = next((place for place, letters in enumerate(columns) if len(set(letters)) > 1), len(columns))
     shared = names[0][:different]
