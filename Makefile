@@ -12,13 +12,20 @@ ARGS ?=
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: demo test check format bench clean help
+.PHONY: demo test test-all test-processors check format bench clean help
 
 demo: $(VENV)/.demo  ## simulate, learn and evaluate; prints the table and writes the pictures
 	$(BIN)/forcegp demo $(ARGS)
 
-test: $(VENV)/.test  ## run the test suite
-	$(BIN)/python -m pytest -n 2 $(ARGS)
+# Files stay together, so that what a module shares is computed once.
+test: $(VENV)/.test  ## run the fast tests; every subject is in one
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+test-all: $(VENV)/.test  ## run all tests, the slow ones too, and check annotated shapes at run time
+	FORCEGP_CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "" $(ARGS)
+
+test-processors: $(VENV)/.test  ## run the tests as other processors and a busy machine do; goes on where it ended
+	$(BIN)/python tests/processors.py $(ARGS)
 
 check: $(VENV)/.check  ## lint, format, types and the rule of imports
 	$(BIN)/ruff check .
@@ -34,11 +41,11 @@ bench: $(VENV)/.test  ## measure; benchmarks/README.md says what
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
 
 clean:  ## remove .venv, caches and builds; keeps what runs and demos wrote
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 help:  ## list the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 10
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 18
 
 # A larger installation contains the smaller ones, so it stamps them too.
 $(VENV)/.demo: EXTRAS := sim

@@ -41,6 +41,7 @@ from forcegp.robots import Robot, physical_from_parameters
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.dynamics_programs import Request, trace
 from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.unrolled_kinematics import UnrolledKinematics
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 
@@ -181,7 +182,9 @@ def inductor() -> None:
 
     @torch.compile(dynamic=True, fullgraph=True)
     def forward(q: torch.Tensor, v: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
-        return torch.stack(unrolled.states(q.unbind(-1), v.unbind(-1)).forward_dynamics(tau.unbind(-1)), dim=-1)
+        return torch.stack(
+            UnrolledKinematics(unrolled, q.unbind(-1), v.unbind(-1)).forward_dynamics(tau.unbind(-1)), dim=-1
+        )
 
     with tempfile.TemporaryDirectory() as folder:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder

@@ -33,7 +33,7 @@ from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
 from forcegp.jobs.machine import machine
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
-from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.robots.devices import usable_device
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 

@@ -27,7 +27,7 @@ from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_
 from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
 from forcegp.inference import ENGINES, Inducing, Stochastic
-from forcegp.models.many_rows import on_all_rows
+from forcegp.models.structured.engine_selection import on_all_rows
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
 SEED, SECONDS = 903, 420.0
@@ -94,7 +94,7 @@ def run() -> dict[str, float]:
 
 def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     """Time and memory over the number of rows."""
-    from forcegp.evaluation.figure_style import SERIES, SMALL, new_figure, quiet, save_figure
+    from forcegp.evaluation.plots.style import SERIES, SMALL, new_figure, quiet, save_figure
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2)

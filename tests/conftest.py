@@ -1,19 +1,25 @@
-"""Every shape in a signature of forcegp is checked at run time here, and every test computes on one thread."""
+"""Environment of every test: one thread, no verdict by the clock, and on request a check of all annotated shapes.
+
+`FORCEGP_CHECK_SHAPES=1` (`make test-all`) checks at run time what annotations of forcegp promise, at more than twice
+the time. `FORCEGP_TEST_THREADS=2` computes with two threads (`make test-processors`).
+"""
 
 import os
 from collections.abc import Callable
 from pathlib import Path
 
-for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # read when numpy and torch are imported
-    os.environ[threads] = "1"
+THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # numpy and torch read them at import
+    os.environ[variable] = str(THREADS)
 
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
-install_import_hook("forcegp", "beartype.beartype")  # before the first import of forcegp
-torch.set_num_threads(1)
+if os.environ.get("FORCEGP_CHECK_SHAPES") == "1":
+    install_import_hook("forcegp", "beartype.beartype")  # before the first import of forcegp
+torch.set_num_threads(THREADS)
 
 # The same examples on every machine and no verdict by the clock: a failure here is a failure everywhere.
 settings.register_profile("reproducible", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -1,16 +1,16 @@
 """The example of docs/control-rate.md runs as it stands."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
+
+from tests.examples import run_example
 
 
 def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "control-rate.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    rank, one, linear, many, gradient = done.stdout.splitlines()
+    printed = run_example(example, tmp_path)
+    rank, one, linear, many, gradient = printed.splitlines()
     found, excess = re.fullmatch(r"rank (\d+), standard deviations at most (\S+)% too large", rank).groups()
     assert 1 < int(found) <= 300
     assert 0.0 < float(excess) <= 1.0

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 from benchmarks.force_pictures import PICTURES
+from tests.cli.in_process import run_here
+from tests.examples import run_example
 
 from forcegp import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.cli.arguments import parse_arguments
@@ -30,8 +32,8 @@ def test_the_python_example_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "your-robot.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    noise, error, *_, any_force, friction = done.stdout.splitlines()
+    printed = run_example(example, tmp_path)
+    noise, error, *_, any_force, friction = printed.splitlines()
     assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
     assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
     assert float(error) < 0.3
@@ -46,8 +48,8 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
 def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "comparing-priors.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    verdict, joint, contact, none, left_out = done.stdout.splitlines()
+    printed = run_example(example, tmp_path)
+    verdict, joint, contact, none, left_out = printed.splitlines()
     assert verdict.startswith("The data support contact: ")
     scores = [float(re.search(r"functions, (\S+) nats per row", line)[1]) for line in (joint, contact, none)]
     assert scores[1] > scores[0] > scores[2]
@@ -60,8 +62,8 @@ def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
     example, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # the other has tests of its own
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    tool, total, curve, error, free = done.stdout.splitlines()
+    printed = run_example(example, tmp_path)
+    tool, total, curve, error, free = printed.splitlines()
     assert tool == "torch.Size([2400, 1]) torch.Size([2400, 7, 7]) torch.Size([2400, 3])"
     assert total == "torch.Size([2400, 7]) torch.Size([2400, 1])"
     assert re.fullmatch(r"sliding speed \[m/s\] from \S+ to \S+, 200 values in N", curve)
@@ -102,8 +104,8 @@ def test_the_pictures_and_pages_that_the_page_on_forces_names_exist(repository: 
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    mass, verdict, _ = done.stdout.splitlines()[-3:]
+    printed = run_example(example, tmp_path)
+    mass, verdict, _ = printed.splitlines()[-3:]
     found, error = (float(number) for number in re.fullmatch(r"(\S+) \+- (\S+) kg", mass).groups())
     assert abs(found - 2.0) < 0.1
     assert 0.0 < error < 0.05
@@ -114,18 +116,19 @@ def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
 def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
     commands, _ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the second needs a log of the reader's own
-    scripts = Path(sys.executable).parent
     for command in commands.splitlines():
         program, *words = command.split()
-        subprocess.run([scripts / program, *words], cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert program == "forcegp"
+        done = run_here(*words, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
     assert (tmp_path / "identified" / "identified.urdf").exists()
 
 
 def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    states, more, diverged, free, held = done.stdout.splitlines()[-5:]
+    printed = run_example(example, tmp_path)
+    states, more, diverged, free, held = printed.splitlines()[-5:]
     assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
     assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
     assert diverged == "tensor([-1, -1])"
@@ -135,15 +138,15 @@ def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "incremental.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "70 40"
+    printed = run_example(example, tmp_path)
+    assert printed.splitlines()[-1] == "70 40"
 
 
 def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "large-data.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    engine, refined, left_out = done.stdout.splitlines()
+    printed = run_example(example, tmp_path)
+    engine, refined, left_out = printed.splitlines()
     assert engine == "inducing: as asked for"
     assert refined.startswith("on all rows, ")
     assert float(left_out.split()[2]) <= 1.0
@@ -155,8 +158,8 @@ def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "gpu.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "cpu"
+    printed = run_example(example, tmp_path)
+    assert printed.splitlines()[-1] == "cpu"
 
 
 def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):

@@ -10,7 +10,7 @@ from forcegp.analytical.bodies import ConsistentBodies, FreeBodies, pseudo_inert
 from forcegp.analytical.identified_robot import thickened, with_bodies, with_joint_dynamics
 from forcegp.analytical.regressor import body_pseudo_inertias, standard_parameters
 from forcegp.errors import NonPhysicalInertia
-from forcegp.models.objective import squared_distance
+from forcegp.models.structured.objective import squared_distance
 from forcegp.robots import Robot
 from forcegp.robots.inertia import parameters_from_physical
 

@@ -2,10 +2,9 @@
 
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
+from tests.examples import run_example
 
 from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.check import Check
@@ -20,12 +19,12 @@ def page(repository):
 
 def test_the_example_finds_what_was_planted(page, tmp_path):
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert re.search(r"\[wrong\] torque sign: the torque of elbow has the opposite sign", done.stdout)
-    delay = re.search(r"\[wrong\] delay: the torque of all joints is logged (\S+) ms .* later", done.stdout)
+    printed = run_example(example, tmp_path)
+    assert re.search(r"\[wrong\] torque sign: the torque of elbow has the opposite sign", printed)
+    delay = re.search(r"\[wrong\] delay: the torque of all joints is logged (\S+) ms .* later", printed)
     assert delay is not None
     assert float(delay[1]) == pytest.approx(20.0, abs=1.5)
-    assert done.stdout.count("[wrong]") == 2
+    assert printed.count("[wrong]") == 2
 
 
 def test_the_commands_are_commands(page):

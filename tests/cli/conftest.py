@@ -1,4 +1,4 @@
-"""The real executable, and real files made by it, once for all tests of this room."""
+"""`forcegp` in this process and as the installed executable, and real files made by it, once for all tests here."""
 
 import os
 import subprocess
@@ -7,8 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.cli.in_process import run_here
 
 Forcegp = Callable[..., subprocess.CompletedProcess[str]]
+
+LONGEST = 1200.0
+"""Seconds after which a command hangs: hundreds of times what any of them takes, so no verdict depends on the clock."""
 
 
 @pytest.fixture(scope="session")
@@ -20,10 +24,13 @@ def executable() -> Path:
 
 
 @pytest.fixture(scope="session")
-def forcegp(executable) -> Forcegp:
-    """Run `forcegp` with these arguments in that folder; returns exit code, stdout and stderr."""
+def installed(executable) -> Forcegp:
+    """Run the executable with these arguments in that folder; returns exit code, stdout and stderr.
 
-    def run(*arguments: object, folder: Path | None = None, timeout: float = 300.0) -> subprocess.CompletedProcess[str]:
+    Each start imports torch anew: for what belongs to a process. `forcegp` does everything else.
+    """
+
+    def run(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [executable, *(str(argument) for argument in arguments)],
             cwd=folder,
@@ -31,10 +38,16 @@ def forcegp(executable) -> Forcegp:
             capture_output=True,
             text=True,
             check=False,
-            timeout=timeout,
+            timeout=LONGEST,
         )
 
     return run
+
+
+@pytest.fixture(scope="session")
+def forcegp() -> Forcegp:
+    """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr."""
+    return run_here
 
 
 @pytest.fixture(scope="session")

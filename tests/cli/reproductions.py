@@ -26,10 +26,10 @@ class Reproduced:
 
     @classmethod
     def everything(cls, forcegp: Forcegp, folder: Path, preset: str, page: str) -> Reproduced:
-        """Through the real executable, in this folder."""
+        """All of it in this folder."""
         pytest.importorskip("pybullet")
-        words = ("reproduce", "all", "--preset", preset, "--out", "out", "--docs", "docs", "--jobs", 2)
-        done = forcegp(*words, folder=folder, timeout=1200.0)
+        words = ("reproduce", "all", "--preset", preset, "--out", "out", "--docs", "docs", "--jobs", 1)
+        done = forcegp(*words, folder=folder)
         assert done.returncode == 0, done.stderr
         assert f"{page}.md tells what was found" in done.stdout
         return cls(forcegp, folder, preset, page)
@@ -74,7 +74,7 @@ class Reproduced:
     def page_of_one(self, name: str, *arguments: object, folder: Path) -> str:
         """The page of one figure, made in a copy of the results in `folder`; the page of all is left alone."""
         shutil.copytree(self.folder / "out", folder / "out")
-        done = self.forcegp("reproduce", name, *arguments, "--out", "out", "--jobs", 1, folder=folder, timeout=600.0)
+        done = self.forcegp("reproduce", name, *arguments, "--out", "out", "--jobs", 1, folder=folder)
         assert done.returncode == 0, done.stderr
         assert self.text(folder / "out") == self.text()
         return (folder / "out" / f"{name}.md").read_text()

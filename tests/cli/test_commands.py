@@ -1,4 +1,4 @@
-"""The commands from end to end: the real executable on real files."""
+"""The commands from end to end on real files."""
 
 import contextlib
 import dataclasses
@@ -181,6 +181,7 @@ def interruptible():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.mark.nightly
 def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path):
     pytest.importorskip("pybullet")
     screen, terminal = pty.openpty()
@@ -195,13 +196,14 @@ def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path)
         with contextlib.suppress(OSError):  # how Linux reports the end of a terminal; others with an empty read
             while chunk := os.read(screen, 4096):
                 seen += chunk
-        assert process.wait(60) == 130
+        assert process.wait(600) == 130  # a guard against a hang
     os.close(screen)
     assert b"forcegp: interrupted; no partial output was kept." in seen.splitlines()[-1]
     assert b"Traceback" not in seen
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.nightly
 def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable, tmp_path):
     pytest.importorskip("pybullet")
     command = [executable, "reproduce", "fig2b", "--preset", "smoke", "--jobs", "1", "--out", "out"]
@@ -215,22 +217,9 @@ def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable,
             assert process.poll() is None
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, told = process.communicate(timeout=600)  # a guard against a hang
     assert process.returncode == 130
     last = told.decode().splitlines()[-1]
     assert last == "forcegp: interrupted; finished jobs are kept, and the same command goes on from there."
     assert b"Traceback" not in told
     assert list((tmp_path / "out" / "jobs").glob(finished))
-
-
-@pytest.mark.parametrize("command", ["demo", "simulate", "fit", "evaluate"])
-def test_help_has_an_example(forcegp, command):
-    done = forcegp(command, "--help")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(rf"For instance:\n\s+forcegp {command} \S", done.stdout)
-
-
-def test_version(forcegp):
-    done = forcegp("--version")
-    assert done.returncode == 0
-    assert re.fullmatch(r"forcegp \d+\.\d+\.\d+\n", done.stdout)

@@ -1,4 +1,4 @@
-"""`forcegp compare` from end to end: the real executable on real files."""
+"""`forcegp compare` from end to end."""
 
 import dataclasses
 import json
@@ -78,12 +78,6 @@ def test_json_and_the_folder_hold_the_same(forcegp, folder):
     again = forcegp("compare", "train.h5", *words, *QUICK, folder=folder)
     assert (again.returncode, again.stdout) == (2, "")
     assert "--overwrite" in again.stderr
-
-
-def test_help_has_an_example(forcegp):
-    done = forcegp("compare", "--help")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"For instance:\n\s+forcegp compare \S", done.stdout)
 
 
 TWO = "--prior joint --prior joint-friction"

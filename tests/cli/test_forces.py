@@ -1,4 +1,4 @@
-"""Forces by themselves and other systems, on the command line: the real executable on files of a small arm."""
+"""Forces by themselves and other systems, on the command line: files of a small arm."""
 
 import dataclasses
 import json

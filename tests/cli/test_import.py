@@ -1,4 +1,4 @@
-"""`forcegp import` through the real executable: what it makes, what it says, and what it refuses."""
+"""`forcegp import`: what it makes, what it says, and what it refuses."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""`forcegp reproduce` through the real executable: everything once at the smallest size, and its refusals."""
+"""`forcegp reproduce`: everything once at the smallest size, and its refusals."""
 
 import csv
 import json

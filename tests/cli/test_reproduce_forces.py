@@ -1,4 +1,4 @@
-"""`forcegp reproduce` of the experiments on force priors, through the real executable, at the smallest size."""
+"""`forcegp reproduce` of the experiments on force priors, at the smallest size."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""`forcegp rollout` from end to end: the real executable on real files, and whatever can be asked wrongly."""
+"""`forcegp rollout` from end to end, and whatever can be asked wrongly."""
 
 import dataclasses
 import json
@@ -61,13 +61,6 @@ def test_the_table_is_for_people(workshop, forcegp, tmp_path):
     assert re.search(r"^\s*0\.1 s\s+2\s+\S+\s+\S+\s+\S+ mm\s+\S+e-\d\d mm", told, re.M), told
     assert re.search(r"diverged\s+0 of 2", told)
     assert re.search(r"initial states\s+moved onto the contacts by up to \S+ rad", told)
-
-
-def test_help_has_an_example(forcegp):
-    done = forcegp("rollout", "--help")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"For instance:\n\s+forcegp rollout run \S", done.stdout)
-    assert "symplectic-euler" in done.stdout
 
 
 @pytest.fixture

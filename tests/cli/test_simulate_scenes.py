@@ -1,4 +1,4 @@
-"""`forcegp simulate` with other friction, surfaces and contacts, through the real executable."""
+"""`forcegp simulate` with other friction, surfaces and contacts."""
 
 import json
 

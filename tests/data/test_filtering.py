@@ -89,7 +89,7 @@ def test_other_wrong_arguments_are_refused(rate, order):
 def test_too_few_rows_are_refused():
     # Poles of the analogue filter of order 2: 2 pi f_c at 45 degrees; log(1000) / (2 pi 0.01 / sqrt(2)) = 155 rows.
     zero_phase_low_pass(np.zeros((157, 1)), 1000.0, 10.0, 2)
-    with pytest.raises(DatasetError, match="154 rows are too few for a filter of order 2 with a cut-off"):
+    with pytest.raises(DatasetError, match=r"154 rows .*order 2"):
         zero_phase_low_pass(np.zeros((154, 1)), 1000.0, 10.0, 2)
 
 
@@ -142,14 +142,14 @@ def test_what_cannot_be_filtered_is_named():
         low_pass(data.rows(slice(0, 52)), 10.0)
     with pytest.raises(DatasetError, match="not in order of time"):
         low_pass(data.rows([3, 1]), 10.0)
-    with pytest.raises(DatasetError, match=r"episode 0 is not sampled uniformly: the step after row 9 .*Resample"):
+    with pytest.raises(DatasetError, match=r"episode 0 .*row 9 .*Resample"):
         low_pass(data.rows(np.delete(np.arange(80), 10)), 10.0)
 
 
 def test_an_angle_that_wraps_is_refused():
     time = np.arange(100) / 100
     turning = motion(time, q=np.stack([(7 * time + np.pi) % (2 * np.pi) - np.pi, time], 1))
-    with pytest.raises(DatasetError, match=r"episode 0: q of joint 'one' jumps by more than pi after row 44.*unwrap"):
+    with pytest.raises(DatasetError, match=r"episode 0: q of joint 'one' .*row 44.*unwrap"):
         low_pass(turning, 10.0)
     with pytest.raises(DatasetError, match="wraps"):
         differentiated(turning, "q")

@@ -249,7 +249,7 @@ def test_what_cannot_be_prepared_is_named():
     data, _ = noisy(4.0)
     with pytest.raises(InvalidInput, match="delay has 3 numbers; the dataset has 2 joints"):
         Preparation(delay=(0.0, 0.0, 0.1)).apply(data)
-    with pytest.raises(DatasetError, match=r"episode 0 lasts 3.998 s; nothing is left of it after 2.5 s are trimmed"):
+    with pytest.raises(DatasetError, match=r"episode 0 .*3\.998 s.* 2\.5 s"):
         Preparation(trim=2.5).apply(data)
     with pytest.raises(InvalidInput, match="automatic cut-off or delay is not known"):
         _ = Preparation(cutoff="auto").halo

@@ -55,7 +55,7 @@ def test_one_episode_is_never_split():
 
 def test_rows_in_both_are_found():
     data = many(4)
-    with pytest.raises(DatasetError, match=r"1 of 3 test rows are also training rows \(the first: test row 2\)"):
+    with pytest.raises(DatasetError, match=r"1 of 3 test rows .*row 2"):
         require_disjoint(data.rows(slice(0, 8)), data.rows([12, 13, 5]))
     require_disjoint(data.rows(slice(0, 8)), data.rows(slice(8, 16)))
 

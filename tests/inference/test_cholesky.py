@@ -95,7 +95,7 @@ def test_no_warning_without_need():
 @pytest.mark.parametrize("smallest", [-1.0, -1e-6])
 def test_an_indefinite_matrix_is_refused(smallest):
     matrix = torch.diag(torch.tensor([1.0, smallest, 1.0], dtype=torch.float64))
-    with pytest.raises(NumericalError, match=r"not positive definite even with .* raise the noise level"):
+    with pytest.raises(NumericalError, match=r"not positive definite .*noise"):
         factorize(matrix.clone)
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from gpytorch.kernels import CosineKernel, LinearKernel, MaternKernel, RBFKernel, ScaleKernel
+from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import ExactPosterior, LatentKernels
-from forcegp.inference.kernels import kernel_cross, kernel_matrix
 from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
 from forcegp.priors.kernels import kernel_of
 
@@ -69,7 +69,7 @@ def test_kernels_that_cannot_be_stacked_have_the_same_mean(points):
 )
 def test_kernels_that_cannot_be_drawn_are_named(kernel):
     latent = conditioned([kernel, scaled_rbf(1, 0.9, 1.4)], (1, 1))
-    with pytest.raises(InvalidInput, match=r"no functions can be drawn for a (CosineKernel|ScaleKernel with active)"):
+    with pytest.raises(InvalidInput, match=r"CosineKernel|ScaleKernel with active"):
         draw_functions(latent, 2, seed=0)
 
 

@@ -134,7 +134,7 @@ def test_the_position_tolerance_is_a_distance_whatever_the_scale_of_the_surface(
 def test_a_start_out_of_reach_is_refused_with_a_remedy():
     system = arm_system(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 5.0))])
     q, v = start(free_system("plane"))
-    with pytest.raises(NumericalError, match=r"state 0 cannot be moved onto .* Start nearer to the surfaces"):
+    with pytest.raises(NumericalError, match=r"state 0 .*nearer"):
         ConstraintManifold(system).project(q, v)
 
 

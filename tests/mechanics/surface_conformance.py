@@ -17,6 +17,15 @@ BATCHES = [(), (1,), (0,), (4,), (2, 3), (3, 0, 2)]
 STEP = 1e-5
 
 
+def assert_rounded(given: torch.Tensor, expected: torch.Tensor) -> None:
+    """Equal but for rounding: an entry is the result of less than 50 additions and products of numbers of its size.
+
+    Vector instructions differ with processor, layout and batch shape: no bit is promised across them.
+    """
+    scale = max(1.0, float(expected.abs().max())) if expected.numel() else 1.0
+    torch.testing.assert_close(given, expected, rtol=0.0, atol=50.0 * torch.finfo(torch.float64).eps * scale)
+
+
 class SurfaceConformance:
     """Value, gradient, Hessian, batches, transforms and storage of `surface`."""
 
@@ -39,14 +48,14 @@ class SurfaceConformance:
             assert result.dtype == torch.float64
             one_by_one = [function(point) for point in p.reshape(-1, 3)]
             if one_by_one:
-                torch.testing.assert_close(result.reshape(-1, *trailing), torch.stack(one_by_one), rtol=0.0, atol=1e-14)
+                assert_rounded(result.reshape(-1, *trailing), torch.stack(one_by_one))
 
     def test_points_in_any_memory_layout(self):
         p = self.points(4, 5)
         scattered = p.transpose(0, 1).contiguous().transpose(0, 1)
         for name in ("value", "gradient", "hessian"):
-            assert torch.equal(getattr(self.surface, name)(scattered), getattr(self.surface, name)(p))
-        assert torch.equal(p, self.points(4, 5))
+            assert_rounded(getattr(self.surface, name)(scattered), getattr(self.surface, name)(p))
+        assert torch.equal(p, self.points(4, 5))  # the points are left as they were
 
     def test_gradient_and_hessian_against_finite_differences(self):
         p = self.points(20)
@@ -66,7 +75,7 @@ class SurfaceConformance:
 
     def test_hessian_is_symmetric(self):
         hessian = self.surface.hessian(self.points(20))
-        torch.testing.assert_close(hessian, hessian.mT, rtol=0.0, atol=1e-14)
+        assert_rounded(hessian, hessian.mT)
 
     def test_everything_is_differentiable_in_the_points(self):
         for name in ("value", "gradient", "hessian"):
@@ -78,8 +87,8 @@ class SurfaceConformance:
         for name in ("value", "gradient", "hessian"):
             function = getattr(self.surface, name)
             mapped = torch.func.vmap(torch.func.vmap(function))(p)
-            torch.testing.assert_close(mapped, function(p), rtol=0.0, atol=1e-14)
-            torch.testing.assert_close(torch.func.vmap(function)(p), function(p), rtol=0.0, atol=1e-14)
+            assert_rounded(mapped, function(p))
+            assert_rounded(torch.func.vmap(function)(p), function(p))
         hessians = torch.func.vmap(torch.func.jacrev(self.surface.gradient))(p[:, 0])
         torch.testing.assert_close(hessians, self.surface.hessian(p[:, 0]), rtol=1e-12, atol=1e-12)
 

@@ -216,7 +216,7 @@ def test_contradictory_contacts_are_named():
     tool = FRAMES["iiwa"]
     contacts = tuple(Contact(tool, (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), height)) for height in (0.055, 0.065))
     held = MechanicalSystem(robot("iiwa"), contacts, baumgarte=Baumgarte(10.0))
-    with pytest.raises(ContactError, match=r"contradict each other, most at row \d: .* = 5.00e-01 for contact [01]"):
+    with pytest.raises(ContactError, match=r"row \d: .* = 5\.00e-01 for contact [01]"):
         held.check_states(*states(7, 3))
 
 

@@ -82,12 +82,12 @@ class ModelConformance:
             assert force is None or force.mean.shape[:-1] == batch
         only_mean = fitted.predict(*states, covariance=False)
         assert only_mean.covariance is None
-        assert torch.equal(only_mean.mean, prediction.mean)
+        torch.testing.assert_close(only_mean.mean, prediction.mean, rtol=1e-10, atol=1e-10)
 
     def test_rows_are_predicted_each_for_itself(self, fitted, test, monkeypatch):
         flat = fitted.predict(test.q[:6], test.v[:6], test.u[:6])
         batched = fitted.predict(*(x[:6].reshape(2, 3, 3) for x in (test.q, test.v, test.u)))
-        assert torch.equal(batched.mean.reshape(6, 3), flat.mean)
+        torch.testing.assert_close(batched.mean.reshape(6, 3), flat.mean, rtol=1e-10, atol=1e-10)
         single = fitted.predict(test.q[4], test.v[4], test.u[4])
         torch.testing.assert_close(single.mean, flat.mean[4], rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(single.covariance, flat.covariance[4], rtol=1e-8, atol=1e-10)

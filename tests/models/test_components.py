@@ -121,7 +121,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     if contacts == "none":
         assert float(components["contact-friction"].joint_force.mean.abs().max()) == 0.0
     bare = moved.components(*states, covariance=False)
-    assert torch.equal(bare.total.mean, components.total.mean)
+    torch.testing.assert_close(bare.total.mean, components.total.mean, rtol=1e-12, atol=1e-12)
     assert bare["payload"].joint_force.covariance is None
 
 
@@ -133,7 +133,7 @@ def test_components_of_any_batch_and_their_names(posterior, states):
     close(single.total.covariance, flat.total.covariance[1], 1e-12)
     assert flat["contact-friction"].latent_units == ("N",)
     assert flat["joint-friction"].latent_names == ("pan", "lift", "bend")
-    with pytest.raises(InvalidInput, match="no component 'joint-fricton' in this model; did you mean 'joint-friction'"):
+    with pytest.raises(InvalidInput, match=r"'joint-fricton'.*'joint-friction'"):
         flat["joint-fricton"]
     with pytest.raises(InvalidInput, match="last dimension must be 3"):
         posterior.components([1.0], [1.0], [1.0])
@@ -169,14 +169,14 @@ def test_a_curve_is_that_of_dense_conditioning(posterior, dense, train):
 def test_wrong_curves_are_refused(posterior, train):
     with pytest.raises(InvalidInput, match=r"no latent 'lift' in this model.* Valid latents: "):
         posterior.curve("lift")
-    with pytest.raises(InvalidInput, match=r"'joint-friction lift' have shape \(3, 2\); give finite numbers \(n, 1\)"):
+    with pytest.raises(InvalidInput, match=r"'joint-friction lift' .*\(3, 2\).*\(n, 1\)"):
         posterior.curve("joint-friction lift", np.zeros((3, 2)))
     with pytest.raises(InvalidInput, match="give finite numbers"):
         posterior.curve("joint-friction lift", [math.nan])
     with pytest.raises(InvalidInput, match="points=0"):
         posterior.curve("joint-friction lift", points=0)
     joint = StructuredGP(train.system).fit(train, restarts=1, options=OptimizerOptions(iterations=1))
-    with pytest.raises(InvalidInput, match=r"'pan' is a function of 9 features; give features \(n, 9\)"):
+    with pytest.raises(InvalidInput, match=r"'pan' .*\(n, 9\)"):
         joint.curve("pan")
     assert joint.curve("pan", np.zeros((2, 9))).mean.shape == (2,)
 
@@ -252,7 +252,7 @@ def test_forces_move_to_a_robot_with_another_tool(posterior, states):
 def test_what_cannot_move_is_refused(posterior, train):
     heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
-    with pytest.raises(InvalidInput, match="trained on joints pan, lift, bend; the other robot has yaw, lift, bend"):
+    with pytest.raises(InvalidInput, match=r"pan, lift, bend.*yaw, lift, bend"):
         posterior.with_robot(renamed)
     handless = Robot.from_urdf_text(URDF.replace('"hand"', '"claw"'))
     with pytest.raises(UnknownFrame, match="hand"):

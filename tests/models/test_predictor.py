@@ -241,7 +241,7 @@ def test_forward_mode_derivatives_are_not_lost(posterior, means, states):
         assert_close(means.mean(q, v, u), eager.mean(q, v, u))  # numbers alone are taken as ever
         x = forward_ad.make_dual(q, direction)
         for function in (means.mean, means.linearize):
-            with pytest.raises(InvalidInput, match=r"compiled predictor does not support forward-mode .*linearize"):
+            with pytest.raises(InvalidInput, match=r"forward-mode .*linearize"):
                 function(x, v, u)
         with pytest.raises(InvalidInput, match="linearize does not support forward-mode"):
             eager.linearize(x, v, u)
@@ -258,11 +258,11 @@ def test_errors_name_the_remedy(posterior, means, states):
         predictor.mean(q, v[0], u)
     with pytest.raises(InvalidInput, match="not finite"):
         predictor.mean(q, v * float("nan"), u)
-    with pytest.raises(InvalidInput, match="another device than the predictor; move all three to cpu"):
+    with pytest.raises(InvalidInput, match=r"device .*cpu"):
         predictor.mean(q.to("meta"), v, u)
     with pytest.raises(InvalidInput, match="covariance='compressed' or 'exact'"):
         predictor(q, v, u)
-    with pytest.raises(InvalidInput, match="covariance is 'dense'; give one of 'auto', 'compressed', 'exact', 'none'"):
+    with pytest.raises(InvalidInput, match=r"'dense'.*'auto', 'compressed', 'exact', 'none'"):
         posterior.predictor(covariance="dense")
     with pytest.raises(InvalidInput, match=r"tolerance is 0\.0 .*give a positive number"):
         posterior.predictor(tolerance=0.0)
@@ -285,7 +285,7 @@ def test_it_takes_what_another_engine_knows(states):
         model = StructuredGP(arm_system(), JointFriction())
         posterior = model.fit(arm_data(30, 0), restarts=1, options=SHORT, engine="inducing")
     check(posterior, states)
-    with pytest.raises(InvalidInput, match=r"InducingPosterior does not have; give covariance='exact'"):
+    with pytest.raises(InvalidInput, match=r"InducingPosterior .*covariance='exact'"):
         posterior.predictor(covariance="compressed")
     predictor = posterior.predictor()
     assert (predictor.kind, predictor.rank, predictor.inflation) == ("exact", None, None)

@@ -81,7 +81,7 @@ def test_along_the_surface_nothing_is_hidden(on_a_table):
 @pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
 def test_two_loads_that_weigh_the_same_everywhere_are_one(data):
     """The origin of the hand lies on the z axis of the fore arm."""
-    with pytest.raises(InvalidInput, match="no data can tell 'payload-1 mass' and 'payload-2 moment-z' apart"):
+    with pytest.raises(InvalidInput, match="'payload-1 mass' and 'payload-2 moment-z'"):
         fit(data, Payload("hand") + Payload("fore"))
 
 
@@ -94,18 +94,18 @@ def test_all_hidden_is_refused(data):
     walls = [Plane(normal, float(tip[axis])) for axis, normal in enumerate(normals)]
     held = data.system.with_contacts([Contact("hand", TIP, wall) for wall in walls])
     rows = with_columns(data, q=q.numpy(), system=held)
-    with pytest.raises(InvalidInput, match=r"^no data can identify 'pan', 'lift', 'bend': the contacts take"):
+    with pytest.raises(InvalidInput, match="'pan', 'lift', 'bend': the contacts"):
         fit(rows, JointFriction())
     with (
         pytest.warns(DataWarning, match="^'moment-y' moves no joint"),
-        pytest.raises(InvalidInput, match="no data can identify 'mass', 'moment-x', 'moment-z': the contacts take"),
+        pytest.raises(InvalidInput, match=r"'mass', 'moment-x', 'moment-z'.*contacts"),
     ):
         fit(rows, Payload("hand"))
 
 
 def test_a_force_that_moves_no_joint_is_pointed_out(data):
     """All axes of the arm lie in one plane with gravity or across it: a mass beside that plane moves nothing."""
-    with pytest.warns(DataWarning, match="^'moment-y' moves no joint at any training row.* data in other postures"):
+    with pytest.warns(DataWarning, match=r"'moment-y' moves no joint.* postures"):
         posterior = fit(data, Payload("hand"))
     moment = posterior.components(data.q, data.v, data.u)["payload"].latents
     assert float(moment.mean[:, 2].abs().max()) < 1e-6
@@ -114,9 +114,9 @@ def test_a_force_that_moves_no_joint_is_pointed_out(data):
 
 
 def test_a_term_that_moves_no_joint_is_refused(data):
-    with pytest.raises(InvalidInput, match=r"^'payload mass', 'payload moment-x', .* exerts no force at any training"):
+    with pytest.raises(InvalidInput, match=r"'payload mass', 'payload moment-x', .*no force"):
         fit(data, JointFriction() + Payload("upper"))
-    with pytest.raises(InvalidInput, match=r"^'mass' exerts no force .* check frame, point and contact"):
+    with pytest.raises(InvalidInput, match=r"'mass' .*frame, point and contact"):
         fit(data, Payload("fore", moments=False))
 
 
@@ -127,7 +127,7 @@ def test_an_input_that_never_changes_is_pointed_out(data):
     (message,) = [str(warning.message) for warning in caught]
     assert message.startswith("u of lift [Nm] never changes in the training rows")
     assert "how 'pan', 'lift', 'bend' depends on it; leave that input out (inputs=...)" in message
-    with pytest.warns(DataWarning, match=r"^u of pan \[Nm\], u of lift \[Nm\], u of bend \[Nm\] never changes"):
+    with pytest.warns(DataWarning, match=r"u of pan \[Nm\], u of lift \[Nm\], u of bend \[Nm\]"):
         fit(with_columns(data, u=np.ones((12, 3))), ToolForces(inputs=("velocity", "u")))
 
 
@@ -158,7 +158,7 @@ def test_a_joint_that_never_moves_teaches_nothing_of_its_own(data, prior, messag
 
 @pytest.mark.parametrize("prior", [ToolForces(), ContactFriction()], ids=["tool", "contact"])
 def test_a_tool_that_never_moves_has_no_friction(data, prior):
-    with pytest.raises(InvalidInput, match=r"depends on .*\[m/s\], which is the same in all 12 training rows \("):
+    with pytest.raises(InvalidInput, match=r"\[m/s\].* all 12 training rows"):
         fit(with_columns(data, v=np.zeros((12, 3))), prior)
 
 
@@ -188,21 +188,21 @@ def test_a_prior_that_does_not_fit_the_system_is_refused_before_any_data(data, p
     "prior", [ToolForces(), ContactFriction(), ToolForces("hand", axes="world", inputs=("load",))], ids=["a", "b", "c"]
 )
 def test_forces_of_a_contact_need_one(prior):
-    with pytest.raises(InvalidInput, match=r"but the system has no contact; give the contact \(--contact\), or use a"):
+    with pytest.raises(InvalidInput, match=r"no contact.*--contact"):
         StructuredGP(arm_system(contacts=0), prior)
     StructuredGP(arm_system(contacts=0), ToolForces("hand", axes="world"))
 
 
 def test_a_weight_needs_gravity(data):
     weightless = data.system.with_robot(Robot.from_urdf_text(data.system.robot.urdf_text, gravity=(0.0, 0.0, 0.0)))
-    with pytest.raises(InvalidInput, match="the robot's gravity is zero; leave it out or set gravity"):
+    with pytest.raises(InvalidInput, match=r"gravity is zero; .*set gravity"):
         StructuredGP(weightless, Payload("hand"))
 
 
 def test_equal_terms_are_refused_and_sums_of_one(data):
-    with pytest.raises(InvalidInput, match="the sum has 'joint-friction' twice, which no data can tell apart"):
+    with pytest.raises(InvalidInput, match="'joint-friction' twice"):
         JointFriction() + ContactFriction() + JointFriction()
-    with pytest.raises(InvalidInput, match="a SumPrior has 1 terms; give two or more, or use the prior itself"):
+    with pytest.raises(InvalidInput, match=r"SumPrior has 1 .*two or more"):
         SumPrior((JointFriction(),))
 
 
@@ -248,7 +248,7 @@ def test_terms_that_differ_are_fitted_without_a_word(data, prior):
 def test_no_residual_at_all_is_refused(data):
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
     exact = with_columns(data, a=data.system.dynamics(*states).acceleration_map().offset.numpy())
-    with pytest.raises(InvalidInput, match="the accelerations equal the mean exactly, so no unknown force"):
+    with pytest.raises(InvalidInput, match="accelerations equal the mean"):
         fit(exact, JointFriction(), noise=Noise(0.1))
 
 

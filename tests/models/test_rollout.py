@@ -9,8 +9,8 @@ from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
 from forcegp.models import StructuredGP
-from forcegp.models.accelerations import PredictedAccelerations
-from forcegp.models.independent_gp import IndependentGP
+from forcegp.models.baselines.independent_gp import IndependentGP
+from forcegp.models.protocol import Posterior
 from forcegp.models.rollout import roll_out
 from forcegp.priors import NoForces
 
@@ -59,7 +59,7 @@ def test_the_black_box_way_through_predict_gives_the_same_motion(data, start, in
     posterior = StructuredGP(arm_system(baumgarte=None), mean="zero").fit(data, points=15, **QUICK)
     q, v, u = start
     direct = posterior.rollout(q, v, u[:, :4], DT, integrator=integrator)
-    through = roll_out(PredictedAccelerations(posterior, None), q, v, u[:, :4], DT, integrator=integrator)
+    through = roll_out(Posterior.accelerations(posterior, None), q, v, u[:, :4], DT, integrator=integrator)
     torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
     torch.testing.assert_close(direct.a, through.a, rtol=1e-9, atol=1e-9)
 
@@ -125,8 +125,10 @@ def test_samples_are_functions_that_obey_the_constraint(posterior, start):
     assert (other.samples.q - drawn.q).abs().max() > 1e-9
     torch.testing.assert_close(rollout.std("v"), drawn.v.std(0))
     low, high = rollout.quantiles((0.0, 1.0), "q")
-    assert (low <= drawn.q.mean(0)).all()
-    assert (drawn.q.mean(0) <= high).all()
+    mean = drawn.q.mean(0)
+    rounding = 8 * torch.finfo(mean.dtype).eps * mean.abs()  # of 5 numbers added; at the start all five are one number
+    assert (low <= mean + rounding).all()
+    assert (mean - rounding <= high).all()
 
 
 def test_first_sampled_accelerations_have_the_predicted_distribution(posterior, start):
@@ -143,7 +145,7 @@ def test_the_independent_model_rolls_out_its_mean_and_functions_of_its_own(data,
     posterior = IndependentGP(arm_system()).fit(data, points=20, options=OptimizerOptions(iterations=15))
     q, v, u = start
     direct = posterior.rollout(q, v, u[:, :4], DT, integrator="rk4")
-    through = roll_out(PredictedAccelerations(posterior, None), q, v, u[:, :4], DT, integrator="rk4")
+    through = roll_out(Posterior.accelerations(posterior, None), q, v, u[:, :4], DT, integrator="rk4")
     torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
     drawn = posterior.rollout(q[0], v[0], u[0, :1], DT, samples=3000, seed=0).samples.a[:, 0]
     expected = posterior.predict(q[0], v[0], u[0, 0])
@@ -159,7 +161,7 @@ def test_the_independent_model_rolls_out_its_mean_and_functions_of_its_own(data,
 def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):
     q, v, u = start
     rollout = StructuredGP(data.system, prior=NoForces()).fit(data, points=10, **QUICK).rollout(q, v, u, DT, samples=2)
-    torch.testing.assert_close(rollout.samples.q, rollout.q.expand(2, -1, -1, -1), rtol=0, atol=0)
+    torch.testing.assert_close(rollout.samples.q, rollout.q.expand(2, -1, -1, -1), rtol=1e-12, atol=1e-12)
 
 
 def test_progress_counts_mean_and_samples(posterior, start):
@@ -201,9 +203,9 @@ def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, st
     with pytest.raises(InvalidInput, match="quantile levels"):
         rollout.quantiles((1.5,))
     with pytest.raises(InvalidInput, match=r"does not know the constraint.*integrator='projected'"):
-        PredictedAccelerations(posterior, Baumgarte(1.0))
+        Posterior.accelerations(posterior, Baumgarte(1.0))
     with pytest.raises(InvalidInput, match="no functions can be drawn from a StructuredPosterior"):
-        roll_out(PredictedAccelerations(posterior, None), q, v, u, DT, samples=1)
+        roll_out(Posterior.accelerations(posterior, None), q, v, u, DT, samples=1)
     free = StructuredGP(arm_system(0)).fit(arm_data(20, 1, arm_system(0)), points=10, **QUICK)
     with pytest.raises(InvalidInput, match="has no contacts; give baumgarte=None"):
         free.rollout(q, v, u, DT, baumgarte=Baumgarte(1.0))
@@ -248,5 +250,5 @@ def test_feedback_sees_the_batch_dimensions_of_the_motions(posterior, start):
 
 def test_feedback_of_another_shape_is_refused(posterior, start):
     q, v, u = start
-    with pytest.raises(InvalidInput, match=r"feedback gave \(3,\) at step 0; it must give a tensor \(2, 3\)"):
+    with pytest.raises(InvalidInput, match=r"feedback .*\(3,\) at step 0.*\(2, 3\)"):
         posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: torch.zeros(3).double())

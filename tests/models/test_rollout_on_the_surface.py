@@ -46,6 +46,7 @@ def test_one_second_under_recorded_torques_stays_on_the_surface_and_near_the_rec
     assert (rollout.q[0, :, :25] - recorded[:, :25]).abs().max() <= 5e-3
 
 
+@pytest.mark.nightly
 def test_five_seconds_from_rest_stay_on_the_surface_also_from_a_millimetre_off(posterior, test):
     q = torch.tensor(test.q[list(STARTS)])
     q = torch.stack([q, a_millimetre_off(posterior, q)])

@@ -104,7 +104,7 @@ def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
     states = [torch.tensor(x[:6]) for x in (test.q, test.v, test.u)]
     flat = posterior.predict(*states)
     batched = posterior.predict(*(x.reshape(2, 3, 3) for x in states))
-    assert torch.equal(batched.mean.reshape(6, 3), flat.mean)
+    torch.testing.assert_close(batched.mean.reshape(6, 3), flat.mean, rtol=1e-10, atol=1e-10)
     assert batched.covariance.shape == (2, 3, 3, 3)
     assert batched.multiplier.mean.shape == (2, 3, 1)
     single = posterior.predict(*(x[0] for x in states))
@@ -239,7 +239,7 @@ def test_wrong_mean_and_contradictory_contacts_are_refused(train):
 
 def test_a_surface_that_no_row_touches_is_refused(train):
     raised = train.system.with_contacts((Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9)),))
-    with pytest.raises(ContactError, match=r"no training point touches .* contact 0 \(frame 'hand'\).* 0\.49 m away"):
+    with pytest.raises(ContactError, match=r"contact 0 \(frame 'hand'\).* 0\.49 m"):
         StructuredGP(raised).fit(train, points=10, restarts=1, options=OptimizerOptions(iterations=1))
 
 

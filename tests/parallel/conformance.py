@@ -37,7 +37,7 @@ class BackendConformance:
         def wait_for_the_gate(index):
             import time
 
-            for _ in range(600):
+            for _ in range(12_000):
                 if index == 0 or gate.exists():
                     return index
                 time.sleep(0.05)
@@ -90,6 +90,7 @@ class WorkersConformance(BackendConformance):
                 found = list(backend.map(tasks.die_once, arguments))
         assert found == ["survived"] * 4
 
+    @pytest.mark.nightly
     @pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
     def test_a_task_that_always_kills_its_worker_ends_in_an_error(self, backend, tmp_path):
         with pytest.raises(BackendError, match=rf"{MOST_DEATHS + 1} times"):

@@ -60,13 +60,13 @@ def _wait_for(address: str, folder: str, count: int, nodes: list[subprocess.Pope
         f"ray.init(address={address!r}, log_to_driver=False, configure_logging=False)\n"
         f"sys.exit(0 if sum(node['Alive'] for node in ray.nodes()) == {count} else 3)"
     )
-    end = time.monotonic() + 60.0
+    end = time.monotonic() + 600.0  # a guard against a hang
     while True:
         if _listens(address) and subprocess.run([sys.executable, "-c", asked], capture_output=True).returncode == 0:
             return
         logs = "\n".join(log.read_text() for log in Path(folder).glob("*.log"))
         assert all(node.poll() is None for node in nodes), f"a node of the cluster ended:\n{logs}"
-        assert time.monotonic() < end, f"the cluster did not start within a minute:\n{logs}"
+        assert time.monotonic() < end, f"the cluster did not start within ten minutes:\n{logs}"
         time.sleep(0.3)
 
 
@@ -87,7 +87,7 @@ def _free_port() -> int:
 
 def end_session(node: subprocess.Popen[bytes]) -> None:
     """End the node and everything that it started: all that is in the session that was made for it."""
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 600.0  # a guard against a hang
     while members := session(node.pid):
         assert time.monotonic() < end, f"processes {members} cannot be ended"
         for member in members:

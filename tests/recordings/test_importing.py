@@ -237,7 +237,7 @@ def test_joints_that_slide_are_in_metres(tmp_path):
     found = imported(write_text(tmp_path / "log.csv", table(data)), tmp_path / "out.h5", mapping)
     assert found.units["q"] == ("rad", "m")
     np.testing.assert_array_equal(found.q[:, 1], data["q"][:, 1] / 1000)
-    with pytest.raises(InvalidInput, match=r"unit of v of joint 'elbow' is rad/s, but the joint slides"):
+    with pytest.raises(InvalidInput, match=r"v of joint 'elbow' is rad/s.*slides"):
         imported(
             tmp_path / "log.csv",
             tmp_path / "x.h5",
@@ -266,7 +266,7 @@ def test_files_side_by_side_are_one_recording(tmp_path):
         np.testing.assert_array_equal(getattr(found, signal), data[signal])
     assert len(found.metadata["import"]["files"]) == 4
     (tmp_path / "run_u.txt").write_text("1.0\n" * 20)
-    with pytest.raises(Exception, match=r"equally many rows; these have: run_time.txt 200, .*run_u.txt 10"):
+    with pytest.raises(Exception, match=r"run_time\.txt 200, .*run_u\.txt 10"):
         import_recordings(paths, tmp_path / "x.h5", mapping)
 
 

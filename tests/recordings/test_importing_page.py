@@ -2,10 +2,9 @@
 
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
+from tests.examples import run_example
 
 from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.import_log import Import
@@ -20,8 +19,8 @@ def page(repository):
 
 def test_the_example_runs(page, tmp_path):
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    described, error = done.stdout.splitlines()
+    printed = run_example(example, tmp_path)
+    described, error = printed.splitlines()
     assert described == "Dataset(375 rows, 2 joints, episodes [0], no system)"
     assert float(error.split()[0]) < 1e-14
 

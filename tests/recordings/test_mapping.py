@@ -205,7 +205,7 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
     assert guessed_time(source, []) == "time"
     both = columns | {f"position_{joint}": columns[f"q_{joint}"] for joint in JOINTS} | {"t": columns["time"]}
     source = open_source(write_text(tmp_path / "both.csv", both))
-    with pytest.raises(InvalidInput, match="q could be q_shoulder, q_elbow or position_shoulder, position_elbow"):
+    with pytest.raises(InvalidInput, match=r"q_shoulder, q_elbow .*position_shoulder, position_elbow"):
         guessed_columns("q", JOINTS, source)
     with pytest.raises(InvalidInput, match="time could be time or t"):
         guessed_time(source, [])

@@ -212,7 +212,7 @@ def test_other_robots_have_code_of_their_own(robot, compiled, folder):
 def test_prepare_compiles_ahead(robot, tmp_path):
     compiled = robot.compile(tmp_path / "new").prepare("gravity_forces", derivatives=True)
     assert len(list((tmp_path / "new").iterdir())) == 2
-    with pytest.raises(InvalidInput, match="no function 'gravity' to compile; there are: mass_matrix, "):
+    with pytest.raises(InvalidInput, match=r"'gravity' .*mass_matrix"):
         compiled.prepare("gravity")
 
 
@@ -270,7 +270,7 @@ def test_what_is_not_supported_says_so(robot, compiled):
 
 def test_no_compiler(robot, tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler -O2")
-    with pytest.raises(CompilerError, match=r"looked for 'no-such-compiler', which .*CC names\); install one"):
+    with pytest.raises(CompilerError, match=r"'no-such-compiler', .*CC .*install"):
         robot.compile(tmp_path).gravity_forces(random(3))
     monkeypatch.delenv("CC")
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -292,7 +292,7 @@ def test_folders_that_others_can_write_to(robot, tmp_path):
     tmp_path.chmod(0o700)
     file = tmp_path / "file"
     file.touch()
-    with pytest.raises(CompilerError, match=r"cannot be made .*; choose another: robot\.compile\(folder=\.\.\.\)"):
+    with pytest.raises(CompilerError, match=r"robot\.compile\(folder=\.\.\.\)"):
         robot.compile(file).gravity_forces(random(3))
 
 
@@ -305,9 +305,7 @@ def test_folders_in_folders_that_others_can_write_to(robot, tmp_path, mode):
     link = tmp_path / "link"
     link.symlink_to(own)
     for folder in (own, link, shared / "new"):
-        with pytest.raises(
-            CompilerError, match=r"shared can be written to by others than you, .*chmod go-w .*shared\)"
-        ):
+        with pytest.raises(CompilerError, match=r"shared .*chmod go-w .*shared\)"):
             robot.compile(folder).gravity_forces(random(3))
     assert not (shared / "new").exists()
     assert list(own.iterdir()) == []
@@ -325,7 +323,7 @@ def test_folders_of_others(robot, tmp_path):
         os.chown(theirs, os.getuid() + 12345, -1)
     except PermissionError:
         pytest.skip("only root may give a folder away")
-    with pytest.raises(CompilerError, match=r"theirs belongs to another user, .*lies in folders of your own"):
+    with pytest.raises(CompilerError, match=r"theirs .*another user"):
         robot.compile(theirs / "mine").gravity_forces(random(3))
 
 
@@ -349,5 +347,5 @@ def test_files_that_are_not_whole_or_not_ones_own(robot, tmp_path):
     other = tmp_path / "other"
     other.mkdir(mode=0o700)
     (other / path.name).write_bytes(b"half a library")
-    with pytest.raises(CompilerError, match=r"cannot be loaded .*; delete it, and it is compiled anew"):
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*delete"):
         robot.compile(other).gravity_forces(random(3))

@@ -250,7 +250,7 @@ def test_one_kinematics_serves_everything(chain):
 
 def test_unknown_names_list_the_valid_ones(tree):
     q = torch.zeros(6, dtype=torch.float64)
-    with pytest.raises(UnknownFrame, match="no frame 'left_fingr' in tree; did you mean 'left_finger'"):
+    with pytest.raises(UnknownFrame, match=r"'left_fingr' .*'left_finger'"):
         tree.frame_pose(q, "left_fingr")
     with pytest.raises(UnknownLink, match="no link 'boddy' in tree; did you mean 'body'"):
         tree.link("boddy")
@@ -265,7 +265,7 @@ def test_unknown_names_list_the_valid_ones(tree):
 
 
 def test_links_without_inertial_parameters_say_why(tree):
-    with pytest.raises(InvalidInput, match="'base' of tree is fixed in the world, so its inertia never enters"):
+    with pytest.raises(InvalidInput, match=r"'base' of tree .*fixed in the world"):
         tree.inertial_parameters("base")
     with pytest.raises(InvalidInput, match="'base' of tree is fixed in the world"):
         tree.mass_matrix(torch.zeros(6, dtype=torch.float64), {"base": torch.zeros(10, dtype=torch.float64)})
@@ -316,9 +316,9 @@ def test_wrong_batches_points_and_parameters(chain):
     zeros = torch.zeros(3, 10, dtype=torch.float64)
     with pytest.raises(InvalidInput, match=r"inertials\['hub'\] \(2,\), inertials\['wrist'\] \(3,\)"):
         chain.mass_matrix(two, {"hub": zeros[:2], "wrist": zeros})
-    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] has shape \(9,\); its last dimension must be 10"):
+    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] .*\(9,\).* 10"):
         chain.mass_matrix(two, {"wrist": torch.zeros(9, dtype=torch.float64)})
-    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] has shape \(2, 10\); a robot holds one set"):
+    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] .*\(2, 10\)"):
         chain.with_inertials({"wrist": torch.zeros(2, 10, dtype=torch.float64)})
     with pytest.raises(InvalidInput, match="inertials is a list; give a mapping from link names"):
         chain.mass_matrix(two, [zeros[0]])

@@ -2,11 +2,10 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from tests.examples import run_example
 from tests.validation.moving_arm import moving_arm
 
 from forcegp.cli.arguments import parse_arguments
@@ -48,8 +47,8 @@ def test_every_model_that_it_names_exists(page):
 def test_its_example_runs(page, tmp_path):
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     moving_arm(1.5, 2).save(tmp_path / "log.h5")
-    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert "Does a Gaussian process on forces beat the identified model?" in done.stdout
-    assert "mine / identified-acceleration" in done.stdout
-    assert "'median'" in done.stdout.splitlines()[-1]
+    printed = run_example(example, tmp_path)
+    assert "Does a Gaussian process on forces beat the identified model?" in printed
+    assert "mine / identified-acceleration" in printed
+    assert "'median'" in printed.splitlines()[-1]
     assert (tmp_path / "mine" / "report.md").exists()

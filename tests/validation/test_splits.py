@@ -96,7 +96,7 @@ def test_imported_episodes_answer_to_the_names_of_their_logs():
     assert split_named("episodes:143339", data)[0].held_out == (Stretch(0),)
     assert split_named("episodes:143524", data)[0].held_out == (Stretch(1), Stretch(2))
     assert "run-143339.csv" in split_named("episodes:0", data)[0].words
-    with pytest.raises(InvalidInput, match=r"several logs are called so \(run-143339.csv, run-143524.csv\)"):
+    with pytest.raises(InvalidInput, match=r"run-143339\.csv, run-143524\.csv"):
         split_named("episodes:run", data)
 
 

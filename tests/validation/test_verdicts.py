@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from forcegp.validation.verdicts import against_baseline, best_of, paired, verdicts
+from forcegp.validation.paired_tests import against_baseline, best_of, paired, verdicts
 
 
 @pytest.mark.parametrize("score", ["nlpd", "force_rms"])

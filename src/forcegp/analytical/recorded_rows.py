@@ -102,7 +102,7 @@ def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce
         frames = ", ".join(contact.frame for contact in system.contacts)
         raise InvalidInput(
             f"the robot touches something with {frames}, and contact forces are not measured; identify it from a "
-            "motion in the air (system.with_contacts([])), or use StructuredGP.fit(learn=...)."
+            "motion in the air (system.with_contacts([])), or use StructuredGP.identify."
         )
     if not any(type(force) is RigidBodyBias for force in system.known_forces):
         raise InvalidInput("the known forces lack RigidBodyBias(); list it, since its parameters are estimated.")

@@ -11,8 +11,8 @@ import scipy.linalg
 import torch
 from jaxtyping import Float, Int
 
-from forcegp.analytical.base_parameters import BaseParameters
 from forcegp.analytical.bodies import BodyCoordinates, FreeBodies
+from forcegp.analytical.identifiability import BaseParameters
 from forcegp.analytical.identified_robot import with_bodies, with_joint_dynamics
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import Fit, correlation_time

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+from rich.table import Table
+from rich.text import Text
 from tyro.conf import Positional, arg
 
+import forcegp
+import forcegp.evaluation
 from forcegp.atomic_files import atomic_folder, write_json
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.preparation_options import CutoffOptions
-from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import DatasetError
-
-if TYPE_CHECKING:
-    from forcegp.checks import CheckReport
 
 KIND = "forcegp check"
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
@@ -36,7 +38,7 @@ class Check(CutoffOptions, RobotOptions):
       forcegp check log.h5 --robot arm.urdf --plots look --strict
     """
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to check (HDF5)."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Filter for the comparison of q, v, a and u. auto: where the spectrum shows that motion ends and noise begins."""
@@ -55,15 +57,13 @@ class Check(CutoffOptions, RobotOptions):
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
         if self.plots is not None:
             require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
-        from forcegp.checks import check
-        from forcegp.data import Dataset
 
         preparation = self._preparation()
-        dataset = Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.data)
         needs_robot = self.robot is not None or self.identified is not None or dataset.system is not None
         system = self.chosen_system(dataset, self.data) if needs_robot else None
         with terminal.progress("checking"):
-            report = check(dataset, system, preparation=preparation)
+            report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
             self._draw(terminal, report, content)
@@ -76,24 +76,18 @@ class Check(CutoffOptions, RobotOptions):
             )
         return content
 
-    def _draw(self, terminal: Terminal, report: CheckReport, content: Mapping[str, Any]) -> None:
-        from forcegp.evaluation.check_plot import check_figure
-        from forcegp.evaluation.figure_style import save_figure
-
+    def _draw(self, terminal: Terminal, report: forcegp.CheckReport, content: Mapping[str, Any]) -> None:
         assert self.plots is not None
         with atomic_folder(self.plots) as folder:
             folder.mkdir()
-            save_figure(check_figure(report), folder / "check.png")
+            forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
             write_json(folder / "check.json", content)
             write_config(folder, KIND, {"data": str(self.data)})
         terminal.note(f"plots: {self.plots}")
 
 
-def _shown(data: Path, report: CheckReport) -> list[Any]:
+def _shown(data: Path, report: forcegp.CheckReport) -> list[Any]:
     """One paragraph per finding, worst first, and the numbers of every joint."""
-    from rich.table import Table
-    from rich.text import Text
-
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
@@ -110,9 +104,7 @@ def _shown(data: Path, report: CheckReport) -> list[Any]:
     return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
 
 
-def _numbers(report: CheckReport, content: Mapping[str, Any]) -> Any:
-    from forcegp.cli.tables import NONE, columns
-
+def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:
     def shown(value: float | None, pattern: str = "{:.3g}") -> str:
         return NONE if value is None else pattern.format(value)
 
@@ -127,6 +119,6 @@ def _numbers(report: CheckReport, content: Mapping[str, Any]) -> Any:
         ]
         for each in content["joints"]
     ]
-    units = report.evidence.log.units
+    units = report.inputs.log.units
     unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
     return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)

@@ -8,24 +8,24 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
+import forcegp
+import forcegp.evaluation
+import forcegp.inference
+import forcegp.models
 from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.evaluate import draw, score
 from forcegp.cli.fit import fit, fit_summary
 from forcegp.cli.output_folders import holds_only_own_files, require_free_folder, write_config
 from forcegp.cli.simulate import simulate
+from forcegp.cli.tables import NONE, NORMAL_FORCES, columns, multiplier_scores, nats, number, percent
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.experiments import published
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.evaluation import Evaluation
-    from forcegp.models import StructuredPosterior
 
 KIND = "forcegp demo"
 NOISE = 0.1  # rad/s^2, as in the paper
@@ -95,7 +95,7 @@ class Demo(Command):
     def _seeds(self) -> dict[str, int]:
         return {"train": self.seed, "test": self.seed + 1}
 
-    def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> Dataset:
+    def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> forcegp.Dataset:
         start = time.monotonic()
         dataset = simulate(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
         dataset.save(folder / f"{name}.h5")
@@ -103,35 +103,32 @@ class Demo(Command):
         return dataset
 
     def _fitted(
-        self, terminal: Terminal, run: Path, train: Dataset, name: str, mean: Any
-    ) -> tuple[StructuredPosterior, float]:
+        self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: Any
+    ) -> tuple[forcegp.models.StructuredPosterior, float]:
         """The fitted model, and the seconds that the fit alone took."""
-        from forcegp.inference import OptimizerOptions
-        from forcegp.models import StructuredGP, save_posterior
-
         assert train.system is not None
         start = time.monotonic()
         posterior = fit(
             terminal,
-            StructuredGP(train.system, mean=mean),
+            forcegp.StructuredGP(train.system, mean=mean),
             train,
             name=f"fitting {name}",
             points=min(self.points, len(train)),
             restarts=None,
             seed=0,
             jobs=self.jobs,
-            options=OptimizerOptions(iterations=self.iterations),
+            options=forcegp.inference.OptimizerOptions(iterations=self.iterations),
         )
         seconds = time.monotonic() - start
-        save_posterior(posterior, run)
+        forcegp.save_posterior(posterior, run)
         iterations = len(posterior.result.history) - 1
         terminal.note(f"fitted {name}: {iterations} iterations ({seconds:.1f} s)")
         return posterior, seconds
 
     def _results(
         self,
-        models: Mapping[str, StructuredPosterior],
-        evaluations: Mapping[str, Evaluation],
+        models: Mapping[str, forcegp.models.StructuredPosterior],
+        evaluations: Mapping[str, forcegp.Evaluation],
         fit_seconds: Mapping[str, float],
         wall_seconds: float,
     ) -> dict[str, Any]:
@@ -153,9 +150,7 @@ class Demo(Command):
             "wall_seconds": wall_seconds,
         }
 
-    def _show(self, terminal: Terminal, evaluations: Mapping[str, Evaluation], wall_seconds: float) -> None:
-        from forcegp.cli.tables import NONE, columns, nats, number, percent
-
+    def _show(self, terminal: Terminal, evaluations: Mapping[str, forcegp.Evaluation], wall_seconds: float) -> None:
         header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
         rows = []
         for name, evaluation in evaluations.items():
@@ -175,19 +170,20 @@ class Demo(Command):
         )
 
 
-def _multiplier_line(evaluations: Mapping[str, Evaluation]) -> str:
-    from forcegp.cli.tables import NORMAL_FORCES, multiplier_scores
-
+def _multiplier_line(evaluations: Mapping[str, forcegp.Evaluation]) -> str:
     scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
     return f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
 
 
-def _draw_all(terminal: Terminal, folder: Path, models: Mapping[str, StructuredPosterior], test: Dataset) -> list[str]:
-    from forcegp.evaluation import likelihood_figure, save_figure
-
+def _draw_all(
+    terminal: Terminal,
+    folder: Path,
+    models: Mapping[str, forcegp.models.StructuredPosterior],
+    test: forcegp.Dataset,
+) -> list[str]:
     pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-    save_figure(
-        likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
+    forcegp.evaluation.save_figure(
+        forcegp.evaluation.likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
         folder / "likelihood.png",
     )
     return pictures

@@ -5,39 +5,37 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from rich.text import Text
+
+import forcegp
+import forcegp.analytical
 from forcegp.atomic_files import atomic_folder
 from forcegp.cli.friction_laws import friction_laws
+from forcegp.cli.identify_options import IdentifyOptions
 from forcegp.cli.output_folders import require_free_folder, write_config
-from forcegp.cli.robot_choice import SYSTEM_FILE
+from forcegp.cli.robot_options import SYSTEM_FILE
+from forcegp.cli.tables import columns
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput, NonPhysicalInertia
-
-if TYPE_CHECKING:
-    from forcegp.analytical import AnalyticalIdentification
-    from forcegp.cli.identify import Identify
-    from forcegp.mechanics import MechanicalSystem
 
 INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 """Names of models on the command line, and what `identify_analytical` calls their inertias."""
 
 
-def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> Mapping[str, Any]:
+def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: str) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
     _refuse_what_does_nothing(command)
     friction = friction_laws(command.friction)
     require_free_folder(command.out, kind=kind, overwrite=command.overwrite)
-    from forcegp.analytical import identify_analytical, motion_residuals, residual_scores
-    from forcegp.analytical.least_squares import ROUNDS
-    from forcegp.data import Dataset
 
     begin = time.process_time()
-    dataset = Dataset.load(command.data)
-    test = None if command.test is None else Dataset.load(command.test)
+    dataset = forcegp.Dataset.load(command.data)
+    test = None if command.test is None else forcegp.Dataset.load(command.test)
     system = command._system(dataset)
     with terminal.progress("identifying", may_end_early=True) as report:
-        found = identify_analytical(
+        found = forcegp.identify_analytical(
             system,
             dataset,
             friction=friction,
@@ -46,12 +44,14 @@ def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> 
             likelihood=command.likelihood,
             prior_strength=1.0 if command.prior_strength is None else command.prior_strength,
             robust=command.robust,
-            progress=lambda done, rms: report(min(done, ROUNDS), ROUNDS, f"rms of the residual {rms:.3g}"),
+            progress=lambda done, rms: report(
+                min(done, forcegp.analytical.ROUNDS), forcegp.analytical.ROUNDS, f"rms of the residual {rms:.3g}"
+            ),
         )
     content = {"model": command.model, **found.to_dict(), "cpu_seconds": time.process_time() - begin}
     for name, rows in (("training", dataset), ("test", test)):
         if rows is not None:
-            before = residual_scores(*motion_residuals(system, rows), rows)
+            before = forcegp.analytical.residual_scores(*forcegp.analytical.motion_residuals(system, rows), rows)
             content[name] = {"before": before, "after": found.scores(rows)}
     try:
         identified, why_not = found.system, None
@@ -71,7 +71,7 @@ def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> 
     return {"run": str(command.out), "data": str(command.data), **content}
 
 
-def _refuse_what_does_nothing(command: Identify) -> None:
+def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
     """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
     given = {"learn": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
     changed = [name for name, default in given.items() if getattr(command, name) != default]
@@ -84,12 +84,11 @@ def _refuse_what_does_nothing(command: Identify) -> None:
 
 
 def _report(
-    command: Identify, found: AnalyticalIdentification, content: Mapping[str, Any], identified: MechanicalSystem | None
+    command: IdentifyOptions,
+    found: forcegp.AnalyticalIdentification,
+    content: Mapping[str, Any],
+    identified: forcegp.MechanicalSystem | None,
 ) -> list[Any]:
-    from rich.text import Text
-
-    from forcegp.cli.tables import columns
-
     joints = found.given.robot.joint_names
     tables: list[Any] = []
     for name in ("training", "test"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,6 @@ def holds_only_own_files(path: Path, kind: str) -> bool:
 def write_config(folder: Path, kind: str, content: Mapping[str, Any]) -> None:
     """`config.json`: what is needed to do it again, with versions and the list of files, which must be there by now."""
     files = sorted([CONFIG, *(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())])
-    from importlib.metadata import version
 
     versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
     write_json(folder / CONFIG, {"kind": kind, **content, "versions": versions, "files": files})

@@ -8,16 +8,15 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import forcegp
+import forcegp.simulation
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.terminal import Terminal
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,11 +95,9 @@ class Simulate(Command):
         return fields
 
 
-def simulate(terminal: Terminal, scenario: str, **options: Any) -> Dataset:
+def simulate(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
-    from forcegp.simulation import SCENARIOS
-
-    chosen = SCENARIOS[scenario]
+    chosen = forcegp.simulation.SCENARIOS[scenario]
     config = chosen.config(**options)
     _import_silently("pybullet")
     with terminal.progress(f"simulating seed {config.seed}") as report:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import forcegp
+import forcegp.models
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.models import Posterior
 
 SystemChoice = Literal["model", "data"]
 
 
-def carried_over(terminal: Terminal, posterior: Posterior, dataset: Dataset, choice: SystemChoice) -> Posterior:
+def carried_over(
+    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, choice: SystemChoice
+) -> forcegp.models.Posterior:
     """The posterior for the chosen system.
 
     A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data,

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from forcegp.evaluation import Evaluation, ForceScore, ForceScores
-
+import forcegp
+import forcegp.evaluation
 
 NONE = "–"
 NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
@@ -60,7 +58,7 @@ def columns(
     return table
 
 
-def evaluation_table(title: str, evaluation: Evaluation) -> Table:
+def evaluation_table(title: str, evaluation: forcegp.Evaluation) -> Table:
     """One line per joint and their mean."""
     header = ["joint", "MAE", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "MAE, known\nphysics"]
     formats = {
@@ -80,13 +78,13 @@ def evaluation_table(title: str, evaluation: Evaluation) -> Table:
     return columns(title, header, rows, last=["mean (NLPD: joint)", *means])
 
 
-def multiplier_scores(evaluation: Evaluation) -> str:
+def multiplier_scores(evaluation: forcegp.Evaluation) -> str:
     """`MAE 1.2345 N, 90.1 % in the 95 % band`, against the true multipliers."""
     inside = percent(evaluation.multiplier_coverage_95)
     return f"MAE {number(evaluation.multiplier_mae)} N, {inside} in the 95 % band"
 
 
-def force_facts(scores: ForceScores, normal_forces: str) -> dict[str, str]:
+def force_facts(scores: forcegp.evaluation.ForceScores, normal_forces: str) -> dict[str, str]:
     """One line per force that the truth knows: its errors relative to its size, and whether the intervals hold.
 
     `normal_forces` says what the multiplier rests on.
@@ -99,7 +97,7 @@ def force_facts(scores: ForceScores, normal_forces: str) -> dict[str, str]:
     return values
 
 
-def _force_scores(score: ForceScore) -> str:
+def _force_scores(score: forcegp.evaluation.ForceScore) -> str:
     """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
     if score.relative_rmse is None:
         error = f"{number(score.rmse)} (the true force is zero)"

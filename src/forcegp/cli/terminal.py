@@ -11,10 +11,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
@@ -47,15 +47,11 @@ class Terminal:
     @cached_property
     def out(self) -> Console:
         """What the command found."""
-        from rich.console import Console
-
         return Console(highlight=False, soft_wrap=False)
 
     @cached_property
     def err(self) -> Console:
         """What happens meanwhile."""
-        from rich.console import Console
-
         return Console(stderr=True, highlight=False, soft_wrap=True)
 
     def __enter__(self) -> Terminal:
@@ -108,8 +104,6 @@ class Terminal:
             yield _PlainProgress(self, what, may_end_early).report
 
     def _bar(self, what: str, may_end_early: bool) -> Iterator[Report]:
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
         columns = (
             SpinnerColumn(),
             TextColumn("{task.description}"),

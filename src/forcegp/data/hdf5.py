@@ -14,6 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+import forcegp.mechanics
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
 from forcegp.errors import FileFormatError, ForceGPError
@@ -174,9 +175,8 @@ def _json(path: Path, name: str, text: str) -> dict[str, Any]:
 
 
 def _system(path: Path, text: str) -> Any:
-    from forcegp.mechanics import MechanicalSystem  # brings torch, which a file without a robot does not need
 
     try:
-        return MechanicalSystem.from_json(text)
+        return forcegp.mechanics.MechanicalSystem.from_json(text)
     except ForceGPError as error:
         raise FileFormatError(f"{path}: its robot or contacts cannot be used: {error}") from error

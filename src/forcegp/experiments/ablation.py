@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments import published
@@ -14,9 +15,6 @@ from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdo
 from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 OURS = "ours"
 FILTERED_MODELS = ("s-gp-mean",)

@@ -9,6 +9,7 @@ from typing import Any
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job, JobStore
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
 SIMULATION_COST = 0.1
@@ -37,8 +38,6 @@ def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float,
 
 def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Simulate both trajectories and keep them. Raises InvalidInput where more rows are wanted than there are."""
-    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-
     everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
     if spec["rows"] > len(everything):
         raise InvalidInput(

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.plots.style import QUIET, SERIES, SMALL, new_figure, quiet
 from forcegp.experiments import published
 from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_tables import only_test, plain_ticks, score_table
 from forcegp.jobs import JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PRIORS = {
     "joint forces on (q, v, u), the paper's": "joint",
@@ -42,8 +41,6 @@ class DataEfficiency(ForceExperiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.evaluation.figure_style import QUIET, SERIES, SMALL, new_figure, quiet
-
         figure = new_figure(8.6, 3.8)
         panels = figure.subplots(1, 2)
         for axes, score, heading in zip(

@@ -6,18 +6,17 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
+
+from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.spreads import markdown_table as markdown_table
-from forcegp.evaluation.spreads import number as number
-from forcegp.evaluation.spreads import shown as shown
-from forcegp.evaluation.spreads import spread as spread
+from forcegp.evaluation.summary_statistics import markdown_table as markdown_table
+from forcegp.evaluation.summary_statistics import number as number
+from forcegp.evaluation.summary_statistics import shown as shown
+from forcegp.evaluation.summary_statistics import spread as spread
 from forcegp.experiments.data import data_job
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Row = dict[str, str | int | float | None]
 

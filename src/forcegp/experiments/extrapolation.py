@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
 from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
+from forcegp.experiments.plots.extrapolation import extrapolation_figure
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
 TARGETS = {
@@ -100,8 +99,6 @@ class Extrapolation(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.experiments.extrapolation_plot import extrapolation_figure
-
         return {"extrapolation": extrapolation_figure(summary)}
 
     @override

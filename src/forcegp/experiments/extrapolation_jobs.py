@@ -12,9 +12,11 @@ from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
+from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.experiments.fits import MODEL, fitted, search_report
 from forcegp.jobs import JobStore
+from forcegp.models import save_posterior
 
 TRAIN_X, TEST_X = 0.0, 0.1
 """Training rows have their tool at x below the first, test rows above the second [m]."""
@@ -57,9 +59,6 @@ def split_by_region(train: Dataset, test: Dataset, region: str) -> dict[str, Dat
 
 def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Fit one model in the region and score it inside and outside."""
-    from forcegp.evaluation import evaluate
-    from forcegp.models import save_posterior
-
     everything = training_rows(results, spec["data"], None)
     parts = split_by_region(everything, scored_rows(results, spec["data"]), spec["region"])
     train = parts["train"]

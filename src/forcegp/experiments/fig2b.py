@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments import published
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
 from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
+from forcegp.experiments.plots.learning_curves import learning_curves_figure
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
 HEADINGS = {
@@ -103,8 +102,6 @@ class Fig2b(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.experiments.learning_curves import learning_curves_figure
-
         return {"fig2b": learning_curves_figure(summary)}
 
     @override

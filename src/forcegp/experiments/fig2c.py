@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.fits import fit_cost
+from forcegp.experiments.plots.estimation import estimation_figure
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 AXES = ("com.x", "com.y", "com.z")
 
@@ -91,8 +90,6 @@ class Fig2c(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.experiments.estimation_plot import estimation_figure
-
         return {"fig2c": estimation_figure(summary)}
 
     @override

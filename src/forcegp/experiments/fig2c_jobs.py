@@ -78,9 +78,7 @@ def _fitted(train: Dataset, spec: Mapping[str, Any]) -> StructuredPosterior:
     system = wrong_system(train.system)
     options = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"], keep_iterates=True)
     learn = system.robot.link(TOOL_LINK).inertial("mass", "com")
-    return StructuredGP(system, PRIORS[spec["model"]], spec["mean"]).fit(
-        train, restarts=1, options=options, learn=learn
-    )
+    return StructuredGP(system, PRIORS[spec["model"]], spec["mean"]).identify(train, learn, restarts=1, options=options)
 
 
 def _values(system: MechanicalSystem | None) -> dict[str, float]:

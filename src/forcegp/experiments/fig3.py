@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
+from forcegp.evaluation.metrics import interval_coverage
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number
 from forcegp.experiments.fits import MODEL, FitSettings, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.plots.prediction_window import prediction_window_figure
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.models import load_posterior
 
 ARRAYS = "prediction.npz"
 
@@ -65,8 +66,6 @@ class Fig3(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.experiments.prediction_window_plot import prediction_window_figure
-
         arrays = {}
         for model in self.models:
             with np.load(results.place(self._name(model)) / ARRAYS) as stored:
@@ -95,9 +94,6 @@ class Fig3(Experiment):
 
 def predict(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Predict every row of the window and keep mean, deviations, truth and measurement."""
-    from forcegp.evaluation.metrics import interval_coverage
-    from forcegp.models import load_posterior
-
     posterior = load_posterior(results.place(spec["fit"]) / MODEL)
     trajectory = test_trajectory(results, spec["data"])
     elapsed = trajectory.time - trajectory.time[0]

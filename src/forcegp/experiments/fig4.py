@@ -6,19 +6,18 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, spread
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.plots.rollouts import rollouts_figure
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 BLACK_BOXES = ("gp", "neural-network")
 WITHOUT_CONSTRAINT = ("none", "projected")
@@ -117,8 +116,6 @@ class Fig4(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.experiments.rollouts_plot import rollouts_figure
-
         figures = {}
         for control in CONTROLS:
             arrays: dict[str, dict[str, dict[str, np.ndarray]]] = {variant: {} for variant in VARIANTS}

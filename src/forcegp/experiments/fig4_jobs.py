@@ -13,12 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.evaluation.recorded_motions import recorded_motions
+from forcegp.evaluation.recorded_segments import recorded_motions
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.fits import MODEL
 from forcegp.integration import Feedback, SymplecticEuler, integrate
 from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte, MechanicalSystem
+from forcegp.models import load_posterior
 
 BAUMGARTE = Baumgarte(10.0, 1.0)
 """As in the paper, K = 100 and D = 20, and as in the simulation itself."""
@@ -44,8 +45,6 @@ VARIANTS = {
 
 def roll(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Roll a fitted model out from evenly spaced rows of its test trajectory."""
-    from forcegp.models import load_posterior
-
     posterior = load_posterior(results.place(spec["fit"]) / MODEL)
     recorded = _Recorded(test_trajectory(results, spec["data"]), spec["starts"], max(spec["seconds"]))
     q0 = _displaced(posterior.system, recorded.q[:, 0]) if spec["variant"] == "off-surface" else recorded.q[:, 0]

@@ -10,9 +10,12 @@ from typing import Any
 from torch import Tensor
 
 from forcegp.data import Dataset
+from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.experiments.model_names import MODELS, NETWORKS
+from forcegp.inference import OptimizerOptions
 from forcegp.jobs import Job, JobStore
+from forcegp.models import load_posterior, save_posterior
 
 MODEL = "model"
 """The folder of the fitted model inside its job."""
@@ -88,9 +91,6 @@ def fit_cost(model: str, points: int, settings: Mapping[str, Any]) -> float:
 
 def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Fit, keep the model, and score it on the test trajectory of the same data job."""
-    from forcegp.evaluation import evaluate
-    from forcegp.models import load_posterior, save_posterior
-
     train = training_rows(results, spec["data"], spec["points"])
     start = None
     if spec["start"] is not None:
@@ -103,8 +103,6 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
 
 def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] | None = None) -> Any:
     """The model of `spec` fitted to these rows; "restarts", "iterations" and "tolerance" where its search has them."""
-    from forcegp.inference import OptimizerOptions
-
     kind = MODELS[spec["model"]]
     assert train.system is not None
     model = kind.make(train.system)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.experiments.experiment import DataSettings, Experiment, Row, spread
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.force_scenarios import SCENARIOS
 from forcegp.jobs import Job, JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TASKS = "forcegp.experiments.force_jobs"
 TEST_SEED = 1000

@@ -11,9 +11,15 @@ import torch
 
 from forcegp.data import Dataset, farthest_rows, rows_in_contact
 from forcegp.errors import InvalidInput
+from forcegp.evaluation import curve_coverage, evaluate, force_scores
 from forcegp.experiments.extrapolation_jobs import TEST_X, TRAIN_X, tool_motion
 from forcegp.experiments.fits import MODEL, search_report
+from forcegp.experiments.true_curves import true_curves
+from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
+from forcegp.models import IndependentGP, StructuredGP, save_posterior
+from forcegp.priors import named_prior
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 FILE = "data.h5"
 BLACK_BOX, KNOWN_PHYSICS = "independent-gp", "none"
@@ -25,8 +31,6 @@ def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
 
     Where contacts can open, training rows are those that the data show to be in contact.
     """
-    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-
     config = KukaSurfaceConfig(seconds=spec["seconds"], seed=spec["seed"], **spec["scenario"])
     everything = simulate_kuka_surface(config)
     told: dict[str, Any] = {"rows_available": len(everything)}
@@ -56,8 +60,6 @@ def load(results: JobStore, name: str) -> Dataset:
 
 def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Fit to the first `points` training rows and score on every test trajectory, under the contacts of its own."""
-    from forcegp.models import save_posterior
-
     train = load(results, spec["train"])
     if spec["region"]:
         train = train.rows(tool_motion(train)[0] < TRAIN_X)
@@ -78,10 +80,6 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
 
 def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
     """The model of `spec` fitted to these rows."""
-    from forcegp.inference import OptimizerOptions
-    from forcegp.models import IndependentGP, StructuredGP
-    from forcegp.priors import named_prior
-
     system = train.system
     assert system is not None, "simulated data carry their system"
     options = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
@@ -93,8 +91,6 @@ def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
 
 def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     """Errors of the acceleration and, where the model speaks of them, of the forces; plain JSON values."""
-    from forcegp.evaluation import evaluate
-
     assert test.system is not None, "simulated data carry their system"
     if posterior.speaks_of_forces:
         posterior = posterior.with_system(test.system)
@@ -117,8 +113,6 @@ def _forces(posterior: Any, test: Dataset) -> dict[str, Any]:
 
     Without contacts there is nothing about lambda; its coverage is None where the model has no uncertainty of it.
     """
-    from forcegp.evaluation import force_scores
-
     known = force_scores(posterior, test)
     out: dict[str, Any] = {}
     if known.multiplier is not None:
@@ -133,9 +127,6 @@ def _forces(posterior: Any, test: Dataset) -> dict[str, Any]:
 
 def curve_scores(posterior: Any) -> dict[str, Any]:
     """Share of the visited range where the 95 % band of a friction curve holds the true law, per curve."""
-    from forcegp.evaluation import curve_coverage
-    from forcegp.experiments.true_curves import true_curves
-
     out = {}
     for latent, law in true_curves(posterior).items():
         curve = posterior.curve(latent)

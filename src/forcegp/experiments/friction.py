@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation import friction_curves_figure, normal_force_figure
 from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
 from forcegp.experiments.force_jobs import MODEL, load
 from forcegp.experiments.force_scenarios import LABELS
 from forcegp.experiments.force_tables import dots_figure, only_test, score_table
 from forcegp.jobs import JobStore
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.models import load_posterior
 
 TOOL = {
     "joint forces (the paper's)": "joint",
@@ -59,9 +59,6 @@ class Friction(ForceExperiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        from forcegp.evaluation import friction_curves_figure, normal_force_figure
-        from forcegp.models import load_posterior
-
         groups = {
             LABELS[scenario]: {
                 trial["label"]: only_test(trial) for trial in summary["trials"] if trial["scenario"] == scenario

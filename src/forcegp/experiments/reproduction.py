@@ -7,7 +7,9 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
@@ -18,10 +20,6 @@ from forcegp.experiments.pages import page_of
 from forcegp.experiments.report import report
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 KIND = "forcegp reproduce"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.models.components import term_slices
+from forcegp.models.structured.components import term_slices
 from forcegp.priors import ContactFriction, JointFriction
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.friction_laws import DryFriction, ViscousFriction

@@ -42,6 +42,10 @@ JITTER = 1e-10
 """Added to the kernel matrices of inducing points, relative to their mean diagonal, where hyper-parameters move away
 from those that the points were chosen at."""
 
+MOST_ROUNDING = 1e-3
+"""Of the prior variance, by which rounding may take what inducing points leave out below 0: `JITTER` and rounding, both
+magnified by the condition number of at most 1 / JITTER, stay far below."""
+
 
 @dataclass(frozen=True, eq=False)
 class InducingPosterior(LatentPosterior):
@@ -120,7 +124,7 @@ def inducing_pivots(
     share = tolerance / max(1, C.shape[-1]) * len(candidates)
     return [
         candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share).indices]
-        for c, (kernel, z) in enumerate(zip(kernels, features, strict=True))
+        for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
     ]
 
 
@@ -136,7 +140,8 @@ def collapsed_bound(
     """An upper bound of `negative_log_likelihood`, differentiable in every argument but the inducing `points`.
 
     The kernels are taken at `parameters`. Time O(N P^2) for P points in all, memory O(N C + P^2): blocks of rows are
-    computed again in the backward pass. Raises NumericalError when a covariance cannot be factorised.
+    computed again in the backward pass. Raises NumericalError when a covariance cannot be factorised, or where rounding
+    explains more than all of the prior variance, as at length scales of 1e-10: the sum would be no bound there.
     """
     count, outputs, _ = W.shape
     W_white, y_white, log_noise = whiten(W, residual, noise)
@@ -144,14 +149,17 @@ def collapsed_bound(
     total = sum(len(lower) for lower in lowers)
     height = max(1, CHUNK_BYTES // (8 * max(1, total) * 4))
     products = W.new_zeros(total, total)
-    right, left_out = W.new_zeros(total), W.new_zeros(())
+    right, left_out, prior = W.new_zeros(total), W.new_zeros(()), W.new_zeros(())
     for start in range(0, count, height):
         rows = slice(start, start + height)
         block = [z[rows] for z in features]
         statistics = checkpoint(
             _statistics, kernels, parameters, points, lowers, W_white[rows], y_white[rows], block, use_reentrant=False
         )
-        products, right, left_out = (a + b for a, b in zip((products, right, left_out), statistics, strict=True))
+        so_far = products, right, left_out, prior
+        products, right, left_out, prior = (a + b for a, b in zip(so_far, statistics, strict=True))
+    if bool(left_out < -MOST_ROUNDING * prior):
+        raise NumericalError("rounding hides the covariance of the inducing points; take other parameters")
     B = _lower(products + torch.eye(total, dtype=W.dtype, device=W.device), jitter=0.0)
     explained = torch.linalg.solve_triangular(B, right[:, None], upper=False).square().sum()
     quadratic = y_white.square().sum() - explained
@@ -167,17 +175,16 @@ def _statistics(
     W: Float[Tensor, "n D C"],
     y: Float[Tensor, "n D"],
     features: Sequence[Tensor],
-) -> tuple[Float[Tensor, "P P"], Float[Tensor, " P"], Float[Tensor, ""]]:
-    """Phi^T Phi, Phi^T y and what is left out of the prior variance, of some rows."""
+) -> tuple[Float[Tensor, "P P"], Float[Tensor, " P"], Float[Tensor, ""], Float[Tensor, ""]]:
+    """Phi^T Phi, Phi^T y, what is left out of the prior variance, and that variance, of some rows."""
     crosses = kernels.crosses(parameters, points, features)
     phi = [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(lowers, crosses, strict=True)]
     diagonals = kernels.diagonals(parameters, features)
     relevance = W.square().sum(1)
-    left_out = sum(
-        (relevance[:, c] * (k - f.square().sum(0))).sum() for c, (k, f) in enumerate(zip(diagonals, phi, strict=True))
-    )
+    prior = torch.stack([relevance[:, c] @ k for c, k in enumerate(diagonals)]).sum()
+    shares = (relevance[:, c] @ (k - f.square().sum(0)) for c, (k, f) in enumerate(zip(diagonals, phi, strict=True)))
     wide = torch.cat([f[:, None, :] * W[:, :, c].mT for c, f in enumerate(phi)]).flatten(1)
-    return wide @ wide.mT, wide @ y.mT.reshape(-1), torch.as_tensor(left_out)
+    return wide @ wide.mT, wide @ y.mT.reshape(-1), sum(shares, torch.zeros_like(prior)), prior
 
 
 def _lower(matrix: Float[Tensor, "n n"], jitter: float = JITTER) -> Float[Tensor, "n n"]:

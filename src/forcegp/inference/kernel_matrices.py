@@ -1,4 +1,4 @@
-"""Dense kernel matrices of GPyTorch kernels, exact and lean: sums and products are taken apart into their leaves.
+"""Dense kernel matrices of GPyTorch kernels, exact and lean: sums and products are taken apart into their leaves, once.
 
 GPyTorch's own sums are not used: it adds a low-rank matrix (a linear kernel) to a dense one through a root
 decomposition of the latter, which needs jitter where that is singular and is approximate where it is large. Its lazy
@@ -19,7 +19,9 @@ both differentiable in z and in the kernel's parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial, reduce
 from operator import add, mul
 from typing import cast
@@ -40,6 +42,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
+from typing_extensions import override
 
 PointMap = Callable[[Tensor], Tensor]
 """Features (n, d) -> something (n, _) of every point."""
@@ -60,35 +63,234 @@ KNOWN = (
 """GPyTorch classes whose formulas are evaluated here; subclasses may have other formulas and are called."""
 
 
-def dense_matrix(
-    kernel: Kernel, z: Float[Tensor, "n d"], other: Float[Tensor, "N d"] | None = None
-) -> Float[Tensor, "n _"]:
-    """k(z_i, other_j) (n, N); without `other` k(z_i, z_j) (n, n), of which there are first derivatives only."""
+class DenseKernel(ABC):
+    """A kernel that is taken apart: its matrices, with the parameters that its modules hold at the call.
+
+    Made once for a kernel by `taken_apart`, for the checks of what a kernel is cost more than small matrices do.
+    """
+
+    @abstractmethod
+    def matrix(self, z: Float[Tensor, "n d"]) -> Float[Tensor, "n n"]:
+        """k(z_i, z_j), of which there are first derivatives only."""
+
+    @abstractmethod
+    def cross(self, z: Float[Tensor, "n d"], other: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
+        """k(z_i, other_j)."""
+
+    @abstractmethod
+    def diagonal(self, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
+        """k(z_i, z_i)."""
+
+
+def taken_apart(kernel: Kernel) -> DenseKernel:
+    """The kernel as sums, products and leaves whose formulas are evaluated here; any other kernel is called."""
+    inner = _inner(kernel)
+    return inner if kernel.active_dims is None or isinstance(inner, _Called) else _Selected(kernel, inner)
+
+
+def _inner(kernel: Kernel) -> DenseKernel:
+    """The kernel on the features that it looks at."""
     if not _is_known(kernel):
-        if other is None and torch.is_grad_enabled():
-            return _recomputed(kernel, z)
-        return kernel(z, z if other is None else other).to_dense()
-    z, other = _selected(kernel, z), None if other is None else _selected(kernel, other)
-    if type(kernel) is AdditiveKernel or type(kernel) is ProductKernel:
-        inner = [dense_matrix(cast(Kernel, part), z, other) for part in kernel.kernels]
-        return reduce(add if type(kernel) is AdditiveKernel else mul, inner)
+        return _Called(kernel)
+    if isinstance(kernel, AdditiveKernel | ProductKernel) and type(kernel) in KNOWN:
+        parts = [taken_apart(cast(Kernel, part)) for part in kernel.kernels]
+        return _Combined(add if type(kernel) is AdditiveKernel else mul, parts)
     if type(kernel) is ScaleKernel:
-        base, outputscale = kernel.base_kernel, cast(Tensor, kernel.outputscale)
-        if type(base) in (RBFKernel, MaternKernel):
-            return _of_distance(base, z, other, outputscale)
-        return outputscale * dense_matrix(base, z, other)
+        base = kernel.base_kernel
+        # active_dims of the base are those of the scaled kernel, which selects
+        return (
+            _Stationary(base, kernel) if type(base) in (RBFKernel, MaternKernel) else _Scaled(kernel, taken_apart(base))
+        )
     if type(kernel) in (RBFKernel, MaternKernel):
-        return _of_distance(kernel, z, other, torch.ones((), dtype=z.dtype, device=z.device))
+        return _Stationary(kernel, None)
     if type(kernel) is ConstantKernel:
-        return kernel.constant.reshape(1, 1).expand(len(z), len(z if other is None else other)).contiguous()
-    embedded = embedding(kernel)
-    if embedded is not None:
-        embed, smoothness = embedded
-        return _of_embedding(embed(z), None if other is None else embed(other), smoothness)
-    feature = weight_features(kernel)
-    assert feature is not None  # _is_known said so
-    left = feature(z)
-    return left @ (left if other is None else feature(other)).mT
+        return _Constant(kernel)
+    return _Embedded(kernel) if embedding(kernel) is not None else _Weighted(kernel)
+
+
+@dataclass(frozen=True, eq=False)
+class _Called(DenseKernel):
+    """A kernel of which nothing is known: GPyTorch evaluates it, and once more in the backward pass."""
+
+    kernel: Kernel
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        return _recomputed(self.kernel, z) if torch.is_grad_enabled() else self.kernel(z, z).to_dense()
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return self.kernel(z, other).to_dense()
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return cast(Tensor, self.kernel(z, z, diag=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Selected(DenseKernel):
+    """A kernel of some of the features, its `active_dims`."""
+
+    kernel: Kernel
+    inner: DenseKernel
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        return self.inner.matrix(self._of(z))
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return self.inner.cross(self._of(z), self._of(other))
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return self.inner.diagonal(self._of(z))
+
+    def _of(self, z: Tensor) -> Tensor:
+        return z.index_select(-1, cast(Tensor, self.kernel.active_dims))
+
+
+@dataclass(frozen=True, eq=False)
+class _Combined(DenseKernel):
+    """A sum or a product."""
+
+    combine: Callable[[Tensor, Tensor], Tensor]
+    parts: Sequence[DenseKernel]
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        return reduce(self.combine, [part.matrix(z) for part in self.parts])
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return reduce(self.combine, [part.cross(z, other) for part in self.parts])
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return reduce(self.combine, [part.diagonal(z) for part in self.parts])
+
+
+@dataclass(frozen=True, eq=False)
+class _Scaled(DenseKernel):
+    """An output scale (variance) times another kernel."""
+
+    kernel: ScaleKernel
+    base: DenseKernel
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        return self.kernel.outputscale * self.base.matrix(z)
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return self.kernel.outputscale * self.base.cross(z, other)
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return self.kernel.outputscale * self.base.diagonal(z)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stationary(DenseKernel):
+    """A squared exponential or a Matern, with an output scale where it has one."""
+
+    kernel: Kernel
+    scale: ScaleKernel | None
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        given = (z, _lengthscale(self.kernel), self._variance(z), self._smoothness)
+        return cast(Tensor, _StationaryMatrix.apply(*given))
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        lengthscale = _lengthscale(self.kernel)
+        return self._variance(z) * _of_distance(z / lengthscale, other / lengthscale, self._smoothness)
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return self._variance(z).expand(len(z))
+
+    @property
+    def _smoothness(self) -> float:
+        return self.kernel.nu if isinstance(self.kernel, MaternKernel) else math.inf
+
+    def _variance(self, z: Tensor) -> Tensor:
+        if self.scale is None:
+            return torch.ones((), dtype=z.dtype, device=z.device)
+        return cast(Tensor, self.scale.outputscale)
+
+
+@dataclass(frozen=True, eq=False)
+class _Constant(DenseKernel):
+    """The same covariance of all points."""
+
+    kernel: ConstantKernel
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        return self.cross(z, z)
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return self.kernel.constant.reshape(1, 1).expand(len(z), len(other)).contiguous()
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return self.kernel.constant.reshape(1).expand(len(z))
+
+
+@dataclass(frozen=True, eq=False)
+class _Embedded(DenseKernel):
+    """A function of the distance in an embedding, with variance 1."""
+
+    kernel: Kernel
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        embed, smoothness = self._embedding
+        one = torch.ones(1, dtype=z.dtype, device=z.device)
+        return cast(Tensor, _StationaryMatrix.apply(embed(z), one, one[0], smoothness))
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        embed, smoothness = self._embedding
+        return _of_distance(embed(z), embed(other), smoothness)
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return torch.ones(len(z), dtype=z.dtype, device=z.device)
+
+    @property
+    def _embedding(self) -> tuple[PointMap, float]:
+        found = embedding(self.kernel)
+        assert found is not None, "taken_apart found one"
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighted(DenseKernel):
+    """phi(z) . phi(z')."""
+
+    kernel: Kernel
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        phi = self._features(z)
+        return phi @ phi.mT
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return self._features(z) @ self._features(other).mT
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return self._features(z).square().sum(-1)
+
+    def _features(self, z: Tensor) -> Tensor:
+        features = weight_features(self.kernel)
+        assert features is not None, "taken_apart found them"
+        return features(z)
 
 
 def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
@@ -143,7 +345,7 @@ def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[
 
 
 def _is_known(kernel: Kernel) -> bool:
-    """Whether `dense_matrix` evaluates the kernel itself."""
+    """Whether its formula is evaluated here."""
     if kernel.batch_shape:
         return False
     if type(kernel) is ScaleKernel:
@@ -153,33 +355,15 @@ def _is_known(kernel: Kernel) -> bool:
     return type(kernel) in KNOWN or embedding(kernel) is not None or weight_features(kernel) is not None
 
 
-def _selected(kernel: Kernel, z: Tensor) -> Tensor:
-    """The features that the kernel looks at, its `active_dims`."""
-    return z if kernel.active_dims is None else z.index_select(-1, cast(Tensor, kernel.active_dims))
-
-
 def _lengthscale(kernel: Kernel) -> Tensor:
     return cast(Tensor, kernel.lengthscale).reshape(-1)
 
 
-def _of_distance(kernel: Kernel, z: Tensor, other: Tensor | None, outputscale: Tensor) -> Tensor:
-    smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
-    lengthscale = _lengthscale(kernel)
-    if other is None:
-        return cast(Tensor, _Stationary.apply(z, lengthscale, outputscale, smoothness))
-    z, other = z / lengthscale, other / lengthscale
+def _of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:
+    """The squared exponential (smoothness inf) or a Matern of the distances between points that are scaled already."""
     if smoothness == math.inf:
-        return outputscale * torch.exp(-0.5 * squared_distance(z, other))
-    return outputscale * _matern(distance(z, other), smoothness)
-
-
-def _of_embedding(left: Tensor, right: Tensor | None, smoothness: float) -> Tensor:
-    if right is not None and smoothness == math.inf:
         return torch.exp(-0.5 * squared_distance(left, right))
-    if right is not None:
-        return _matern(distance(left, right), smoothness)
-    one = torch.ones(1, dtype=left.dtype, device=left.device)
-    return cast(Tensor, _Stationary.apply(left, one, one[0], smoothness))
+    return _matern(distance(left, right), smoothness)
 
 
 def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
@@ -203,7 +387,7 @@ def _matern_slope(r: Tensor, smoothness: float) -> Tensor:
     return 3.0 * decay if smoothness == 1.5 else 5.0 / 3.0 * (1.0 + a) * decay
 
 
-class _Stationary(torch.autograd.Function):
+class _StationaryMatrix(torch.autograd.Function):
     """s k(r) with r_ij = |(z_i - z_j) / l|: the squared exponential (smoothness inf) or a Matern.
 
     Saves nothing of size N x N but its own result and, for a Matern, the derivative of it.
@@ -252,7 +436,7 @@ class _Stationary(torch.autograd.Function):
 
 def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
     """A kernel of any kind, called now and again in the backward pass, so that nothing of size N x N is kept."""
-    dense = _DenseKernel(kernel)
+    dense = _DenseCall(kernel)
     # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own
     # ones back.
     names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
@@ -267,7 +451,7 @@ def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
         )
 
 
-class _DenseKernel(torch.nn.Module):
+class _DenseCall(torch.nn.Module):
     """A kernel whose call returns the dense matrix at once, so that `functional_call` covers the whole evaluation."""
 
     def __init__(self, kernel: Kernel) -> None:

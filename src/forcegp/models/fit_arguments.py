@@ -56,7 +56,7 @@ def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:
     """
     if noise is not None and noise.measured_torque:
         raise InvalidInput(
-            "Noise(measured_torque=True) needs the noise of single torques, but windows (observe=...) tell that of "
+            "Noise(measured_torque=True) needs the noise of single torques, but windows give that of "
             "their mean; leave measured_torque out, or fit to accelerations"
         )
     if noise is not None or windows.noise_level is None:
@@ -75,7 +75,8 @@ def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
             "noise=Noise(0.1, learn=True) "
             "to learn it from there"
         )
-    return replace(noise or Noise(), acceleration=tuple(float(std) for std in level))
+    noise = noise or Noise()
+    return replace(noise, acceleration=tuple(float(std) for std in level), from_data=not noise.learn)
 
 
 def check_search_numbers(restarts: int, seed: int) -> None:

@@ -32,6 +32,9 @@ class Noise:
     With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions know that their u
     is as noisy, and shrink accelerations that only its noise explains (`models/measured_torque.py`). Leave it False
     where u is a command, as in model-predictive control.
+
+    `from_data` is set by a fit whose level of noise the dataset stated: rows that state another one are then warned of
+    (`Posterior.update`).
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -41,6 +44,7 @@ class Noise:
     force: float | tuple[float, ...] | None = None
     learn: bool = False
     measured_torque: bool = False
+    from_data: bool = False
 
     def __post_init__(self) -> None:
         if self.acceleration is not None:
@@ -107,6 +111,7 @@ class Noise:
             "force": list(self.force) if isinstance(self.force, tuple) else self.force,
             "learn": self.learn,
             "measured_torque": self.measured_torque,
+            "from_data": self.from_data,
         }
 
     @classmethod
@@ -118,6 +123,7 @@ class Noise:
             tuple(force) if isinstance(force, list) else force,
             bool(stored["learn"]),
             bool(stored.get("measured_torque", False)),
+            bool(stored.get("from_data", False)),
         )
 
 

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from forcegp.codegen.tape_machine import TapeMachine
+from forcegp.codegen.tape_tracing import trace
 from forcegp.errors import InvalidInput
-from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.models.marginal_likelihood import inertials_of
-from forcegp.models.tape_machine import TapeMachine
-from forcegp.models.tape_tracing import trace
-
-if TYPE_CHECKING:
-    from forcegp.models.structured_posterior import StructuredPosterior
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 """States (n, nv) -> the entries of `Terms` as one list."""
@@ -36,24 +31,6 @@ class Terms(NamedTuple):
     def of(cls, parts: Sequence[Tensor], groups: int) -> Terms:
         """From one list."""
         return cls(parts[0], parts[1], list(parts[2 : 2 + groups]), list(parts[2 + groups :]))
-
-
-def terms_function(posterior: StructuredPosterior, prepared: PreparedKernels, features: bool) -> TermsFunction:
-    """The terms as a function of the state, differentiable, by the same code as `posterior.predict`.
-
-    Without `features` that list of them stays empty.
-    """
-    system, prior, known = posterior.system, posterior.model.prior, posterior.model.mean == "analytical"
-    inertials = {name: value.detach() for name, value in inertials_of(posterior.parameters).items()} or None
-    standardize = posterior.likelihood.standardization
-
-    def terms(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-        dynamics = system.dynamics(q, v, u, inertials)
-        affine, given = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
-        joined = [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(given)]
-        return [*joined, *given] if features else joined
-
-    return terms
 
 
 class EagerTerms:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -15,16 +15,14 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.inference import LeaveOut, OptimizationResult
+from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
-from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
-from forcegp.models.marginal_likelihood import TrainingData
-from forcegp.models.moving import moved
 from forcegp.models.prediction import Prediction, join_predictions
 from forcegp.models.predictor import Predictor
-from forcegp.models.rollout import Rollout, roll_out
+from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
+from forcegp.models.training_data import TrainingData
 
 ROWS_PER_BLOCK = 4096
 """States that are predicted at once; bounds the memory of long recordings."""
@@ -49,6 +47,8 @@ class Posterior(ABC):
     result: OptimizationResult
     target: MechanicalSystem | None = None
     """The system that predictions are for, where it is not that of the model (`with_system`)."""
+    engine: Any = None
+    """The Engine that computed the posterior, stored with the model; None where there is no choice."""
 
     @property
     def system(self) -> MechanicalSystem:
@@ -165,8 +165,26 @@ class Posterior(ABC):
         return [x.reshape(-1, nv) for x in states], states[0].shape[:-1]
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
-        """What `rollout` integrates, under this stabilisation; for models that know no constraint it must be None."""
-        return PredictedAccelerations(self, baumgarte)
+        """What `rollout` integrates, under this stabilisation.
+
+        By default the mean of `predict`, from which no functions can be drawn. Raises InvalidInput for a stabilisation
+        where the model knows no constraint.
+        """
+        if baumgarte is not None:
+            raise InvalidInput(
+                f"baumgarte was given, but a {type(self).__name__} does not know the constraint, so there is "
+                "nothing to stabilise; give baumgarte=None, and integrator='projected' to stay on the surface."
+            )
+
+        def mean() -> AccelerationFunction:
+            return lambda q, v, u: self.predict(q, v, u, covariance=False).mean
+
+        def sampled(samples: int, seed: int) -> AccelerationFunction:
+            raise InvalidInput(
+                f"no functions can be drawn from a {type(self).__name__}; give samples=0, or use a StructuredGP."
+            )
+
+        return AccelerationModel(self.system, None, mean, sampled)
 
     def rollout(
         self,
@@ -260,13 +278,26 @@ class Posterior(ABC):
 
         Raises InvalidInput for a device that is not there. An `identification` stays where it was.
         """
-        return moved(self, device)  # type: ignore[return-value]  # of the same class, for its model made it
+        model = replace(self.model, system=self.model.system.to(device))
+        at: torch.device = model.system.robot.device
+        result = replace(
+            self.result,
+            parameters=_all_on(self.result.parameters, at),
+            iterates=tuple(_all_on(point, at) for point in self.result.iterates),
+        )
+        there = model.condition(
+            self.training.to(at),
+            _all_on(self.parameters, at),
+            result,
+            self.settings,
+            engine=self.engine,
+            solution=None if self.solution is None else self.solution.to(at),
+        )
+        return there if self.target is None else there.with_system(self.target.to(device))
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""
-        changed = copy.copy(self)
-        object.__setattr__(changed, "settings", {**self.settings, **settings})
-        return changed
+        return replace(self, settings={**self.settings, **settings})  # type: ignore[type-var]  # see the class
 
 
 class Model(ABC):
@@ -296,16 +327,22 @@ class Model(ABC):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        engine: Engine | None = None,
         solution: Tensor | None = None,
     ) -> Posterior:
         """The posterior at given parameters, without a search: what a stored model is loaded with.
 
-        `solution` is what its engine had found (`Posterior.solution`), which saves the engine most of its work.
+        `engine` computes it, where there is a choice; `solution` is what that engine had found (`Posterior.solution`),
+        which saves it most of its work.
         """
 
     @abstractmethod
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the parameters that a posterior on these points needs."""
+
+
+def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in tensors.items()}
 
 
 def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult, OptimizerOptions
-from forcegp.models.noise import ACCELERATION, FORCE
-from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.parallel import Backend, Joblib, Serial
 
 RESTART_SPREAD = 0.7
@@ -31,6 +29,9 @@ SMOOTHER = 4.0
 
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
+
+KERNELS = "kernels."
+"""How the names of kernel parameters begin (`LatentKernels.initial_parameters`)."""
 
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
@@ -71,7 +72,7 @@ def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, T
     shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
     shifted = {}
     for name, value in start.items():
-        if name in (ACCELERATION, FORCE, PHYSICAL):
+        if not name.startswith(KERNELS):
             shifted[name] = value
             continue
         shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)

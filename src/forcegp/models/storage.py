@@ -21,11 +21,11 @@ from forcegp import __version__
 from forcegp.atomic_files import atomic_folder
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
-from forcegp.inference import OptimizationResult
+from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
-from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.stored_models import KINDS, kind_of
+from forcegp.models.training_data import TrainingData
 
 FORMAT_VERSION = 6
 FEATURES = {
@@ -85,6 +85,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
             "evaluations": result.evaluations,
             "cpu_seconds": result.cpu_seconds,
         },
+        "engine": None if posterior.engine is None else posterior.engine.to_dict(),
         "settings": dict(posterior.settings),
     }
     training = posterior.training
@@ -128,7 +129,12 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
+        settings = dict(document["settings"])
+        if settings.get("noise_from_data"):  # where formats 1 to 5 kept it
+            document["model"]["noise"]["from_data"] = True
         model = KINDS[document["kind"]].from_dict(system, document["model"])
+        stored_engine = document.get("engine", settings.get("engine"))  # formats 1 to 5 kept it among the settings
+        engine = None if stored_engine is None else engine_from_dict(stored_engine)
         target = None
         if moved_to is not None:
             target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
@@ -148,7 +154,6 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             float(result["cpu_seconds"]),
         )
         names = document["joint_names"]
-        settings = dict(document["settings"])
     except (KeyError, TypeError, ValueError, RuntimeError, ForceGPError) as error:
         raise FileFormatError(f"{path / 'model.json'} is incomplete or damaged: {error}") from None
     if document.get("units") != _plain(units_for(system.robot)):
@@ -162,7 +167,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     if solution is not None:
         _check_numbers(path / "tensors.safetensors", SOLUTION, solution)
     try:
-        posterior = model.condition(training, parameters, optimization, settings, solution)
+        posterior = model.condition(training, parameters, optimization, settings, engine, solution)
     except (InvalidInput, RuntimeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
     if target is not None:

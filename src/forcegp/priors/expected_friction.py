@@ -105,7 +105,7 @@ class ExpectedFriction:
         to it, and a NumericalWarning says so.
         """
         state, multiplier = dynamics.state, dynamics.multiplier_map()
-        robot = state.kinematics.robot
+        robot = state.robot
         rows = multiplier.matrix[..., contact, :]
         free = multiplier.offset[..., contact]
         for index, (_, curve) in zip(joint_indices([name for name, _ in self.joints], robot), self.joints, strict=True):

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
@@ -133,8 +135,6 @@ class DelimitedText(Source):
             raise
 
     def _read(self, names: Sequence[str], rows: int, *, threads: bool) -> Iterator[Columns]:
-        import pyarrow as pa
-        from pyarrow import csv as arrow_csv
 
         stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from forcegp.atomic_files import atomic_file
+from forcegp.codegen.native_code import C, compile_library
 from forcegp.errors import CompilerError
-from forcegp.native_code import C, compile_library
 from forcegp.robots.dynamics_programs import Request, trace
 from forcegp.robots.machine_code import input_arrays, write_c
 from forcegp.robots.unrolled import UnrolledRobot

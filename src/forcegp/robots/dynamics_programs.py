@@ -102,7 +102,7 @@ def trace(unrolled: UnrolledRobot, request: Request) -> Program:
     if request.free_inertias:
         arguments["inertias"] = graph.inputs("inertias", len(INERTIA_ENTRIES) * n)
         inertias = [_symmetric(arguments["inertias"][10 * body : 10 * body + 10]) for body in range(n)]
-    at = unrolled.states(arguments["q"], arguments.get("v"))
+    at = UnrolledKinematics(unrolled, arguments["q"], arguments.get("v"))
     positive: Vector = []
     if request.function == "forward_dynamics":
         results, held, differentiated = _forward_dynamics(at, arguments["tau"], inertias, graph, request, positive)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.recorded_motions import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.evaluation.recorded_segments import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.models import Posterior
 from forcegp.validation.scores import plain
 

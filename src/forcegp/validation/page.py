@@ -6,9 +6,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from forcegp.evaluation.spreads import markdown_table, number, shown
-from forcegp.validation.figures import listed_units
-from forcegp.validation.verdicts import SCORES
+from forcegp.evaluation.summary_statistics import markdown_table, number, shown
+from forcegp.validation.paired_tests import SCORES
 
 ALT_TEXTS = {
     "errors": "Errors of accelerations and in force space, by joint and model",
@@ -137,7 +136,7 @@ def _against(answer: Mapping[str, Any] | None) -> str:
 
 
 def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
-    force = listed_units(document["units"]["u"])
+    force = _listed_units(document["units"]["u"])
     header = [
         "model",
         "nRMSE",
@@ -171,7 +170,7 @@ def _by(models: Mapping[str, Any], value: Callable[[Any, str], float | None]) ->
 
 
 def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:
-    force = listed_units(document["units"]["u"])
+    force = _listed_units(document["units"]["u"])
     tables = (
         ("nrmse_per_joint", "Normalised error of the acceleration (RMSE / standard deviation of the target)", 3),
         ("force_rms_per_joint", f"Force-space error, rms [{force}]", 3),
@@ -217,7 +216,7 @@ def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
             cell = _marked(motions["rms"][k], 4, best[k] if lost == fewest[k] else None)
             cells.append(f"{cell}, {lost} of {motions['motions']} diverged" if lost else cell)
         rows.append([_named(name, model), *cells])
-    unit = listed_units(document["units"]["q"])
+    unit = _listed_units(document["units"]["q"])
     table = markdown_table(["model", *(f"after {h:g} s" for h in first["horizons"])], rows)
     last = first["horizons"][-1]
     each = _motion_joints(moving, document, len(first["horizons"]) - 1)
@@ -297,3 +296,8 @@ def _percent(value: Mapping[str, Any] | None, best: float | None = None) -> str:
         for name, number in value.items()
     }
     return _marked(in_percent, 1, None if best is None else 100.0 * best) + " %"
+
+
+def _listed_units(units: str | Sequence[str]) -> str:
+    """`Nm`, or `Nm and N` where joints differ."""
+    return units if isinstance(units, str) else " and ".join(dict.fromkeys(units))

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import forcegp.evaluation
+import forcegp.validation
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.figure_style import save_figure
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.jobs.machine import machine
 from forcegp.parallel import Backend, backend_for
 from forcegp.validation.candidates import DEFAULT_MODELS, candidates
 from forcegp.validation.comparison import Comparison
-from forcegp.validation.figures import figures_of
 from forcegp.validation.jobs import jobs_of, kept
 from forcegp.validation.page import page
-from forcegp.validation.preparation_words import preparation_lines
+from forcegp.validation.paired_tests import against_baseline, verdicts
+from forcegp.validation.preparation_summary import preparation_lines
 from forcegp.validation.summary import summary_of
-from forcegp.validation.verdicts import against_baseline, verdicts
 
 KIND = "forcegp validate"
 RESULTS, PAGE = "results.json", "report.md"
@@ -88,9 +88,9 @@ def validate(
     document |= {"configuration": {"forcegp": __version__, **configuration}, "source": dict(source or {})}
     document["identifications"] = [_brief(kept(store, job.name)) for job in identifications]
     with store.locked():
-        figures = figures_of(document)
+        figures = forcegp.validation.figures_of(document)
         for name, figure in figures.items():
-            save_figure(figure, store.folder / f"{name}.png")
+            forcegp.evaluation.save_figure(figure, store.folder / f"{name}.png")
         document["figures"] = sorted(figures)
         write_json(store.folder / RESULTS, document)
         write_text(store.folder / PAGE, page(document))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from forcegp.errors import FileFormatError
-from forcegp.evaluation.spreads import spread
+from forcegp.evaluation.summary_statistics import spread
 from forcegp.validation.candidates import Candidate
 from forcegp.validation.scores import over_joints
 

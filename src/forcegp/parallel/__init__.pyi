@@ -1,0 +1,9 @@
+from .backend import MOST_DEATHS as MOST_DEATHS
+from .backend import Backend as Backend
+from .backend import Pool as Pool
+from .backend import Serial as Serial
+from .backend import Shared as Shared
+from .choice import backend_for as backend_for
+from .choice import backend_of as backend_of
+from .cluster import Ray as Ray
+from .processes import Joblib as Joblib

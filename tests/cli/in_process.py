@@ -1,0 +1,70 @@
+"""`forcegp` in this process, as if it were a process of its own."""
+
+import contextlib
+import ctypes
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import pytest
+import torch
+
+from forcegp.cli.main import main
+
+PYTHON_FILTERS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+"""Which warnings Python does not show where nobody asks for them: https://docs.python.org/3/library/warnings.html."""
+
+
+def run_here(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr.
+
+    Files, pipes and warnings are those of a new process, and what the command could change here is put back.
+    """
+    words = [str(argument) for argument in arguments]
+    with contextlib.ExitStack() as undo:
+        undo.callback(torch.set_num_threads, torch.get_num_threads())
+        undo.enter_context(contextlib.chdir(folder or Path.cwd()))
+        environment = undo.enter_context(pytest.MonkeyPatch.context())
+        environment.setenv("COLUMNS", "100")
+        undo.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("default")
+        for category in PYTHON_FILTERS:
+            warnings.simplefilter("ignore", category)
+        stdout, stderr = (undo.enter_context(_into_a_file(name)) for name in ("stdout", "stderr"))
+        try:
+            code = main(words)
+        except SystemExit as end:  # --help
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        texts = [_text(stream) for stream in (stdout, stderr)]
+    return subprocess.CompletedProcess(["forcegp", *words], code, *texts)
+
+
+@contextlib.contextmanager
+def _into_a_file(name: str) -> Iterator[IO[bytes]]:
+    """What Python, C and child processes write to that stream goes into a temporary file."""
+    stream = getattr(sys, name)
+    stream.flush()
+    descriptor = {"stdout": 1, "stderr": 2}[name]
+    kept = os.dup(descriptor)
+    with tempfile.TemporaryFile() as file, os.fdopen(os.dup(file.fileno()), "w", encoding="utf-8") as ours:
+        os.dup2(file.fileno(), descriptor)
+        setattr(sys, name, ours)
+        try:
+            yield file
+        finally:
+            setattr(sys, name, stream)
+            os.dup2(kept, descriptor)
+            os.close(kept)
+
+
+def _text(file: IO[bytes]) -> str:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    ctypes.CDLL(None).fflush(None)
+    file.seek(0)
+    return file.read().decode()

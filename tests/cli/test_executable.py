@@ -1,0 +1,112 @@
+"""Every command once through the installed executable on real files, and what belongs to a process: exit codes, pipes.
+
+Whatever else the commands do is tested in this process by the fixture `forcegp`, which does not import torch anew.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from tests.cli.test_import import FLAGS
+from tests.models.arm import arm_data
+from tests.recordings.log_files import motion, table, write_text
+from tests.validation.moving_arm import moving_arm
+
+from forcegp.cli.arguments import COMMANDS
+
+QUICK = ("--points", 8, "--iterations", 2, "--restarts", 1)
+
+RUNS: dict[str, tuple[tuple[object, ...], str]] = {
+    "demo": (("--seconds", 0.5, "--points", 8, "--iterations", 2, "--out", "story"), "story/summary.png"),
+    "simulate": (("kuka-surface", "--seconds", 0.1, "--out", "simulated.h5"), "simulated.h5"),
+    "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
+    "check": (("log.h5", "--plots", "look"), "look/check.png"),
+    "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
+    "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
+    "compare": (("arm.h5", "--prior", "joint", "--prior", "joint-friction", *QUICK, "--out", "c"), "c/comparison.json"),
+    "identify": (("arm.h5", "--learn", "hand:mass", *QUICK, "--out", "found"), "found/identified.urdf"),
+    "evaluate": (("run", "test.h5", "--plots", "figures"), "figures/evaluation.json"),
+    "validate": (
+        (
+            "log.h5",
+            "--models",
+            "analytical",
+            *QUICK,
+            "--seeds",
+            1,
+            "--horizon",
+            0.05,
+            "--starts",
+            1,
+            "--out",
+            "results",
+        ),
+        "results/report.md",
+    ),
+    "rollout": (("run", "test.h5", "--starts", 1, "--seconds", 0.05, "--out", "motion"), "motion/rollout.h5"),
+    "reproduce": (("fig3", "--preset", "smoke", "--points", 10, "--jobs", 1, "--out", "paper"), "paper/fig3.md"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(forcegp, tmp_path_factory):
+    """Logs of the small arm, one as CSV, and a model."""
+    place = tmp_path_factory.mktemp("executable")
+    for name, rows, seed in (("arm", 40, 0), ("test", 40, 1)):
+        arm_data(rows, seed).save(place / f"{name}.h5")
+    moving_arm(1.0, 2).save(place / "log.h5")
+    write_text(place / "log.csv", table(motion()))
+    assert forcegp("fit", "arm.h5", *QUICK, "--out", "run", folder=place).returncode == 0
+    return place
+
+
+def test_every_command_is_run_here():
+    assert RUNS.keys() == COMMANDS.keys()
+
+
+@pytest.mark.parametrize("command", RUNS)
+def test_every_command_writes_its_files_and_prints_one_json_object(installed, folder, command):
+    if command in ("demo", "simulate", "reproduce"):
+        pytest.importorskip("pybullet")
+    words, written = RUNS[command]
+    done = installed(command, *words, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert isinstance(json.loads(done.stdout), dict)
+    assert (folder / written).stat().st_size > 0
+
+
+def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(installed, folder):
+    done = installed("fit", "missing.h5", "--out", "never", folder=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("forcegp: missing.h5 is not a file")
+    assert not (folder / "never").exists()
+
+
+def test_people_read_the_result_on_stdout_and_warnings_on_stderr(installed, folder):
+    done = installed("evaluate", "run", "arm.h5", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"^\s*(?:pan|lift|bend)\s", done.stdout, re.M)) == 3
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warning: 8 of 40 test rows")
+
+
+def test_version_and_help_through_the_module(installed):
+    done = installed("--version")
+    assert done.returncode == 0
+    assert re.fullmatch(r"forcegp \d+\.\d+\.\d+\n", done.stdout)
+    environment = {**os.environ, "COLUMNS": "100"}
+    words = [sys.executable, "-m", "forcegp.cli", "--help"]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert all(re.search(rf"^\W*{command}\s", done.stdout, re.M) for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_an_example_in_its_help(forcegp, command):
+    done = forcegp(command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(rf"For instance:\n\s+forcegp {command} \S", done.stdout)

@@ -1,0 +1,21 @@
+"""Run the code of a document as a reader would, but in this process, which has imported torch already."""
+
+import contextlib
+import io
+import warnings
+from pathlib import Path
+
+import torch
+
+
+def run_example(code: str, folder: Path) -> str:
+    """What the code prints in that folder; warnings are no errors, as in a process of its own."""
+    printed = io.StringIO()
+    threads = torch.get_num_threads()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            exec(compile(code, "<example>", "exec"), {"__name__": "__main__"})
+        finally:
+            torch.set_num_threads(threads)
+    return printed.getvalue()
