@@ -152,7 +152,7 @@ def test_the_independent_model_rolls_out_its_mean_and_functions_of_its_own(data,
     assert ((drawn.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
     torch.testing.assert_close(drawn.std(0), expected.std, rtol=0.08, atol=0)
     assert torch.corrcoef(drawn.mT).tril(-1).abs().max() <= 5.0 / np.sqrt(3000)
-    with pytest.raises(InvalidInput, match=r"IndependentPosterior does not know the constraint"):
+    with pytest.raises(InvalidInput, match=r"IndependentPosterior has no constraint"):
         posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0))
     on_surface = posterior.rollout(q, v, u[:, :4], DT, integrator="projected")
     assert on_surface.constraint.abs().max() <= 1e-11
@@ -202,7 +202,7 @@ def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, st
             ask()
     with pytest.raises(InvalidInput, match="quantile levels"):
         rollout.quantiles((1.5,))
-    with pytest.raises(InvalidInput, match=r"does not know the constraint.*integrator='projected'"):
+    with pytest.raises(InvalidInput, match=r"has no constraint.*integrator='projected'"):
         Posterior.accelerations(posterior, Baumgarte(1.0))
     with pytest.raises(InvalidInput, match="no functions can be drawn from a StructuredPosterior"):
         roll_out(Posterior.accelerations(posterior, None), q, v, u, DT, samples=1)

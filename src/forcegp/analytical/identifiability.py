@@ -7,7 +7,7 @@ others. QR with column pivoting takes independent columns first, ``W P = Q [R1 R
 
 with pi_1 the parameters of the independent columns and pi_2 those that are regrouped into them (Gautier, "Numerical
 calculation of the base inertial parameters of robots", J. Robotic Systems 1991). The condition number of the
-independent columns, each divided by its norm, says how well a motion excites them.
+independent columns, each divided by its norm, measures how well a motion excites them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RANDOM_ROWS = 50
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """What a regressor (rows, p) can tell of p parameters.
+    """What a regressor (rows, p) identifies of p parameters.
 
     `independent` are the columns of the base parameters in the order of QR, `dependent` those that are regrouped,
     `regrouping` (r, p - r) is R1^-1 R2 for columns as they are, `unseen` the columns that are zero, which are in
@@ -87,13 +87,13 @@ class BaseParameters:
 
     def _expression(self, row: int) -> str:
         weights = self.regrouping[row]
-        told = [self.names[self.independent[row]]]
+        terms = [self.names[self.independent[row]]]
         scale = max(1.0, float(abs(weights).max(initial=0.0)))
         for column, weight in zip(self.dependent, weights, strict=True):
             if abs(weight) > NAMED * scale:
                 factor = "" if abs(abs(weight) - 1.0) < NAMED else f"{abs(weight):.3g} "
-                told.append(f"{'+' if weight > 0 else '-'} {factor}{self.names[column]}")
-        return " ".join(told)
+                terms.append(f"{'+' if weight > 0 else '-'} {factor}{self.names[column]}")
+        return " ".join(terms)
 
 
 def base_parameters(robot: Robot) -> BaseParameters:
@@ -111,7 +111,7 @@ def excitation(
     v: Float[np.ndarray, "rows nv"],
     a: Float[np.ndarray, "rows nv"],
 ) -> BaseParameters:
-    """What recorded states (numpy) tell: `rank` below that of `base_parameters` means that something never showed."""
+    """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
     states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))
     return BaseParameters.of(torque_regressor(robot, *states).flatten(0, 1).cpu().numpy(), parameter_names(robot))
 

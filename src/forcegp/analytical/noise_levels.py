@@ -45,7 +45,7 @@ class NoiseLevels:
             acceleration, force = whole * logs.view_as(whole).exp()
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
             white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)
-            # a weak pull to the start keeps a level that the residuals say nothing about from running away
+            # a weak pull to the start keeps a level that the residuals do not inform from running away
             pull = 0.5 * (logs - torch.as_tensor(start)).square().sum()
             value = 0.5 * white.square().sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum() + pull
             (gradient,) = torch.autograd.grad(value, logs)

@@ -24,7 +24,7 @@ from forcegp.mechanics import KnownForce, MechanicalSystem, RigidBodyBias, State
 
 
 class RecordedRows:
-    """States (rows, nv) of a robot, the given forces there, and what the equation of motion says of them."""
+    """States (rows, nv) of a robot, the given forces there, and the terms of the equation of motion."""
 
     def __init__(
         self,

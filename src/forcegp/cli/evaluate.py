@@ -126,7 +126,7 @@ def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, 
     if posterior.system.contacts:
         figures["tool_path.png"] = lambda: forcegp.evaluation.tool_path_figure(posterior, dataset)
         figures["summary.png"] = lambda: forcegp.evaluation.summary_figure(posterior, dataset)
-        if posterior.speaks_of_forces:
+        if posterior.predicts_forces:
             figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
     if forcegp.evaluation.curve_panels(posterior):
         figures["forces.png"] = lambda: forcegp.evaluation.friction_curves_figure(posterior, dataset)

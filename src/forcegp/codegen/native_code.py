@@ -64,7 +64,7 @@ def compile_library(
 ) -> None:
     """Compile a source text to the shared library ``library``.
 
-    ``purpose`` and ``instead`` say in errors what needs the compiler and what to do without one. Raises
+    ``purpose`` and ``instead`` name in errors what needs the compiler and what to do without one. Raises
     :class:`~forcegp.errors.CompilerError` where there is no compiler or it fails, OSError where files cannot be
     written.
     """

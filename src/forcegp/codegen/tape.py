@@ -186,7 +186,7 @@ class Tape:
 def _folded(operation: str, operands: Sequence[float | None]) -> float:
     """An operation on known numbers; outside its domain NaN, as a processor has it."""
     try:
-        return {**UNARY, **BINARY}[operation](*operands)  # type: ignore[arg-type]  # the caller knows that none is None
+        return {**UNARY, **BINARY}[operation](*operands)  # type: ignore[arg-type]  # the caller has checked that none is None
     except (ValueError, ZeroDivisionError, OverflowError):
         return math.nan
 

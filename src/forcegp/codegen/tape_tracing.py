@@ -32,7 +32,7 @@ MOVING = frozenset(
 """Operations that are the same on node numbers: nodes 0 and 1 hold 0.0 and 1.0."""
 
 CREATION = ("dtype", "layout", "device", "pin_memory", "memory_format")
-"""Keywords that say nothing about values."""
+"""Keywords without an effect on values."""
 
 INDEXED = ("index", "index_select", "gather")
 """Those whose further tensors are indices, which must be known."""

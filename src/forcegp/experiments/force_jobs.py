@@ -92,7 +92,7 @@ def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
 def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     """Errors of the acceleration and, where the model speaks of them, of the forces; plain JSON values."""
     assert test.system is not None, "simulated data carry their system"
-    if posterior.speaks_of_forces:
+    if posterior.predicts_forces:
         posterior = posterior.with_system(test.system)
     out = evaluate(posterior, test).to_dict()
     kept = {name: out[name] for name in ("mae", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae")}
@@ -103,7 +103,7 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
         for name, where in (("touching", open_contacts == 0), ("in_the_air", open_contacts > 0)):
             chosen = np.flatnonzero(where)
             kept[f"mae_{name}"] = evaluate(posterior, test.rows(chosen)).mae if chosen.size else None
-    if not posterior.speaks_of_forces:
+    if not posterior.predicts_forces:
         return kept
     return kept | _forces(posterior, test)
 

@@ -1,9 +1,9 @@
-"""What the rest of the data say about rows that are left out: closed-form predictive densities, without a refit.
+"""Rows that are left out, predicted from the rest of the data: closed-form predictive densities, without a refit.
 
 For a normal vector with precision P the density of some entries I given all others needs only P_II (Rasmussen &
 Williams 2006, eqs. 5.10-5.12, there for one entry): mean y_I - P_II^-1 (P y)_I and covariance P_II^-1. In deflated
 coordinates the precision is that of t, T^-1, and the part of the whitened data orthogonal to U is N(0, I) whatever the
-other rows say. So with alpha = T^-1 t, the rows i in I and n = |I|,
+other rows predict. So with alpha = T^-1 t, the rows i in I and n = |I|,
 
     e_I = (T^-1_II)^-1 alpha_I                                  t_I less its prediction, of covariance (T^-1_II)^-1
     log p(y_I | rest) = -1/2 alpha_I^T e_I + 1/2 log|T^-1_II| - 1/2 |remainder_I|^2 - sum_i log|L_i| - n D / 2 log 2 pi

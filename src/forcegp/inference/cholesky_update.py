@@ -12,9 +12,9 @@ the row to the one with it. With P = T^-1 and alpha = P t it needs the row's own
     1/2 (tr P_ii - log|P_ii| - r + alpha_i^T (P_ii^-1 - I) alpha_i),
 
 for P_ii^-1 is the covariance of t_i given all other rows, noise I included, and P_ii^-1 alpha_i what these predict
-wrongly of it (`leave_out`). Rows that others tell already are worth nothing; surprising ones are worth more. (Csato &
-Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a score.) Leaving a row out of P is a
-step of Cholesky's algorithm on P, so that rows can be left out one after the other without another inversion.
+wrongly of it (`leave_out`). Rows that the others predict already are worth nothing; surprising ones are worth more.
+(Csato & Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a score.) Leaving a row out of P
+is a step of Cholesky's algorithm on P, so that rows can be left out one after the other without another inversion.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def divergences(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> 
 
 
 def information(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> Float[Tensor, " N"]:
-    """What every row tells beyond all others, whatever was measured there: -1/2 log|P_ii| in nats."""
+    """The information of every row beyond all others, whatever was measured there: -1/2 log|P_ii| in nats."""
     factor, _ = torch.linalg.cholesky_ex(blocks)
     return -factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
@@ -114,7 +114,7 @@ def rows_to_keep(
     count, rank = system.alpha.shape
     surplus = max(0, count - budget)
     if not surplus or not rank:
-        return torch.arange(surplus, count, device=system.alpha.device)  # of rows that say nothing the newest
+        return torch.arange(surplus, count, device=system.alpha.device)  # of rows without information the newest
     with torch.no_grad():
         lower = CholeskyFactor(system.factor.lower.clone(), system.factor.jitter).into_inverse().tril_()
         precision = (lower + lower.tril(-1).mT).reshape(count, rank, count * rank)

@@ -47,7 +47,7 @@ class Functionals:
     def of(cls, weights: Float[Tensor, "N n"], terms: Terms) -> Functionals:
         """From the terms of the N n states, functional by functional; differentiable in all of them.
 
-        Every state has the residual of its own, y_w - m_i say, and its own noise covariance. Those of a functional are
+        Every state has its own residual, y_w - m_i for example, and its own noise covariance. Those of a functional are
         sum_i c_wi residual_i, and sum_i s_wi R_i with s_wi = c_wi^2 / sum_j c_wj^2: noise that is the same in all
         states is that of the functional, and one that turns with the state, such as H F H^T, is white in time.
         """

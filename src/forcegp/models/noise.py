@@ -29,7 +29,7 @@ class Noise:
     where the factor is 1, or, for data that state the noise of every row, that noise over its root mean square: then
     `acceleration` is the level, and which rows are noisier is as stated.
 
-    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions know that their u
+    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions count that their u
     is as noisy, and shrink accelerations that only its noise explains (`models/measured_torque.py`). Leave it False
     where u is a command, as in model-predictive control.
 
@@ -59,7 +59,7 @@ class Noise:
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint.
 
-        Raises InvalidInput for a wrong number of values, and where only a dataset can tell the level.
+        Raises InvalidInput for a wrong number of values, and where only a dataset states the level.
         """
         if self.acceleration is None:
             raise InvalidInput(

@@ -22,7 +22,7 @@ from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.models.predictor_terms import EagerTerms, TapedTerms, Terms
+from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
 
 INSTEAD_OF_TRANSFORMS = (
     "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
@@ -50,7 +50,7 @@ class Predictor:
     `kind` says. Differentiable once in q, v and u where these are tensors that require gradients; with `compile=False`
     any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
-    `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` tell how it was
+    `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
     compressed; `prepare_seconds` is what preparing took, the C++ compiler included, which runs once per process.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
@@ -107,13 +107,13 @@ class Predictor:
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
         return Linearization(a, *jacobian.split(self.nv, dim=-1))
 
-    def _mean(self, terms: Terms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
+    def _mean(self, terms: PredictorTerms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
         if not terms.W.shape[-1]:
             return terms.offset, []
         f, cross = self.prepared.mean(terms.inputs, keep)
         return terms.offset + (terms.W @ f[..., None])[..., 0], cross
 
-    def _covariance(self, terms: Terms, cross: list[Tensor]) -> Tensor:
+    def _covariance(self, terms: PredictorTerms, cross: list[Tensor]) -> Tensor:
         """Of the latents, (n, C, C)."""
         if not terms.W.shape[-1]:
             return terms.W.new_zeros(len(terms.W), 0, 0)

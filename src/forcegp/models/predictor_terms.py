@@ -13,10 +13,10 @@ from forcegp.codegen.tape_tracing import trace
 from forcegp.errors import InvalidInput
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
-"""States (n, nv) -> the entries of `Terms` as one list."""
+"""States (n, nv) -> the entries of `PredictorTerms` as one list."""
 
 
-class Terms(NamedTuple):
+class PredictorTerms(NamedTuple):
     """At n states: a = offset + W f, (n, nv) and (n, nv, C); what the kernels need; the prepared features if asked for.
 
     Their derivatives in [q, v, u] have one dimension (3 nv) more.
@@ -28,7 +28,7 @@ class Terms(NamedTuple):
     features: list[Tensor]
 
     @classmethod
-    def of(cls, parts: Sequence[Tensor], groups: int) -> Terms:
+    def of(cls, parts: Sequence[Tensor], groups: int) -> PredictorTerms:
         """From one list."""
         return cls(parts[0], parts[1], list(parts[2 : 2 + groups]), list(parts[2 + groups :]))
 
@@ -39,18 +39,18 @@ class EagerTerms:
     def __init__(self, function: TermsFunction, nv: int, groups: int) -> None:
         self.function, self.nv, self.groups = function, nv, groups
 
-    def __call__(self, x: Tensor) -> Terms:
+    def __call__(self, x: Tensor) -> PredictorTerms:
         """At rows [q, v, u]."""
-        return Terms.of(self.function(*x.split(self.nv, dim=-1)), self.groups)
+        return PredictorTerms.of(self.function(*x.split(self.nv, dim=-1)), self.groups)
 
-    def with_jacobians(self, x: Tensor) -> tuple[Terms, Terms]:
+    def with_jacobians(self, x: Tensor) -> tuple[PredictorTerms, PredictorTerms]:
         """The terms and their derivatives."""
 
         def one(row: Tensor) -> list[Tensor]:
             return [part[0] for part in self.function(*row[None].split(self.nv, dim=-1))]
 
         slopes = torch.func.vmap(torch.func.jacrev(one))(x)
-        return self(x), Terms.of(slopes, self.groups)
+        return self(x), PredictorTerms.of(slopes, self.groups)
 
 
 class TapedTerms:
@@ -72,18 +72,18 @@ class TapedTerms:
         self.shapes = [shape[1:] for shape in shapes]
         self.sizes = [shape.numel() for shape in self.shapes]
 
-    def __call__(self, x: Tensor) -> Terms:
+    def __call__(self, x: Tensor) -> PredictorTerms:
         """At rows [q, v, u]."""
         return self._split(self.machine(x), ())
 
-    def with_jacobians(self, x: Tensor) -> tuple[Terms, Terms]:
+    def with_jacobians(self, x: Tensor) -> tuple[PredictorTerms, PredictorTerms]:
         """The terms and their derivatives."""
         values, slopes = self.machine.with_jacobian(x)
         return self._split(values, ()), self._split(slopes, x.shape[1:])
 
-    def _split(self, joined: Tensor, trailing: Sequence[int]) -> Terms:
+    def _split(self, joined: Tensor, trailing: Sequence[int]) -> PredictorTerms:
         parts = torch.split_with_sizes(joined, self.sizes, 1)
-        return Terms.of(
+        return PredictorTerms.of(
             [
                 part if len(shape) == 1 else part.reshape(len(joined), *shape, *trailing)
                 for part, shape in zip(parts, self.shapes, strict=True)

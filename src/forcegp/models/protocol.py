@@ -33,7 +33,7 @@ Array = Tensor | np.ndarray | Sequence[Any]
 
 
 class Posterior(ABC):
-    """What a fitted model knows, as a frozen value.
+    """What a fitted model has learned, as a frozen value.
 
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
     (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
@@ -92,7 +92,7 @@ class Posterior(ABC):
         return "negative log likelihood with hyperpriors [nats]"
 
     @property
-    def speaks_of_forces(self) -> bool:
+    def predicts_forces(self) -> bool:
         """Whether predictions hold the forces behind the acceleration."""
         return True
 
@@ -108,7 +108,7 @@ class Posterior(ABC):
         return self.system.dynamics(q, v, u)
 
     def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Prediction:
-        """Distribution of the acceleration and, where the model speaks of them, of the forces behind it.
+        """Distribution of the acceleration and, where the model predicts them, of the forces behind it.
 
         States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
         taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
@@ -141,7 +141,7 @@ class Posterior(ABC):
             covariance of `predict`; "none" leaves it out and prepares faster. "auto" is "compressed" after exact
             inference, and "exact" after another engine, which lacks what compression needs.
         tolerance, largest_rank: the rank is the smallest that keeps the tolerance, and at most `largest_rank`; a
-            NumericalWarning says where that does not suffice.
+            NumericalWarning is given where that does not suffice.
         compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device.
 
         Raises
@@ -168,11 +168,11 @@ class Posterior(ABC):
         """What `rollout` integrates, under this stabilisation.
 
         By default the mean of `predict`, from which no functions can be drawn. Raises InvalidInput for a stabilisation
-        where the model knows no constraint.
+        where the model has no constraint.
         """
         if baumgarte is not None:
             raise InvalidInput(
-                f"baumgarte was given, but a {type(self).__name__} does not know the constraint, so there is "
+                f"baumgarte was given, but a {type(self).__name__} has no constraint, so there is "
                 "nothing to stabilise; give baumgarte=None, and integrator='projected' to stay on the surface."
             )
 
@@ -218,8 +218,9 @@ class Posterior(ABC):
             them.
         progress: called as progress(step, steps).
 
-        A motion that diverges is NaN from then on, `Rollout.diverged_at` tells where, and a NumericalWarning says so.
-        Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be projected.
+        A motion that diverges is NaN from then on, `Rollout.diverged_at` holds the row, and a NumericalWarning is
+        given. Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be
+        projected.
         """
         model = self.accelerations(baumgarte)
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed}
@@ -229,8 +230,8 @@ class Posterior(ABC):
         """How well training rows are predicted from those outside their block: in closed form, without another fit.
 
         `blocks` holds numbers of training rows; None leaves one row out at a time. Rows that follow each other in time
-        tell nearly the same, so leave them out together: `forcegp.data.time_blocks`. The parameters stay those that
-        were fitted to all rows, so the scores flatter a model with many of them a little.
+        hold nearly the same information, so leave them out together: `forcegp.data.time_blocks`. The parameters stay
+        those that were fitted to all rows, so the scores flatter a model with many of them a little.
         Raises InvalidInput for blocks that overlap, and for models that would have to be trained again.
         """
         raise InvalidInput(

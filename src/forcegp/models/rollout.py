@@ -1,4 +1,4 @@
-"""`Rollout`: where a fitted model says that a robot goes, as a frozen value."""
+"""`Rollout`: where a robot goes according to a fitted model, as a frozen value."""
 
 from __future__ import annotations
 

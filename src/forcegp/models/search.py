@@ -91,7 +91,7 @@ def run_restarts(
 ) -> Sequence[Outcome]:
     """`search(0, progress)`, `search(1, progress)`, ... on a backend, on which the outcomes do not depend.
 
-    Only this process can tell the progress. A single search needs no other process of this machine.
+    Only this process can report progress. A single search needs no other process of this machine.
     """
     if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
         return [search(index, progress) for index in range(restarts)]

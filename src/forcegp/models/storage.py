@@ -35,7 +35,7 @@ FEATURES = {
     "measured-torque": "its torques are noisy measurements",
 }
 """What a stored model may hold beyond rows and parameters: a program that ignored one of these would predict wrongly,
-so each is declared in `model.json`, and a program refuses those that it does not know.
+so each is declared in `model.json`, and a program refuses those that it cannot read.
 """
 FEATURES_BEFORE = {1: set(), 2: {"target"}, 3: {"reference"}, 4: {"windows"}, 5: {"measured-torque"}}
 """Formats 1 to 5 declared one feature by their number; other features could be there as well."""
@@ -195,7 +195,7 @@ def _features(posterior: Posterior) -> list[str]:
 
 
 def _declared(file: Path, document: Mapping[str, Any]) -> set[str]:
-    """The features that `model.json` declares. Raises FileFormatError for those that this version does not know."""
+    """The features that `model.json` declares. Raises FileFormatError for those that this version cannot read."""
     if document["format_version"] in FEATURES_BEFORE:
         return FEATURES_BEFORE[document["format_version"]]
     features = document.get("features")

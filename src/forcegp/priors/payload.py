@@ -1,4 +1,4 @@
-"""`Payload`: the weight of something that the robot carries and nobody told the model about."""
+"""`Payload`: the weight of something that the robot carries and the model does not contain."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Payload(ForcePrior):
     """Q_U = J_p^T m g + J_w^T sum_k (m c_k) R e_k x g: weight of an unknown mass m at c in the axes of link `frame`.
 
     J_p and J_w are the linear and angular Jacobians at the origin of `frame`, R its orientation. The four latents are
-    constants: m (kg) and the first moments m c (kg m), normal about zero, so the posterior tells mass and place with
+    constants: m (kg) and the first moments m c (kg m), normal about zero, so the posterior has mass and place with
     their covariance. It is the gravity of the load alone, which is what slow motions show; for its inertia, learn the
     parameters of the link (`StructuredGP.identify`). With `moments=False` the load
     is a point mass at the origin of the frame.

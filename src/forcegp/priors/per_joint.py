@@ -21,7 +21,7 @@ from forcegp.robots import Robot
 class PerJointPrior(ForcePrior):
     """Q_U,j = f_j(x_j), or minus that, in Nm or N: an independent function per joint, of its own position or velocity.
 
-    A subclass is a dataclass with the field `joints` (names as `chosen_joints` gives them, None: all), and says by
+    A subclass is a dataclass with the field `joints` (names as `chosen_joints` gives them, None: all), and defines by
     `depends_on` what x_j is: "q" or "v".
     """
 

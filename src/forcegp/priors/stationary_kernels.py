@@ -52,7 +52,7 @@ def rational_quadratic(dimension: int, variance: float | Tensor) -> ScaleKernel:
     """k = variance (1 + r^2 / (2 alpha))^-alpha: a mixture of squared exponentials of many length scales.
 
     Source: Rasmussen & Williams (2006), eq. 4.19. It starts at alpha = 1 with log alpha ~ N(0, 2^2), because nothing
-    tells a large alpha from a larger one.
+    separates a large alpha from a larger one.
     """
     base = RQKernel(ard_num_dims=dimension, lengthscale_constraint=log_scale(), alpha_constraint=log_scale())
     kernel = _scaled(base, math.sqrt(dimension), variance)

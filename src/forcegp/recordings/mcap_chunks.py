@@ -45,14 +45,13 @@ def mcap_chunks(reader: Any) -> list[Chunk] | None:
         if getattr(storage.metadata, "compression_mode", None) == "message":
             return None
         found = []
-        stores = getattr(storage, "storages", [storage])  # a directory has several, a file is one
-        for store in stores:
+        for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
             topics = {connection.id: connection.topic for connection in store.connections}
-            for chunk in store.chunks:
-                found.append(_chunk(chunk, topics, store.bio, str(store.path), decompress))
-        # where an offset no longer points to a chunk, everything read there would be garbage
-        right = all(_begins_at(chunk, store.bio) for store in stores for chunk in store.chunks[:1])
-        return found if found and right else None
+            # where the offset no longer points to the chunk, everything read there would be garbage
+            if not all(_begins_at(chunk, store.bio) for chunk in store.chunks[-1:]):
+                return None
+            found += [_chunk(chunk, topics, store.bio, str(store.path), decompress) for chunk in store.chunks]
+        return found or None
     except (ImportError, AttributeError, TypeError, ValueError):
         return None
 

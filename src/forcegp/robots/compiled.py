@@ -29,7 +29,7 @@ class CompiledRobot:
 
     The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, and backward passes give the
     derivatives with respect to all arguments and inertial parameters. Results agree to rounding. Not supported, with
-    an :class:`~forcegp.errors.InvalidInput` that says so: second derivatives, transforms of ``torch.func``,
+    an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of ``torch.func``,
     forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
 
     A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in

@@ -27,7 +27,7 @@ from torch import Tensor
 from forcegp.atomic_files import atomic_file
 from forcegp.codegen.native_code import C, compile_library
 from forcegp.errors import CompilerError
-from forcegp.robots.dynamics_programs import Request, trace
+from forcegp.robots.dynamics_programs import Request, trace_dynamics
 from forcegp.robots.machine_code import input_arrays, write_c
 from forcegp.robots.unrolled import UnrolledRobot
 
@@ -106,7 +106,7 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
     key = _key(unrolled, request, (capability, str(lanes), *options, *OPTIONS))
     path = _own_folder(folder) / f"{name}-{request.function}-{key[:32]}.so"
     if not path.exists():
-        compile_c(write_c(trace(unrolled, request), request.inputs, lanes), options, path)
+        compile_c(write_c(trace_dynamics(unrolled, request), request.inputs, lanes), options, path)
     _require_own(path)
     return CompiledProgram(path, input_arrays(request.inputs))
 

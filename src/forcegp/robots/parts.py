@@ -34,7 +34,7 @@ class Joint:
 
     @classmethod
     def of(cls, joint: JointDescription) -> Joint:
-        """What a description says about a movable joint, without its place in the tree."""
+        """A movable joint as a description has it, without its place in the tree."""
         return cls(**{field.name: getattr(joint, field.name) for field in fields(cls)})
 
 

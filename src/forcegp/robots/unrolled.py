@@ -15,7 +15,8 @@ import torch
 from forcegp.robots.scalar_algebra import Matrix
 from forcegp.robots.structure import RobotStructure
 
-# What is smaller in a rotation matrix or an inertia is rounding, of the turn onto the joint axis, say: sin(pi) = 1e-16.
+# What is smaller in a rotation matrix or an inertia is rounding, for example of the turn onto the joint axis: sin(pi) =
+# 1e-16.
 ROUNDING = 1e-15
 
 

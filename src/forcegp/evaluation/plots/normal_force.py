@@ -39,7 +39,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
     Raises InvalidInput without contacts, and for models that do not speak of forces.
     """
-    if not posterior.system.contacts or not posterior.speaks_of_forces:
+    if not posterior.system.contacts or not posterior.predicts_forces:
         raise InvalidInput(
             f"a model of {posterior.description} has no normal force to show; give one with contacts that speaks of "
             "forces."

@@ -88,7 +88,7 @@ def summary_figure(
 
 def _what(posterior: Posterior) -> str:
     return (
-        "the force that nobody modelled" if posterior.speaks_of_forces else f"the {posterior.description} all it knows"
+        "the force that nobody modelled" if posterior.predicts_forces else f"the {posterior.description} all it knows"
     )
 
 

@@ -43,7 +43,7 @@ Value = TypeVar("Value")
 class IndependentGP(Model):
     """a_j = f_j(q, v, u) + noise, with one zero-mean Gaussian process f_j per joint and nothing shared between joints.
 
-    It knows no mass matrix and no contact: the baseline "GP" of Rath et al. (2021), the row "independent GP" of every
+    It has no mass matrix and no contact: the baseline "GP" of Rath et al. (2021), the row "independent GP" of every
     comparison. Each of the nv problems has N rows, so that a fit costs nv N^3 and not (nv N)^3.
 
     Parameters
@@ -69,7 +69,7 @@ class IndependentGP(Model):
             object.__setattr__(self, "noise", Noise(self.noise))
         if self.noise is not None and self.noise.force is not None:
             raise InvalidInput(
-                "an IndependentGP has no noise of forces, for it knows no mass matrix; give Noise(acceleration) alone."
+                "an IndependentGP has no noise of forces, for it has no mass matrix; give Noise(acceleration) alone."
             )
 
     def fit(
@@ -89,7 +89,7 @@ class IndependentGP(Model):
         """Find the kernel and learned noise parameters of every joint in a search of its own, then condition.
 
         All arguments mean what they mean in `StructuredGP.fit`, and the starts are the same, too; of several starts
-        every joint keeps its own best. `progress(restart, iteration, objective)` tells the iteration that the joints
+        every joint keeps its own best. `progress(restart, iteration, objective)` reports the iteration that the joints
         are at on average, and the objective of the joint that is searched.
 
         Raises

@@ -1,4 +1,4 @@
-"""`IndependentPosterior`: what one Gaussian process per joint acceleration knows, joint by joint."""
+"""`IndependentPosterior`: one Gaussian process per joint acceleration, conditioned on data."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class IndependentLikelihood:
 class IndependentPosterior(Posterior):
     """An `IndependentGP` conditioned on training data; made by `IndependentGP.fit` or `load_posterior`.
 
-    Predictions have a diagonal covariance and speak of no force. Parameters have the names that a `StructuredGP` with
+    Predictions have a diagonal covariance and no forces. Parameters have the names that a `StructuredGP` with
     one kernel per joint gives them, so either can start the search of the other.
     """
 
@@ -168,7 +168,7 @@ class IndependentPosterior(Posterior):
 
     @property
     @override
-    def speaks_of_forces(self) -> bool:
+    def predicts_forces(self) -> bool:
         return False
 
     @property

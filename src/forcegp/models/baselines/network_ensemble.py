@@ -44,7 +44,8 @@ class NetworkEnsemble(NetworkModel):
     ----------
     system: what the robot is; contacts are those that predictions are checked on.
     noise: standard deviation of the measured acceleration if it is known; None takes `dataset.noise_std`, and where
-        the Dataset does not know either, the members' variances count as noise. Rows that differ in noise weigh alike.
+        the Dataset does not state it either, the members' variances count as noise. Rows that differ in noise weigh
+        alike.
     members, width, depth: networks, units of a layer, residual layers.
     steps, batch, rate, weight_decay: AdamW steps at most, rows of each, its first rate and weight decay.
     beta: 0 is the plain Gaussian likelihood, 1 weighs all errors equally; 0.5 as Seitzer et al. advise.

@@ -85,9 +85,10 @@ class NetworkModel(Model):
 class NetworkPosterior(Posterior):
     """A trained network or ensemble; made by its `fit` or by `load_posterior`.
 
-    The network sees how far measurements scatter about its mean, and cannot tell noise from its own error. Where the
-    noise is known (`model.noise`, given or stated by the Dataset) the noise covariance is that, and what the scatter
-    exceeds it by counts to the covariance of the acceleration; where it is not known, all of the scatter is noise.
+    The network sees how far measurements scatter about its mean, and cannot separate noise from its own error. Where
+    the noise is known (`model.noise`, given or stated by the Dataset) the noise covariance is that, and what the
+    scatter exceeds it by counts to the covariance of the acceleration; where it is not known, all of the scatter is
+    noise.
     """
 
     model: NetworkModel
@@ -131,7 +132,7 @@ class NetworkPosterior(Posterior):
 
     @property
     @override
-    def speaks_of_forces(self) -> bool:
+    def predicts_forces(self) -> bool:
         return False
 
     @property

@@ -41,7 +41,8 @@ class NeuralNetwork(NetworkModel):
     ----------
     system: what the robot is; contacts are those that predictions are checked on.
     noise: standard deviation of the measured acceleration if it is known; None takes `dataset.noise_std`, and where
-        the Dataset does not know either, all of the residual counts as noise. Rows that differ in noise weigh alike.
+        the Dataset does not state it either, all of the residual counts as noise. Rows that differ in noise weigh
+        alike.
     width: hidden units.
     steps, batch, rate: Adam steps, rows of each, and its rate.
     """
@@ -81,7 +82,7 @@ class NeuralNetwork(NetworkModel):
             parameters,
             value=float(residual.square().mean()),
             history=history,
-            status=f"ended after {self.steps} steps of a constant rate, which do not tell whether it has converged",
+            status=f"ended after {self.steps} steps of a constant rate, which do not show whether it has converged",
             converged=False,
             evaluations=self.steps,
             cpu_seconds=time.process_time() - start_time,

@@ -3,7 +3,7 @@
 With the Hessian in blocks of physical (p) and all other free parameters (k), the information about the physical ones is
 the Schur complement H_pp - H_pk H_kk^-1 H_kp: the curvature after the others have followed, and the inverse of their
 block of H^-1 (Laplace's approximation; Rasmussen & Williams 2006, section 3.4). It means that only at an optimum. How
-far that is, the Newton decrement tells (Boyd & Vandenberghe 2004, section 9.5.1),
+far that is, is the Newton decrement (Boyd & Vandenberghe 2004, section 9.5.1),
 
     sqrt(g^T S^-1 g),    g = g_p - H_pk H_kk^-1 g_k,    S = H_pp - H_pk H_kk^-1 H_kp,
 

@@ -1,4 +1,4 @@
-"""`Identification`: what a fit learned of the system itself, how sure it is, and what the data cannot tell."""
+"""`Identification`: what a fit learned of the system itself, with standard errors and what is not identified."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Identification:
     """Physical parameters before and after a fit, in SI units, centres of mass in link frames.
 
     `history` holds their values at the start and after every iteration of the search that won. Standard errors, their
-    covariance and what they say about the data are computed when first asked for, which takes one evaluation of the
+    covariance and the weak directions are computed when first asked for, which takes one evaluation of the
     objective for each free parameter and two for each physical one; `progress(done, of)` is called after every one.
     """
 
@@ -103,7 +103,7 @@ class Identification:
         except NumericalError as error:  # estimates that ran to the limit of what is allowed
             warnings.warn(
                 f"the curvature cannot be computed where the search ended ({error}), so nothing counts as identified: "
-                "fix a parameter that the data say nothing about, or give a prior",
+                "fix a parameter that the data do not inform, or give a prior",
                 NumericalWarning,
                 stacklevel=2,
             )
@@ -148,7 +148,7 @@ class Identification:
 
     @cached_property
     def standard_errors(self) -> dict[str, float]:
-        """By name, in SI units; infinite for a parameter that the data say nothing about."""
+        """By name, in SI units; infinite for a parameter that the data do not inform."""
         variances, vectors = self._directions
         lost = vectors[:, ~torch.isfinite(variances)]
         moved = (self._jacobian @ lost).abs().amax(1) if lost.shape[1] else torch.zeros(len(vectors)).double()
@@ -178,7 +178,7 @@ class Identification:
 
     @property
     def verdict(self) -> str:
-        """What the data cannot tell, as a sentence, after what the search did not reach."""
+        """What the data do not identify, as a sentence, after what the search did not reach."""
         if not self.at_optimum:
             doubts = "; ".join(self.curvature.doubts)
             return f"The search has not ended at a minimum ({doubts}): let it go on. {self._identified}"

@@ -6,8 +6,8 @@ Every parameter has a scaled form s with s = 0 at its start value:
     inertia about the centre of mass: its second moments are m0 V V^T with V upper triangular,
     log V_ii = log V0_ii + s and V_ij = V0_ij + (row i of V0's length) s.
 
-V does not know the mass, so a link whose inertia is not learned keeps it about its centre of mass whatever mass and
-centre become. In the log-Cholesky parameters of Rucker & Wensing (2022), whose factor carries e^alpha, that reads
+V does not depend on the mass, so a link whose inertia is not learned keeps it about its centre of mass whatever mass
+and centre become. In the log-Cholesky parameters of Rucker & Wensing (2022), whose factor carries e^alpha, that reads
 alpha = alpha0 + s/2, d_i = log V_ii + alpha0 - alpha and s_ij = V_ij e^(alpha0 - alpha). Every s gives a body that can
 exist. The search moves z with s = T z; T makes its steps comparable (`models.physical_scaling`).
 """
@@ -215,7 +215,7 @@ class PhysicalParameters:
         """The parameters that `MarginalLikelihood` understands, differentiable in z.
 
         Coefficients of one force that are learned in several groups are joined.
-        Raises NumericalError for values beyond `FARTHEST`, so that a search turns back: data that say nothing about a
+        Raises NumericalError for values beyond `FARTHEST`, so that a search turns back: data that do not inform a
         parameter let it run away.
         """
         farthest = float((self.transform @ z).detach().abs().amax()) if len(z) else 0.0

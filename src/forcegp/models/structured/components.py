@@ -1,4 +1,4 @@
-"""What a fitted model says about every force by itself: joint friction, tool friction, normal force, their sum."""
+"""Every force of a fitted model by itself: joint friction, tool friction, normal force, their sum."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def term_slices(prior: ForcePrior, robot: Robot) -> list[tuple[str, ForcePrior, 
 
 
 def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Latents, known: bool) -> Components:
-    """All components of Q_U = B f at the states of `dynamics`; `known` says whether Q_K acts beside them."""
+    """All components of Q_U = B f at the states of `dynamics`; `known`: whether Q_K acts beside them."""
     robot = dynamics.state.robot
     B = prior.mixing(dynamics)
     parts = {}

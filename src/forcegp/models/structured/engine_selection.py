@@ -80,7 +80,7 @@ def on_all_rows(
 ) -> StructuredPosterior:
     """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
 
-    `described` replaces what the settings say of the rows. Raises NotEnoughMemory, NumericalError.
+    `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
     """
     reference = fitted.training
     training = reference if len(rows) == len(reference.q) else _training(rows, reference)

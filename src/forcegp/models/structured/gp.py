@@ -58,8 +58,8 @@ class StructuredGP(StructuredModel):
     prior: the unknown force Q_U = B f; the default is one Gaussian process per joint on (q, v, u).
     mean: "analytical" keeps the known forces Q_K in the mean; "zero" drops them, so that the processes carry Q_K + Q_U.
     noise: measurement noise, a `Noise` or just its standard deviation. None takes `dataset.noise_std`, and raises if
-        the dataset does not know it: then pass `Noise(0.1, learn=True)` to learn it. Where the dataset states the noise
-        of every row, the level given or learned here is its root mean square over the training rows.
+        the dataset does not state it: then pass `Noise(0.1, learn=True)` to learn it. Where the dataset states the
+        noise of every row, the level given or learned here is its root mean square over the training rows.
     """
 
     def fit(
@@ -100,7 +100,7 @@ class StructuredGP(StructuredModel):
             `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
         engine: how the posterior is computed from all points: "exact", "iterative", "inducing", or one of
             `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
-            memory, and says why in `settings["engine_reason"]`.
+            memory, with the reason in `settings["engine_reason"]`.
         learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
             up to 1500 and 600 beyond. The posterior is that of all points.
         progress: called as progress(restart, iteration, nll) where the restarts run in this process. The restart is

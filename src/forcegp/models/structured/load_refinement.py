@@ -23,7 +23,7 @@ PLACES = 60
 """Velocities at which a curve is tabulated, of those that the data visited."""
 BEYOND = (1.2, 1.5, 2.0, 3.0, 5.0)
 """Multiples of the largest and smallest visited velocity at which it is tabulated as well: continued from the last two
-of `PLACES`, whose difference is noise, it would soon be far from what the curve itself says.
+of `PLACES`, whose difference is noise, it would soon be far from the curve itself.
 """
 
 
@@ -47,14 +47,14 @@ def fit_with_refined_loads(
         kept = _refined(first, again, rounds)
     if kept is not first:
         with torch.no_grad():
-            kept.model.prior.mixing(kept.likelihood.dynamics())  # says where the friction that was found jams
+            kept.model.prior.mixing(kept.likelihood.dynamics())  # warns where the friction that was found jams
     return kept
 
 
 def _refined(
     first: StructuredPosterior, again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior], rounds: int
 ) -> StructuredPosterior:
-    given = first.model.prior  # whose terms tell which expectations are the user's
+    given = first.model.prior  # whose terms hold the expectations of the user
     best = last = first
     for fits in range(rounds + 1):
         prior = refined_loads(given, last.model.system.robot, lambda name, p=last: _table(p, name))
@@ -62,7 +62,7 @@ def _refined(
             return first
         change = _change(last, prior)
         if change < SETTLED:
-            # the last expects what its own curves say; an earlier one would have to earn that it does not
+            # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
             return last if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE else best
         if fits == rounds:
             warnings.warn(

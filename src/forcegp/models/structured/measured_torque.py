@@ -1,9 +1,9 @@
-"""What a noisy torque sensor tells of the acceleration, where it would otherwise tell too much.
+"""The acceleration under torques from a noisy sensor, whose noise forward dynamics would amplify.
 
 Forward dynamics divides by the inertia: 0.05 Nm of noise at a wrist of 1e-3 kg m^2 are 50 rad/s^2, while the wrist
 moves at 1. The torque of a prediction is as noisy as those of the training rows, u = u_true + e with e ~ N(0, F), so at
-given forces f the measured u says a ~ N(a_f, H F H^T), with a_f what the noise-free model computes from u. The motions
-of the robot say a ~ N(0, S). By Bayes' rule
+given forces f the measured u implies a ~ N(a_f, H F H^T), with a_f what the noise-free model computes from u. The
+motions of the robot imply a ~ N(0, S). By Bayes' rule
 
     a | u, f ~ N(G a_f, H F H^T G^T),      G = S (H F H^T + S)^-1,
 

@@ -1,4 +1,4 @@
-"""`StructuredPosterior`: what a fitted structured model knows, as a value that predicts, and saves and loads itself."""
+"""`StructuredPosterior`: a fitted structured model as a value that predicts."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class StructuredPosterior(Posterior):
         noise = self.model.noise
         if noise is not None and noise.measured_torque:
             raise InvalidInput(
-                "a predictor is for commanded torques, and this model was told that u comes from a noisy sensor; call "
+                "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}

@@ -1,4 +1,4 @@
-"""What data cannot teach a prior, said before anything is fitted."""
+"""What data cannot teach a prior, checked before anything is fitted."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, eff
     if any(absent):
         warnings.warn(
             f"{_few([name for name, nothing in zip(names, absent, strict=True) if nothing])} moves no joint at any "
-            "training row, so what the model says about it is its prior; give data in other postures, or leave it out "
+            "training row, so its posterior is its prior; give data in other postures, or leave it out "
             "if the prior can do without",
             DataWarning,
             stacklevel=5,
@@ -116,7 +116,7 @@ def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, eff
     if blind:
         warnings.warn(
             f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
-            f"what the model says about it and about the normal force is its prior; {remedy}",
+            f"its posterior and that of the normal force are the prior; {remedy}",
             DataWarning,
             stacklevel=5,
         )
@@ -133,10 +133,10 @@ def _check_distinct(
     for first, second in torch.nonzero(torch.triu(cosines.abs() > 1.0 - EQUAL, diagonal=1)).tolist():
         one, other = features[first], features[second]
         if terms[first] == terms[second] or not (shows[first] and shows[second]):
-            continue  # joints that the constraint couples; one prior knows that its latents are independent
+            continue  # joints that the constraint couples; one prior makes its own latents independent
         if one.shape == other.shape and bool(((one - other).abs() <= EQUAL * (1.0 + one.abs())).all()):
             raise InvalidInput(
-                f"no data can tell {names[first]!r} and {names[second]!r} apart: both act in the same direction and "
+                f"no data can separate {names[first]!r} and {names[second]!r}: both act in the same direction and "
                 "depend on the same inputs; leave one of them out"
             )
 

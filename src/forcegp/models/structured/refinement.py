@@ -61,18 +61,18 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
             seed=engine.seed,
             report=report,
         )
-        with torch.no_grad():  # steps are noisy: what they came to is told by the bound on all rows
+        with torch.no_grad():  # steps are noisy: the bound on all rows decides
             before = float(objective(start))
             try:
                 after = float(objective(result.parameters))
             except NumericalError:  # steps so wide that no bound can be computed where they ended
                 after = math.inf
         if not after <= before:
-            told = f"{result.status} would raise the bound on all rows from {before:.1f} to {after:.1f} nats"
+            outcome = f"{result.status} would raise the bound on all rows from {before:.1f} to {after:.1f} nats"
             if not after <= before + NOISE:
                 remedy = f"give Stochastic a smaller rate ({engine.rate} now), a larger batch or more steps"
-                warnings.warn(f"{told}, so that nothing was changed; {remedy}", NumericalWarning, stacklevel=3)
-            return _checked(posterior.with_settings(refined=f"unchanged: {told}"))
+                warnings.warn(f"{outcome}, so that nothing was changed; {remedy}", NumericalWarning, stacklevel=3)
+            return _checked(posterior.with_settings(refined=f"unchanged: {outcome}"))
         return _checked(_moved_to(posterior, replace(result, history=(before, after), value=after)))
     return _checked(posterior)
 

@@ -1,4 +1,4 @@
-"""How far the training points are from the surfaces that they are said to touch."""
+"""How far the training points are from the surfaces that they should touch."""
 
 from __future__ import annotations
 

@@ -82,12 +82,12 @@ def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
     """DataWarning where rows state one noise for all of them, another than the fit's data did, which stays in use."""
     stated = rows.noise_std
     if stated is None or stated.ndim == 2:
-        return  # nothing stated, or stated row by row: then every row is as noisy as it says
+        return  # nothing stated, or stated row by row: then every row is as noisy as stated
     if bool((np.abs(stated / level - 1.0) > OTHER_NOISE).any()):
-        say = ", ".join(f"{mine:.3g} ({fit:.3g})" for mine, fit in zip(stated, level, strict=True))
+        levels = ", ".join(f"{mine:.3g} ({fit:.3g})" for mine, fit in zip(stated, level, strict=True))
         warnings.warn(
-            f"the new rows state another noise per joint than the data of the fit (in brackets): {say}. The level of "
-            "the fit is used for them, too; state the noise of every row (noise_std of shape (rows, nv)) in the fit "
+            f"the new rows state another noise per joint than the data of the fit (in brackets): {levels}. The level "
+            "of the fit is used for them, too; state the noise of every row (noise_std of shape (rows, nv)) in the fit "
             "and here, or fit again to all rows",
             DataWarning,
             stacklevel=4,
@@ -110,7 +110,7 @@ def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int
 
 
 def _with_row_noise(rows: Dataset, reference: TrainingData) -> Dataset:
-    """Rows that state one noise for all of them say it for every row, where the training rows did so."""
+    """Rows that state one noise for all of them state it for every row, where the training rows did so."""
     if reference.noise_std is None or rows.noise_std is None or rows.noise_std.ndim == 2:
         return rows
     return replace(rows, noise_std=np.tile(rows.noise_std, (len(rows), 1)))
