@@ -61,6 +61,7 @@ def test_a_defect_in_one_job_does_not_cost_the_others(results, task, cause):
     assert not results.place("bad").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
 def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(results):
     with pytest.raises(BackendError, match=r"died 4 times while task dead .*1 of 2 jobs are kept"):
@@ -70,7 +71,7 @@ def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(result
 
 def test_a_process_that_is_killed_is_replaced(results, tmp_path):
     job = Job("killed", f"{TOY}:die_once", {"marker": str(tmp_path / "marker")})
-    with pytest.warns(WorkerWarning, match="a process died while task killed was at work"):
+    with pytest.warns(WorkerWarning, match="task killed"):
         assert run_jobs(results, [job, square(2)]) == 2
     assert results.result("killed") == {"survived": True}
     assert not list((tmp_path / "out").glob("**/*.tmp"))
@@ -123,13 +124,14 @@ def test_warnings_are_kept_with_the_job(results):
     assert results.load("w")["warnings"] == ["look here"]
 
 
+@pytest.mark.nightly
 def test_kill_9_loses_only_the_job_at_work_and_leaves_no_process(tmp_path):
     begun = tmp_path / "begun"
     script = (
         "from pathlib import Path\n"
         "from tests.jobs.test_running import *\n"
         "if __name__ == '__main__':\n"
-        f"    slow = Job('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=300))\n"
+        f"    slow = Job('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
         f"    run_jobs(JobStore.open(Path({str(tmp_path / 'out')!r}), 'a test', {{}}), [square(2), slow])\n"
     )
     (tmp_path / "script.py").write_text(script)
@@ -154,8 +156,8 @@ def _alive(process: int) -> bool:
     return status.exists() and "State:\tZ" not in status.read_text()
 
 
-def _wait_until(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+def _wait_until(condition) -> None:
+    end = time.monotonic() + 600.0  # a guard against a hang
     while not condition():
         assert time.monotonic() < end, "it never happened"
         time.sleep(0.05)

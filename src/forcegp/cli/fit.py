@@ -15,12 +15,7 @@ import forcegp.robots
 from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit_options import ModelOptions
-from forcegp.cli.model_choice import (
-    make_model,
-    resolved,
-    search_arguments,
-    window_observation,
-)
+from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
 from forcegp.cli.output_folders import require_free_folder
 from forcegp.cli.tables import facts
 from forcegp.cli.terminal import Terminal

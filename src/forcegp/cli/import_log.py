@@ -127,7 +127,6 @@ class Import(PreparationOptions, RobotOptions):
         require_free_file(self.out, overwrite=self.overwrite)
         if self.write_mapping is not None:
             require_free_file(self.write_mapping, overwrite=self.overwrite)
-
         mapping = self._mapping(terminal)
         options = forcegp.ImportOptions(
             gap=self.gap,

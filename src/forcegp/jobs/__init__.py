@@ -1,8 +1,5 @@
 """Pieces of work whose results are kept: computed once, on any backend, until their settings or their code change."""
 
-from forcegp.jobs.code_digest import code_digest
-from forcegp.jobs.job import Job, digests
-from forcegp.jobs.running import Progress, run_jobs
-from forcegp.jobs.store import JobStore
+import lazy_loader as lazy
 
-__all__ = ["Job", "JobStore", "Progress", "code_digest", "digests", "run_jobs"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

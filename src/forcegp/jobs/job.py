@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from forcegp.jobs.code_digest import code_digest
+from forcegp.jobs.source_code import code_digest
 
 
 @dataclass(frozen=True)

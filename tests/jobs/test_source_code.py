@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.jobs.code_digest import _source, code_digest, imported_files
+from forcegp.jobs.source_code import _file, _source, code_digest, imported_files
 
 FILES = {
     "__init__.py": "",
@@ -35,6 +35,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
     "lazy/__init__.pyi": "from .one import One\nfrom .two import Two\n",
     "lazy/one.py": "One = 1\n",
     "lazy/two.py": "Two = 2\n",
+    "uses_dotted.py": "import toolbox.lazy\ndef run():\n    return toolbox.lazy.One.real\n",
     "uses_lazy.py": "from toolbox.lazy import One\n",
     "uses_room.py": "from toolbox import lazy\n",
     "names.py": "TASK = 'forcegp.errors:f'\n",
@@ -57,6 +58,7 @@ def now(*modules: str) -> str:
     """The digest that a new process would find."""
     code_digest.cache_clear()
     _source.cache_clear()
+    _file.cache_clear()
     return code_digest(*modules)
 
 
@@ -94,12 +96,14 @@ def area(x):
 
 
 def test_names_of_lazy_packages_lead_to_their_modules(toolbox):
-    before = {name: now(f"toolbox.{name}") for name in ("uses_lazy", "uses_room")}
+    before = {name: now(f"toolbox.{name}") for name in ("uses_lazy", "uses_dotted", "uses_room")}
     change(toolbox / "lazy/two.py")
     assert now("toolbox.uses_lazy") == before["uses_lazy"]
+    assert now("toolbox.uses_dotted") == before["uses_dotted"]
     assert now("toolbox.uses_room") != before["uses_room"]
     change(toolbox / "lazy/one.py")
     assert now("toolbox.uses_lazy") != before["uses_lazy"]
+    assert now("toolbox.uses_dotted") != before["uses_dotted"]
 
 
 def test_modules_named_in_texts_count(toolbox):
@@ -120,7 +124,7 @@ def test_modules_without_source_count_by_name(toolbox):
 
 def test_the_task_of_a_figure_rests_on_models_and_not_on_other_figures_or_commands():
     found = imported_files("forcegp.experiments.fits")
-    for module in ("models.structured_gp", "inference.likelihood", "robots.algorithms", "mechanics.gauss_principle"):
+    for module in ("models.structured.gp", "inference.likelihood", "robots.algorithms", "mechanics.gauss_principle"):
         assert f"forcegp.{module}" in found, module
     assert "forcegp.simulation.kuka_surface" in imported_files("forcegp.experiments.data")
     assert not [name for name in found if name.startswith(("forcegp.cli", "forcegp.validation", "forcegp.checks"))]
