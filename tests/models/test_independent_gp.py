@@ -188,6 +188,7 @@ def test_iterates_belong_to_the_history(train, learn):
     assert model.fit(train, points=15, restarts=1, options=OptimizerOptions(iterations=2)).result.iterates == ()
 
 
+@pytest.mark.nightly  # test_structured_gp.py covers processes
 def test_restarts_in_processes_give_the_same(train):
     model = IndependentGP(train.system)
     how = {"points": 12, "restarts": 2, "seed": 7, "options": OptimizerOptions(iterations=3)}

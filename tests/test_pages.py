@@ -1,0 +1,102 @@
+"""The code of the pages in docs/ runs as it stands and prints what its comments say."""
+
+import re
+import shlex
+from pathlib import Path
+
+from tests.cli.in_process import run_here
+from tests.examples import run_example
+
+from forcegp.cli.arguments import parse_arguments
+
+
+def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "your-robot.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    noise, error, *_, any_force, friction = printed.splitlines()
+    assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
+    assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
+    assert float(error) < 0.3
+
+
+def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "comparing-priors.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    verdict, joint, contact, none, left_out = printed.splitlines()
+    assert verdict.startswith("The data support contact: ")
+    scores = [float(re.search(r"functions, (\S+) nats per row", line)[1]) for line in (joint, contact, none)]
+    assert scores[1] > scores[0] > scores[2]
+    assert left_out.endswith("torch.Size([30, 7]) torch.Size([30, 7, 7])")
+    for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
+        for command in re.findall(r"^ *forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
+            parse_arguments(shlex.split(command.partition(">")[0].replace("$seed", "1")))
+
+
+def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    mass, verdict, _ = printed.splitlines()[-3:]
+    found, error = (float(number) for number in re.fullmatch(r"(\S+) \+- (\S+) kg", mass).groups())
+    assert abs(found - 2.0) < 0.1
+    assert 0.0 < error < 0.05
+    assert verdict == "The data identify every parameter that was learned."
+    assert 'xyz="' in (tmp_path / "identified.urdf").read_text()
+
+
+def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
+    commands, _ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the second needs a log of the reader's own
+    for command in commands.splitlines():
+        program, *words = command.split()
+        assert program == "forcegp"
+        done = run_here(*words, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "identified" / "identified.urdf").exists()
+
+
+def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    states, more, diverged, free, held = printed.splitlines()[-5:]
+    assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
+    assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
+    assert diverged == "tensor([-1, -1])"
+    assert float(held.split()[0]) < 0.5 * float(free.split()[0])
+
+
+def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "incremental.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    assert printed.splitlines()[-1] == "70 40"
+
+
+def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "large-data.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    engine, refined, left_out = printed.splitlines()
+    assert engine == "inducing: as asked for"
+    assert refined.startswith("on all rows, ")
+    assert float(left_out.split()[2]) <= 1.0
+    (commands,) = re.findall(r"```console\n(.*?)```", page, re.DOTALL)
+    names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
+    assert names == ["Fit", "Fit", "Fit"]
+
+
+def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "gpu.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path)
+    assert printed.splitlines()[-1] == "cpu"
+
+
+def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
+    page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
+    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
+    assert names == ["Simulate", "Simulate", "Fit", "Rollout"]
