@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
 from forcegp.experiments.data import data_job
-from forcegp.jobs import Job
+from forcegp.jobs import Job, JobStore
 
 Row = dict[str, str | int | float | None]
 

@@ -117,7 +117,7 @@ def paired_test(
     return PairedTest(score, challenger, baseline, len(a), int((difference < 0.0).sum()), shown(mean), interval)
 
 
-def conclusions(summary: Mapping[str, Any], jobs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def conclusions(summary: Mapping[str, Any], runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """The answers to all questions for which there are models of both kinds, as plain JSON values."""
     out = []
     for question, challengers, baselines in QUESTIONS:
@@ -172,10 +172,10 @@ def best_of(
 
 
 def compared(
-    score: str, challenger: str, baseline: str, jobs: Mapping[str, Sequence[Mapping[str, Any]]]
+    score: str, challenger: str, baseline: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> PairedTest | None:
     """`paired_test` over the runs that both models finished."""
-    one, other = runs_of(score, jobs[challenger]), runs_of(score, jobs[baseline])
+    one, other = runs_of(score, runs[challenger]), runs_of(score, runs[baseline])
     shared = [run for run in one if run in other]
     found = paired_test(score, challenger, baseline, [one[run] for run in shared], [other[run] for run in shared])
     if found is None or score == "motion":
