@@ -24,7 +24,7 @@ import torch
 from gpytorch.kernels import Kernel, ScaleKernel
 from threadpoolctl import threadpool_limits
 
-from forcegp.inference.kernel_matrices import taken_apart
+from forcegp.inference.dense_kernels import taken_apart
 from forcegp.inference.likelihood import negative_log_likelihood
 from forcegp.priors import ToolForces
 from forcegp.priors.kernels import kernel_of, squared_exponential_kernel

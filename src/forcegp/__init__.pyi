@@ -1,5 +1,4 @@
 # The whole public API, by theme; __init__.py reads this list. isort: skip_file
-# ruff: noqa: I001
 
 # the robot
 from .robots import Robot as Robot

@@ -139,7 +139,7 @@ def test_compiled_sums_are_those_of_torch(latents: int, count: int):
     expected = torch.stack(
         [s * torch.exp(-0.5 * ((far[:, None] - centers) / length).square().sum(-1)) for length, s in scales], dim=1
     )
-    mean, cross = CompiledSums(group, weights)(inputs, True)
+    mean, cross = CompiledSums(group.centers, group.own, weights)(inputs, True)
     assert float((cross - expected).abs().max()) < 1e-12
     assert float((cross - group.cross(inputs)).abs().max()) < 1e-12
     assert float((mean - (expected * weights).sum(-1)).abs().max()) < 1e-11

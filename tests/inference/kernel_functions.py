@@ -3,7 +3,7 @@
 from gpytorch.kernels import Kernel
 from torch import Tensor
 
-from forcegp.inference.kernel_matrices import taken_apart
+from forcegp.inference.dense_kernels import taken_apart
 
 
 def kernel_matrix(kernel: Kernel, z: Tensor) -> Tensor:

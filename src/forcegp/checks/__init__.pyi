@@ -1,5 +1,2 @@
-from .findings import SEVERITIES as SEVERITIES
-from .findings import Finding as Finding
-from .findings import Severity as Severity
-from .report import CheckReport as CheckReport
-from .report import check as check
+from .findings import SEVERITIES as SEVERITIES, Finding as Finding, Severity as Severity
+from .report import CheckReport as CheckReport, check as check

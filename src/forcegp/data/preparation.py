@@ -26,9 +26,6 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""
 
-SPLINE_ROWS = 24
-"""Rows after which a cubic spline has forgotten a value, to `FORGOTTEN`: it falls by 2 - sqrt(3) per row."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:

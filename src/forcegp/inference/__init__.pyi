@@ -1,28 +1,18 @@
-from .block_cross_validation import LeaveOut as LeaveOut
-from .block_cross_validation import leave_blocks_out as leave_blocks_out
-from .engines import ENGINES as ENGINES
-from .engines import Choice as Choice
-from .engines import Engine as Engine
-from .engines import Exact as Exact
-from .engines import Inducing as Inducing
-from .engines import Iterative as Iterative
-from .engines import ProblemSize as ProblemSize
-from .engines import Stochastic as Stochastic
-from .engines import choose_engine as choose_engine
-from .engines import engine_from_dict as engine_from_dict
-from .engines import engine_of as engine_of
-from .inducing import InducingPosterior as InducingPosterior
-from .inducing import collapsed_bound as collapsed_bound
+from .block_cross_validation import LeaveOut as LeaveOut, leave_blocks_out as leave_blocks_out
+from .engines import (
+    ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing, Iterative as
+    Iterative, ProblemSize as ProblemSize, Stochastic as Stochastic, choose_engine as choose_engine, engine_from_dict as
+    engine_from_dict, engine_of as engine_of,
+)
+from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound
 from .iterative import IterativePosterior as IterativePosterior
 from .kernels import LatentKernels as LatentKernels
 from .likelihood import negative_log_likelihood as negative_log_likelihood
 from .linear_functionals import FunctionalPosterior as FunctionalPosterior
 from .memory import require_memory as require_memory
-from .optimization import OptimizationResult as OptimizationResult
-from .optimization import OptimizerOptions as OptimizerOptions
-from .optimization import best_of as best_of
-from .optimization import minimize_objective as minimize_objective
-from .posterior import ExactPosterior as ExactPosterior
-from .posterior import LatentPosterior as LatentPosterior
-from .posterior import exact as exact
+from .optimization import (
+    OptimizationResult as OptimizationResult, OptimizerOptions as OptimizerOptions, best_of as best_of,
+    minimize_objective as minimize_objective,
+)
+from .posterior import ExactPosterior as ExactPosterior, LatentPosterior as LatentPosterior, exact as exact
 from .terms import Terms as Terms

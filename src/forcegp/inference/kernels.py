@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import DenseKernel, taken_apart
+from forcegp.inference.dense_kernels import DenseKernel, taken_apart
 
 
 class LatentKernels(torch.nn.Module):

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.inference.kernel_matrices import DenseKernel
+from forcegp.inference.dense_kernels import DenseKernel
 
 ROUNDING = 1e-13
 """Remainders below this fraction of the largest k(z, z) are rounding."""

@@ -17,7 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.inference.compiled_kernels import CompiledSums
-from forcegp.inference.kernel_matrices import DenseKernel, squared_exponential_parameters
+from forcegp.inference.dense_kernels import DenseKernel
+from forcegp.inference.kernel_matrices import squared_exponential_parameters
 from forcegp.inference.posterior import LatentPosterior
 
 

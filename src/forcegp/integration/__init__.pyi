@@ -1,14 +1,8 @@
-from .constraint_manifold import ConstraintManifold as ConstraintManifold
-from .constraint_manifold import ProjectedPosition as ProjectedPosition
-from .integrators import INTEGRATORS as INTEGRATORS
-from .integrators import Acceleration as Acceleration
-from .integrators import Integrator as Integrator
-from .integrators import Projected as Projected
-from .integrators import RungeKutta4 as RungeKutta4
-from .integrators import Step as Step
-from .integrators import SymplecticEuler as SymplecticEuler
-from .integrators import integrator_named as integrator_named
-from .trajectory import SPEED_LIMIT as SPEED_LIMIT
-from .trajectory import Feedback as Feedback
-from .trajectory import Trajectory as Trajectory
-from .trajectory import integrate as integrate
+from .constraint_manifold import ConstraintManifold as ConstraintManifold, ProjectedPosition as ProjectedPosition
+from .integrators import (
+    INTEGRATORS as INTEGRATORS, Acceleration as Acceleration, Integrator as Integrator, Projected as Projected,
+    RungeKutta4 as RungeKutta4, Step as Step, SymplecticEuler as SymplecticEuler, integrator_named as integrator_named,
+)
+from .trajectory import (
+    SPEED_LIMIT as SPEED_LIMIT, Feedback as Feedback, Trajectory as Trajectory, integrate as integrate,
+)

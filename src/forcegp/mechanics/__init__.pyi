@@ -1,23 +1,14 @@
-from .contacts import Baumgarte as Baumgarte
-from .contacts import Contact as Contact
-from .gauss_principle import AffineMap as AffineMap
-from .gauss_principle import ConstrainedDynamics as ConstrainedDynamics
-from .known_forces import KNOWN_FORCES as KNOWN_FORCES
-from .known_forces import Actuation as Actuation
-from .known_forces import Armature as Armature
-from .known_forces import ConstantJointForce as ConstantJointForce
-from .known_forces import CoulombJointFriction as CoulombJointFriction
-from .known_forces import KnownForce as KnownForce
-from .known_forces import LoadJointFriction as LoadJointFriction
-from .known_forces import RigidBodyBias as RigidBodyBias
-from .known_forces import RotorInertia as RotorInertia
-from .known_forces import StribeckJointFriction as StribeckJointFriction
-from .known_forces import ViscousJointFriction as ViscousJointFriction
+from .contacts import Baumgarte as Baumgarte, Contact as Contact
+from .gauss_principle import AffineMap as AffineMap, ConstrainedDynamics as ConstrainedDynamics
+from .known_forces import (
+    KNOWN_FORCES as KNOWN_FORCES, Actuation as Actuation, Armature as Armature, ConstantJointForce as
+    ConstantJointForce, CoulombJointFriction as CoulombJointFriction, KnownForce as KnownForce, LoadJointFriction as
+    LoadJointFriction, RigidBodyBias as RigidBodyBias, RotorInertia as RotorInertia, StribeckJointFriction as
+    StribeckJointFriction, ViscousJointFriction as ViscousJointFriction,
+)
 from .state import State as State
-from .surfaces import Cylinder as Cylinder
-from .surfaces import ImplicitSurface as ImplicitSurface
-from .surfaces import Plane as Plane
-from .surfaces import Sphere as Sphere
-from .surfaces import Surface as Surface
+from .surfaces import (
+    Cylinder as Cylinder, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere, Surface as Surface,
+)
 from .system import MechanicalSystem as MechanicalSystem
 from .tangent_frame import surface_axes as surface_axes

@@ -4,21 +4,14 @@ from .baselines.network_ensemble import NetworkEnsemble as NetworkEnsemble
 from .baselines.network_posterior import NetworkPosterior as NetworkPosterior
 from .baselines.neural_network import NeuralNetwork as NeuralNetwork
 from .identification.identification import Identification as Identification
-from .identification.physical_parameters import Coefficients as Coefficients
-from .identification.physical_parameters import Learned as Learned
+from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned
 from .noise import Noise as Noise
-from .prediction import Gaussian as Gaussian
-from .prediction import Prediction as Prediction
-from .predictor import Linearization as Linearization
-from .predictor import Predictor as Predictor
-from .protocol import Model as Model
-from .protocol import Posterior as Posterior
+from .prediction import Gaussian as Gaussian, Prediction as Prediction
+from .predictor import Linearization as Linearization, Predictor as Predictor
+from .protocol import Model as Model, Posterior as Posterior
 from .rollout import Rollout as Rollout
-from .search import ALL_ROWS as ALL_ROWS
-from .search import default_options as default_options
-from .search import default_restarts as default_restarts
-from .storage import load_posterior as load_posterior
-from .storage import save_posterior as save_posterior
+from .search import ALL_ROWS as ALL_ROWS, default_options as default_options, default_restarts as default_restarts
+from .storage import load_posterior as load_posterior, save_posterior as save_posterior
 from .structured.gp import StructuredGP as StructuredGP
 from .structured.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .structured.posterior import StructuredPosterior as StructuredPosterior

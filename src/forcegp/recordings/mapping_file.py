@@ -17,7 +17,6 @@ from forcegp.recordings.source import reading
 
 LARGEST = 2**20  # bytes
 OF_FOLDER = "forcegp.yaml"
-TEXTS = ("time", "episode", "episodes", "delimiter")
 
 
 class _OnceLoader(yaml.SafeLoader):
