@@ -1,4 +1,4 @@
-"""The rules of docs/architecture.md, kept: which room imports which, and what an import may cost."""
+"""The rules of docs/architecture.md, kept: which package imports which, and what an import may cost."""
 
 import ast
 import re
@@ -15,8 +15,8 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = REPOSITORY / "src" / "forcegp"
 
-# The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
-ROOMS = {
+# The packages in the order in which data flows, and which packages each may import: the table of docs/architecture.md.
+PACKAGES = {
     "errors": set(),
     "atomic_files": {"errors"},
     "codegen": {"errors"},
@@ -45,12 +45,12 @@ ROOMS = {
     },
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
-ROOMS["evaluation"] = set(ROOMS) - {"simulation"}
-ROOMS["validation"] = set(ROOMS) - {"simulation"}
-ROOMS["experiments"] = set(ROOMS)
-ROOMS["cli"] = set(ROOMS)
+PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}
+PACKAGES["validation"] = set(PACKAGES) - {"simulation"}
+PACKAGES["experiments"] = set(PACKAGES)
+PACKAGES["cli"] = set(PACKAGES)
 
-# Optional or slow to import: imported inside the function that uses them. Modules and rooms named here may import them
+# Optional or slow to import: imported inside the function that uses them. Modules and packages named here may import them
 # at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
     "pybullet": (),
@@ -80,8 +80,8 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def room(module: str) -> str:
-    """The room of a module of forcegp; the public page `forcegp/__init__.py` stands above all rooms and has none."""
+def package_of(module: str) -> str:
+    """The package of a module; the public page `forcegp/__init__.py` stands above all packages and has none."""
     return module.split(".")[1] if "." in module else ""
 
 
@@ -163,25 +163,25 @@ def test_the_table_in_the_docs_is_the_one_kept_here():
             assert named or allowed == "nothing", f"docs/architecture.md, row {name}: cannot read {allowed!r}"
             table[name] = named
         above.append(name)
-    assert table == ROOMS
+    assert table == PACKAGES
 
 
 def test_every_module_belongs_to_a_room():
-    strangers = sorted({room(module) for module in MODULES} - ROOMS.keys() - {""})
-    assert not strangers, f"rooms that docs/architecture.md does not list: {strangers}"
+    strangers = sorted({package_of(module) for module in MODULES} - PACKAGES.keys() - {""})
+    assert not strangers, f"packages that docs/architecture.md does not list: {strangers}"
 
 
 @pytest.mark.parametrize("module", [module for module in MODULES if module != "forcegp"])
 def test_imports_go_only_to_allowed_rooms(module):
-    allowed = ROOMS[room(module)]
+    allowed = PACKAGES[package_of(module)]
     offences = [
         f"{MODULES[module].relative_to(REPOSITORY)}:{item.line} imports {item.name}"
         for item in IMPORTS[module]
         if item.name.split(".")[0] == "forcegp"
-        and room(item.name) not in allowed | {room(module)}
+        and package_of(item.name) not in allowed | {package_of(module)}
         and item.name not in ("forcegp", "forcegp.__version__")
     ]
-    assert not offences, "\n".join([*offences, f"{room(module)} may import {sorted(allowed) or 'no room'}"])
+    assert not offences, "\n".join([*offences, f"{package_of(module)} may import {sorted(allowed) or 'no package'}"])
 
 
 def longest_module(name: str) -> str:

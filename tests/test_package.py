@@ -26,9 +26,9 @@ def test_one_version_everywhere(repository):
 def test_public_names_are_public_in_their_rooms_and_documented(name, repository):
     value = getattr(forcegp, name)
     page = (repository / "src/forcegp/__init__.pyi").read_text()
-    room = re.search(rf"^from \.(\w+) import {name} as {name}$", page, re.M)
-    assert room is not None
-    assert value is getattr(import_module(f"forcegp.{room[1]}"), name)
+    package = re.search(rf"^from \.(\w+) import {name} as {name}$", page, re.M)
+    assert package is not None
+    assert value is getattr(import_module(f"forcegp.{package[1]}"), name)
     assert value.__doc__, f"{name} has no docstring"
     assert name in dir(forcegp)
 

@@ -5,7 +5,7 @@ Residuals r_n = a_n - a^_n that have noise of both kinds are normal with covaria
     S_n = diag(sigma_a^2) + M_n^-1 diag(sigma_F^2) M_n^-1,
 
 so joints of small inertia count less where the noise is one of forces. The two levels of every joint are those of
-largest likelihood (the model of `forcegp.models.Noise`).
+largest likelihood (the model of `forcegp.models.Noise`). One level per joint would let rows of large M^-1 decide.
 """
 
 from __future__ import annotations

@@ -3,6 +3,9 @@
 The function runs once on an example, while `make_fx` of torch notes the operations; loops and branches of Python leave
 no trace. Operations that only move numbers (slices, stacks, transposes, ...) run on tensors of node numbers instead of
 values, so torch itself does the moving.
+
+A second implementation of each force is not needed: surfaces, known forces and priors of anybody are on the tape as
+they stand. At one state the cost of rigid-body dynamics is that of calling torch operations.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""`DatasetWriter`: a dataset file written in pieces, for data that need not fit into memory."""
+"""`DatasetWriter`: a dataset file written in pieces, for data that need not fit into memory.
+
+Columns are written by more than one thread: HDF5's deflate takes more time than reading, interpolating and
+differentiating together, and runs on one.
+"""
 
 from __future__ import annotations
 

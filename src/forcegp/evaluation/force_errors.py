@@ -1,4 +1,8 @@
-"""Errors of every force by itself: its components, their force at the tool, and the normal force."""
+"""Errors of every force by itself: its components, their force at the tool, and the normal force.
+
+A Dataset holds the truth of a force by its name, `Q_U.<name>` and `force.<name>`. Where two components claim the same
+truth none is compared, since only their sum is true then.
+"""
 
 from __future__ import annotations
 

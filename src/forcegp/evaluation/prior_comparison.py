@@ -1,6 +1,8 @@
 """Which prior on the unknown forces do the data support? Candidates fitted to the same rows, and rows left out.
 
-The score is the log predictive density of stretches of time that are left out, in closed form (`posterior.leave_out`).
+The score is the log predictive density of stretches of time that are left out, in closed form (`posterior.leave_out`),
+not the marginal likelihood: candidates differ in the number of parameters by a factor of thirty, and their searches end
+at optima of different quality; the left-out density charges both where it hurts.
 Differences between two candidates are paired, stretch by stretch: with the difference D_b of block b, its rows n_b and
 d = sum D_b / sum n_b per row, the standard error of d over B blocks is
 

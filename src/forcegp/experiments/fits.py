@@ -1,4 +1,7 @@
-"""Jobs that fit one model to one training set and score it: what most figures are made of."""
+"""Jobs that fit one model to one training set and score it: what most figures are made of.
+
+Fits to more points begin where the fit to fewer ended, because the training sets are nested.
+"""
 
 from __future__ import annotations
 

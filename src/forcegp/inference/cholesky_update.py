@@ -142,6 +142,8 @@ def rows_to_keep(
 def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]) -> CholeskyFactor:
     """The factor of [[T11, cross^T], [cross, own]] from that of T11, which is copied; `own` is overwritten.
 
+    Copied, because torch's triangular solves copy a view of a larger buffer at every call, which costs more.
+
     Only the lower triangle of `own` is read. Jitter is added to the new rows alone, as `factorize` does.
     """
     size, more = factor.lower.shape[0], own.shape[0]

@@ -145,6 +145,7 @@ class FunctionSamples:
 class ComposedSamples:
     """S functions drawn from the posterior of the latents, whose kernels are sums and products."""
 
+    # whole functions: independent noise in every step would average out along a motion
     latent: LatentPosterior
     terms: tuple[tuple[DrawnTerm, ...], ...]
     beta: tuple[Float[Tensor, "S _"], ...]

@@ -1,4 +1,8 @@
-"""`integrate`: many motions at once, each until its end or until it diverges."""
+"""`integrate`: many motions at once, each until its end or until it diverges.
+
+A motion that diverges is a result, not an error that would take the others along: models without physics do diverge,
+and figures compare them.
+"""
 
 from __future__ import annotations
 

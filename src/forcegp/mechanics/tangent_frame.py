@@ -1,4 +1,8 @@
-"""Axes of a surface: two tangents and the outward normal, chosen smoothly along it."""
+"""Axes of a surface: two tangents and the outward normal, chosen smoothly along it.
+
+The shortest turn of the world's axes onto the normal: x and y on a table, so that what was learned along tangents means
+the same on a tilted one.
+"""
 
 from __future__ import annotations
 

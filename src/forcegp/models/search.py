@@ -25,7 +25,9 @@ none.
 """
 
 SMOOTHER = 4.0
-"""Factor on the length scales of odd restarts: measured, these escape the local optima of the start from moments."""
+"""Factor on the length scales of odd restarts. On one seed of the benchmark, without a mean, one start and three
+restarts around the moments all ended at an error of .1266, the smoother start at .109.
+"""
 
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""

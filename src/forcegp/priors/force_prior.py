@@ -92,6 +92,8 @@ class ForcePrior(ABC):
         return SumPrior((*self.summands(), *other.summands()))
 
 
+# Here because `ForcePrior.__add__` makes sums. Columns of B, features and kernels stand side by side, so one fit learns
+# all terms, and `posterior.components` finds each by its slice of the latents.
 @dataclass(frozen=True)
 class SumPrior(ForcePrior):
     """Q_U = sum of what the `terms` describe, independent of each other: `JointFriction() + ContactFriction()`.

@@ -4,6 +4,9 @@ A file of the folder is named by a hash of everything that decides what is in it
 the sources of the modules that write the code, the processor's vector unit and the platform. Loading such a file runs
 the code in it with the rights of the process. So only files of the folder are loaded, and only if the file, the folder
 and all folders above it belong to the user (or to root) and no one else may write to them.
+
+C of our own and not `torch.compile`: of the same unrolled scalars inductor made code in 156-184 s per function, gcc in
+0.3 s, which runs six times faster (`python -m benchmarks.compiled_dynamics inductor`), and this cache loads in 2 ms.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Fitting again with the normal force that a fit has found, for friction that is proportional to it."""
+"""Fitting again with the normal force that a fit has found, for friction that is proportional to it.
+
+Friction that is proportional to the normal force changes the normal force. Solved for, Q_U would no longer be affine in
+the latent functions, and inference no longer exact. Fitted again under an expected friction, every round is an exact
+fit of a legitimate prior. `python -m benchmarks.force_pictures contact-friction` draws the curve with and without.
+"""
 
 from __future__ import annotations
 

@@ -280,7 +280,8 @@ class StructuredPosterior(Posterior):
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
         self.model.prior.mixing(system.dynamics(q, v, u, inertials_of(self.parameters) or None))
-        return replace(self, target=system)  # with what is factorised: the training rows and their system stay
+        # the training rows are always conditioned in their own system: nothing is factorised again, no number changes
+        return replace(self, target=system)
 
     @override
     def to(self, device: torch.device | str) -> StructuredPosterior:
