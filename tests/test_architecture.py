@@ -50,7 +50,7 @@ PACKAGES["validation"] = set(PACKAGES) - {"simulation"}
 PACKAGES["experiments"] = set(PACKAGES)
 PACKAGES["cli"] = set(PACKAGES)
 
-# Optional or slow to import: imported inside the function that uses them. Modules and packages named here may import them
+# Optional or slow to import: imported inside the function that uses them. Modules named here may import them
 # at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
     "pybullet": (),
