@@ -9,7 +9,6 @@ python -m benchmarks likelihood         some of them (the others keep their stor
 from __future__ import annotations
 
 import json
-import os
 import sys
 from datetime import UTC, datetime
 from importlib import import_module
@@ -17,19 +16,13 @@ from pathlib import Path
 
 from benchmarks.performance_page import PAGE, performance_page
 from benchmarks.questions import MEANINGS, TITLES
-from forcegp.evaluation.machine import machine
+from forcegp.atomic_files import write_text
+from forcegp.jobs.machine import machine
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results.json"
 README = FOLDER / "README.md"
 BEGIN, END = "<!-- table: written by `make bench` -->", "<!-- end of table -->"
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write under a temporary name, then rename."""
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def table(results: dict[str, float]) -> str:
@@ -59,11 +52,11 @@ def main(questions: list[str]) -> None:
             stored |= module.run()
         stored["machine"] = f"{machine()}; one thread used"
         stored["date"] = datetime.now(UTC).date().isoformat()
-        write_whole(RESULTS, json.dumps(stored, indent=1, sort_keys=True) + "\n")
+        write_text(RESULTS, json.dumps(stored, indent=1, sort_keys=True) + "\n")
     text = README.read_text(encoding="utf-8")
     before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    write_whole(README, f"{before}\n{table(stored)}\n\n{stored['machine']}, {stored['date']}.\n{after}")
-    write_whole(PAGE, performance_page(stored))
+    write_text(README, f"{before}\n{table(stored)}\n\n{stored['machine']}, {stored['date']}.\n{after}")
+    write_text(PAGE, performance_page(stored))
     print(f"\n{table(stored)}\n\n{stored['machine']}")
 
 

@@ -39,8 +39,9 @@ from threadpoolctl import threadpool_limits
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot, physical_from_parameters
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.dynamics_programs import Request, trace
+from forcegp.robots.dynamics_programs import Request, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.unrolled_kinematics import UnrolledKinematics
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 
@@ -181,7 +182,9 @@ def inductor() -> None:
 
     @torch.compile(dynamic=True, fullgraph=True)
     def forward(q: torch.Tensor, v: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
-        return torch.stack(unrolled.states(q.unbind(-1), v.unbind(-1)).forward_dynamics(tau.unbind(-1)), dim=-1)
+        return torch.stack(
+            UnrolledKinematics(unrolled, q.unbind(-1), v.unbind(-1)).forward_dynamics(tau.unbind(-1)), dim=-1
+        )
 
     with tempfile.TemporaryDirectory() as folder:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder
@@ -202,7 +205,7 @@ def chain(joints: int) -> None:
         for k in range(1, joints + 1)
     ]
     robot = Robot.from_urdf_text(f"""<robot name="chain"><link name="l0"/>{"".join(parts)}</robot>""")
-    operations = trace(UnrolledRobot(robot), Request("forward_dynamics", free_inertias=False)).operations
+    operations = trace_dynamics(UnrolledRobot(robot), Request("forward_dynamics", free_inertias=False)).operations
     with tempfile.TemporaryDirectory() as folder:
         start = sum(os.times()[:4])  # with those of the compiler
         robot.compile(folder).prepare("forward_dynamics")

@@ -47,7 +47,7 @@ from forcegp import (
     ToolForces,
 )
 from forcegp.evaluation import friction_curves_figure, normal_force_figure, save_figure
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.style import (
     KNOWN_PHYSICS,
     MEASUREMENT,
     NORMAL,

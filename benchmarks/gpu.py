@@ -26,14 +26,14 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from benchmarks.__main__ import write_whole
+from forcegp.atomic_files import write_text
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.machine import machine
 from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
+from forcegp.jobs.machine import machine
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
-from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.robots.devices import usable_device
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -226,7 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
             "small": given.small,
             "results": found,
         }
-        write_whole(RESULTS, json.dumps(document, indent=1, sort_keys=True) + "\n")
+        write_text(RESULTS, json.dumps(document, indent=1, sort_keys=True) + "\n")
     return 0
 
 

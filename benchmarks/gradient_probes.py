@@ -24,7 +24,7 @@ from forcegp.inference import LatentKernels
 from forcegp.inference.conjugate_gradients import conjugate_gradients
 from forcegp.inference.deflation import deflate, whiten
 from forcegp.inference.iterative import LowRankPlusDiagonal
-from forcegp.models.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 
 ROWS, PROBES, SEEDS, TOLERANCE = 1000, (8, 32), (0, 1, 2), 1e-2
 JITTER = 1e-10

@@ -50,11 +50,11 @@ def main() -> None:
         wrong = parameters_from_physical(mass + off * TOO_HEAVY, center + center_off, inertia)
         robot = data.system.robot.with_inertials({TOOL_LINK: wrong})
         begin = time.process_time()
-        posterior = StructuredGP(data.system.with_robot(robot), mean=given.mean).fit(
+        posterior = StructuredGP(data.system.with_robot(robot), mean=given.mean).identify(
             data,
+            robot.link(TOOL_LINK).inertial("mass", "com"),
             points=given.points,
             restarts=1,
-            learn=robot.link(TOOL_LINK).inertial("mass", "com"),
             options=OptimizerOptions(iterations=given.iterations, tolerance=given.tolerance),
         )
         fitted = time.process_time()

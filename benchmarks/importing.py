@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -21,6 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+
+from forcegp.atomic_files import atomic_file, atomic_folder
 
 KEPT = Path(__file__).resolve().parent.parent / "runs" / "benchmarks"
 BYTES = 10**9
@@ -98,9 +99,8 @@ def csv_log(size: int) -> tuple[Path, list[str]]:
     """The file, and the flags that import it."""
     path = KEPT / f"log-{size:.0e}.csv"
     if not path.exists():
-        temporary = path.with_suffix(".tmp")
-        write_csv(temporary, size)
-        os.replace(temporary, path)
+        with atomic_file(path) as temporary:
+            write_csv(temporary, size)
     return path, ["--time", "time", "--q", "q_{joints}", "--v", "v_{joints}", "--u", "tau_{joints}"]
 
 
@@ -108,10 +108,8 @@ def mcap_log(size: int) -> tuple[Path, list[str]]:
     """The same for the bag."""
     folder = KEPT / f"log-{size:.0e}"
     if not folder.exists():
-        temporary = folder.with_suffix(".tmp")
-        shutil.rmtree(temporary, ignore_errors=True)
-        write_mcap(temporary, size)
-        os.replace(temporary, folder)
+        with atomic_folder(folder) as temporary:
+            write_mcap(temporary, size)
     (path,) = folder.glob("*.mcap")
     topic = "/joint_states:"
     return path, ["--q", f"{topic}position", "--v", f"{topic}velocity", "--u", f"{topic}effort"]

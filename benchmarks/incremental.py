@@ -28,10 +28,9 @@ import torch
 
 from forcegp.data import Dataset, farthest_point_sampling, farthest_rows
 from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptions
-from forcegp.inference.growing import information, rows_to_keep, with_only
+from forcegp.inference.cholesky_update import information, rows_to_keep, with_only
 from forcegp.models import Noise, StructuredGP, TrainingData
-from forcegp.models.structured_posterior import StructuredPosterior
-from forcegp.models.updating import updated
+from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 SEEDS = (1, 2, 3)
@@ -150,7 +149,7 @@ def streams() -> dict[str, float]:
             posterior = first
             start = time.perf_counter()
             for row in range(FIRST, STREAM, BATCH):
-                posterior = updated(posterior, stream.rows(slice(row, row + BATCH)), BUDGET, rule)
+                posterior = posterior.update(stream.rows(slice(row, row + BATCH)), BUDGET, keep=rule)
             seconds = (time.perf_counter() - start) / ((STREAM - FIRST) / BATCH)
             scores[name] = error(posterior, test), seconds
         for name, (score, seconds) in scores.items():

@@ -24,7 +24,7 @@ import torch
 from gpytorch.kernels import Kernel, ScaleKernel
 from threadpoolctl import threadpool_limits
 
-from forcegp.inference.kernels import kernel_matrix
+from forcegp.inference.dense_kernels import taken_apart
 from forcegp.inference.likelihood import negative_log_likelihood
 from forcegp.priors import ToolForces
 from forcegp.priors.kernels import kernel_of, squared_exponential_kernel
@@ -58,7 +58,7 @@ class Problem:
         self.parameters = [parameter for kernel in self.kernels for parameter in kernel.parameters()] + [self.log_noise]
 
     def deflated(self) -> tuple[torch.Tensor, ...]:
-        matrices = [kernel_matrix(kernel, self.features) for kernel in self.kernels]
+        matrices = [taken_apart(kernel).matrix(self.features) for kernel in self.kernels]
         value = negative_log_likelihood(self.W, self.residual, (2.0 * self.log_noise).exp()[None], matrices)
         return (value.detach(), *torch.autograd.grad(value, self.parameters))
 

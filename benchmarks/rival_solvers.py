@@ -17,7 +17,6 @@ from benchmarks.solver_problem import Problem
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.iterative import LowRankPlusDiagonal
 from forcegp.inference.kernel_panels import KernelPanels
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal
 from forcegp.inference.likelihood import deflated_covariance
 
 Steps = Iterator[tuple[Tensor, Tensor | None]]
@@ -67,8 +66,8 @@ def point_blocks(problem: Problem) -> Callable[[Tensor], Tensor]:
 
 def own_blocks(problem: Problem) -> Tensor:
     """T_ii = sum_c C_ic C_ic^T k_c(z_i, z_i) + I (N, r, r)."""
-    pairs = zip(problem.kernels, problem.features, strict=True)
-    prior = torch.stack([kernel_diagonal(kernel, z) for kernel, z in pairs], dim=-1)
+    pairs = zip(problem.kernels.dense, problem.features, strict=True)
+    prior = torch.stack([kernel.diagonal(z) for kernel, z in pairs], dim=-1)
     return (problem.C * prior[:, None]) @ problem.C.mT + torch.eye(problem.C.shape[1], dtype=problem.C.dtype)
 
 
@@ -86,8 +85,8 @@ def pivoted_cholesky_of_covariance(rank: int, blocks: bool = False) -> Precondit
         for done in range(len(rows)):
             pivot = int(left.argmax())
             i, a = divmod(pivot, outputs)
-            pairs = zip(problem.kernels, problem.features, strict=True)
-            cross = torch.stack([kernel_cross(kernel, z[i : i + 1], z)[0] for kernel, z in pairs], dim=-1)
+            pairs = zip(problem.kernels.dense, problem.features, strict=True)
+            cross = torch.stack([kernel.cross(z[i : i + 1], z)[0] for kernel, z in pairs], dim=-1)
             row = torch.einsum("jbc,jc,c->jb", C, cross, C[i, a]).reshape(-1) - rows[:done].mT @ rows[:done, pivot]
             rows[done] = row / row[pivot].clamp_min(1e-12).sqrt()
             left = (left - rows[done].square()).clamp_min_(0.0)

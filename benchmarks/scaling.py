@@ -24,9 +24,10 @@ import torch
 
 from benchmarks.large_data import RECORDINGS, in_own_process, peak_bytes, recording
 from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_posterior
+from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
 from forcegp.inference import ENGINES, Inducing, Stochastic
-from forcegp.models.many_rows import on_all_rows
+from forcegp.models.structured.engine_selection import on_all_rows
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
 SEED, SECONDS = 903, 420.0
@@ -86,14 +87,14 @@ def run() -> dict[str, float]:
             print(f"{engine:10} {count:8d} {found['cpu_s']:8.2f} {found['memory_mib']:11.0f}", flush=True)
         results[f"slope_{engine}"] = slope(list(counts), [found["cpu_s"] for found in measured[engine].values()])
     FOLDER.mkdir(parents=True, exist_ok=True)
-    (FOLDER / "scaling.json").write_text(json.dumps(measured, indent=1) + "\n")
+    write_json(FOLDER / "scaling.json", measured)
     draw(measured)
     return results
 
 
 def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     """Time and memory over the number of rows."""
-    from forcegp.evaluation.figure_style import SERIES, SMALL, new_figure, quiet, save_figure
+    from forcegp.evaluation.plots.style import SERIES, SMALL, new_figure, quiet, save_figure
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2)

@@ -19,9 +19,9 @@ from forcegp import JointForces, StructuredGP, load_posterior, save_posterior
 from forcegp.data import Dataset, farthest_rows
 from forcegp.inference import LatentKernels, Terms
 from forcegp.inference.deflation import Deflation, deflate, whiten
-from forcegp.inference.kernels import kernel_cross
-from forcegp.models.marginal_likelihood import MarginalLikelihood, TrainingData
-from forcegp.models.structured_posterior import StructuredPosterior
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.models.training_data import TrainingData
 
 SEED, SECONDS = 901, 220.0
 ROWS, LEARNING_ROWS = 2000, 250
@@ -49,7 +49,7 @@ class Problem:
 
     def new_matrices(self) -> Float[Tensor, "C N N"]:
         """All kernel matrices, computed now."""
-        crosses = [kernel_cross(kernel, z, z) for kernel, z in zip(self.kernels, self.features, strict=True)]
+        crosses = [kernel.cross(z, z) for kernel, z in zip(self.kernels.dense, self.features, strict=True)]
         return torch.stack(crosses)
 
     def product(self, alpha: Float[Tensor, "N r"]) -> Float[Tensor, "N r"]:
@@ -108,8 +108,8 @@ class Task:
         with torch.no_grad():
             features, W, residual, _ = self.likelihood(self.test).terms(self.fitted.parameters)
             problem = self.problem
-            pairs = zip(problem.kernels, features, problem.features, strict=True)
-            cross = torch.stack([kernel_cross(kernel, z, centers) for kernel, z, centers in pairs])
+            pairs = zip(problem.kernels.dense, features, problem.features, strict=True)
+            cross = torch.stack([kernel.cross(z, centers) for kernel, z, centers in pairs])
         return cross, W, residual + torch.as_tensor(self.test.truth["a"] - self.test.a)
 
     def mae_noise_free(self, alpha: Float[Tensor, "N r"]) -> float:

@@ -40,10 +40,10 @@ from forcegp.data import (
     units_for,
 )
 from forcegp.errors import DataWarning, NumericalWarning
-from forcegp.evaluation.recorded_motions import RecordedMotions, recorded_motions
+from forcegp.evaluation.recorded_segments import RecordedMotions, recorded_motions
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, RotorInertia
 from forcegp.models import Noise, StructuredGP, StructuredPosterior
-from forcegp.models.marginal_likelihood import Mean
+from forcegp.models.structured.marginal_likelihood import Mean
 from forcegp.priors import ForcePrior, JointForces, JointFriction, NoForces
 from forcegp.robots import Robot
 
@@ -170,7 +170,7 @@ def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPoster
     model = StructuredGP(rig.train.system, rig.prior, rig.mean)
     if isinstance(how, WindowObservation):
         noise = None if rig.force_noise is None else Noise(None, rig.force_noise, learn=True)
-        return replace(model, noise=noise).fit(_later(rig.train, 5 * seed), points=points, restarts=1, observe=how)
+        return replace(model, noise=noise).fit_windows(_later(rig.train, 5 * seed), how, points=points, restarts=1)
     rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train).dataset
     noise = Noise(1.0, rig.force_noise, learn=True)
     return replace(model, noise=noise).fit(farthest_rows(rows, points, seed=seed), restarts=1)

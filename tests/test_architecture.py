@@ -1,4 +1,4 @@
-"""The rules of docs/architecture.md, kept: which room imports which, and what an import may cost."""
+"""The rules of docs/architecture.md, kept: which package imports which, and what an import may cost."""
 
 import ast
 import re
@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,23 +15,26 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = REPOSITORY / "src" / "forcegp"
 
-# The rooms in the order in which data flows, and which rooms each may import: the table of docs/architecture.md.
-ROOMS = {
+# The packages in the order in which data flows, and which packages each may import: the table of docs/architecture.md.
+PACKAGES = {
     "errors": set(),
-    "native_code": {"errors"},
+    "atomic_files": {"errors"},
+    "codegen": {"errors"},
     "parallel": {"errors"},
-    "robots": {"errors", "native_code"},
+    "jobs": {"errors", "atomic_files", "parallel"},
+    "robots": {"errors", "atomic_files", "codegen"},
     "mechanics": {"errors", "robots"},
-    "data": {"errors", "robots", "mechanics"},
+    "data": {"errors", "atomic_files", "robots", "mechanics"},
     "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
     "checks": {"errors", "robots", "mechanics", "data", "analytical"},
     "priors": {"errors", "robots", "mechanics"},
-    "inference": {"errors", "native_code"},
+    "inference": {"errors", "codegen"},
     "integration": {"errors", "robots", "mechanics"},
     "models": {
         "errors",
-        "native_code",
+        "atomic_files",
+        "codegen",
         "parallel",
         "robots",
         "mechanics",
@@ -41,24 +45,24 @@ ROOMS = {
     },
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
-ROOMS["evaluation"] = set(ROOMS) - {"simulation"}
-ROOMS["validation"] = set(ROOMS) - {"simulation"}
-ROOMS["experiments"] = set(ROOMS)
-ROOMS["cli"] = set(ROOMS)
+PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}
+PACKAGES["validation"] = set(PACKAGES) - {"simulation"}
+PACKAGES["experiments"] = set(PACKAGES)
+PACKAGES["cli"] = set(PACKAGES)
 
-# Optional or slow to import: imported inside the function that uses them. The rooms named here may import them at once.
+# Optional or slow to import: imported inside the function that uses them. Modules named here may import them
+# at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
-    "pybullet": set(),
-    "matplotlib": set(),
-    "joblib": set(),
-    "ray": set(),
-    "pyarrow": set(),
-    "rosbags": set(),
-    "tyro": {"cli"},
-    "rich": {"cli"},
+    "pybullet": (),
+    "matplotlib": ("forcegp.evaluation.plots", "forcegp.experiments", "forcegp.validation.figures"),
+    "joblib": (),
+    "ray": (),
+    "rosbags": (),
+    "tyro": ("forcegp.cli",),
+    "rich": ("forcegp.cli",),
 }
 
-LONGEST_MODULE = 350  # lines
+LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
 
 
@@ -69,7 +73,6 @@ class Import:
     name: str
     line: int
     at_module_import: bool
-    for_types_only: bool
 
 
 def module_name(path: Path) -> str:
@@ -77,15 +80,42 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def room(module: str) -> str:
-    """The room of a module of forcegp; the public page `forcegp/__init__.py` stands above all rooms and has none."""
+def package_of(module: str) -> str:
+    """The package of a module; the public page `forcegp/__init__.py` stands above all packages and has none."""
     return module.split(".")[1] if "." in module else ""
+
+
+def exports(stub: Path) -> dict[str, str]:
+    """Name -> module that defines it, of the names that a package imports at their first use."""
+    return {
+        alias.name: f"{module_name(stub)}.{node.module}"
+        for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
+EXPORTS = {module_name(stub): exports(stub) for stub in sorted(PACKAGE.rglob("__init__.pyi"))}
+
+
+def defined_in(name: str) -> str:
+    """`forcegp.Robot` and `forcegp.robots.Robot` -> `forcegp.robots.robot.Robot`; other names as they are."""
+    package, _, rest = name.partition(".")
+    while rest:
+        first, _, attributes = rest.partition(".")
+        if first in EXPORTS.get(package, {}):
+            return defined_in(f"{EXPORTS[package][first]}.{rest}")
+        package, rest = f"{package}.{first}", attributes
+    return name
 
 
 def imports(path: Path) -> Iterator[Import]:
     package = module_name(path) if path.stem == "__init__" else module_name(path).rpartition(".")[0]
 
     def visit(node: ast.AST, at_import: bool, types_only: bool) -> Iterator[Import]:
+        if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("forcegp."):
+            # `forcegp.data.Dataset` after `import forcegp.data`: the name is imported when this line runs
+            yield Import(defined_in(ast.unparse(node)), node.lineno, False)
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -95,7 +125,8 @@ def imports(path: Path) -> Iterator[Import]:
         else:
             names = []
         for name in names:
-            yield Import(name, node.lineno, at_import and not types_only, types_only)
+            name = defined_in(name)
+            yield Import(name, node.lineno, at_import and not types_only)
         in_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
         for child in ast.iter_child_nodes(node):
             guarded = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and child in node.body
@@ -132,35 +163,39 @@ def test_the_table_in_the_docs_is_the_one_kept_here():
             assert named or allowed == "nothing", f"docs/architecture.md, row {name}: cannot read {allowed!r}"
             table[name] = named
         above.append(name)
-    assert table == ROOMS
+    assert table == PACKAGES
 
 
 def test_every_module_belongs_to_a_room():
-    strangers = sorted({room(module) for module in MODULES} - ROOMS.keys() - {""})
-    assert not strangers, f"rooms that docs/architecture.md does not list: {strangers}"
+    strangers = sorted({package_of(module) for module in MODULES} - PACKAGES.keys() - {""})
+    assert not strangers, f"packages that docs/architecture.md does not list: {strangers}"
 
 
 @pytest.mark.parametrize("module", [module for module in MODULES if module != "forcegp"])
 def test_imports_go_only_to_allowed_rooms(module):
-    allowed = ROOMS[room(module)]
+    allowed = PACKAGES[package_of(module)]
     offences = [
         f"{MODULES[module].relative_to(REPOSITORY)}:{item.line} imports {item.name}"
         for item in IMPORTS[module]
         if item.name.split(".")[0] == "forcegp"
-        and room(item.name) not in allowed | {room(module)}
-        and item.name != "forcegp.__version__"
+        and package_of(item.name) not in allowed | {package_of(module)}
+        and item.name not in ("forcegp", "forcegp.__version__")
     ]
-    assert not offences, "\n".join([*offences, f"{room(module)} may import {sorted(allowed) or 'no room'}"])
+    assert not offences, "\n".join([*offences, f"{package_of(module)} may import {sorted(allowed) or 'no package'}"])
+
+
+def longest_module(name: str) -> str:
+    """The module that a dotted name lies in; packages do not count, for they import nothing by themselves."""
+    while name and name not in MODULES:
+        name = name.rpartition(".")[0]
+    return name if name and MODULES[name].stem != "__init__" else ""
 
 
 def test_no_module_imports_itself_through_others():
     graph: dict[str, set[str]] = {}
     for module in MODULES.keys() - {"forcegp"}:
-        needed = [item.name for item in IMPORTS[module] if not item.for_types_only]
-        sources = {
-            name if name in MODULES else name.rpartition(".")[0] for name in needed
-        }  # a module, or a name in one
-        graph[module] = (sources & MODULES.keys()) - {module}
+        needed = [item.name for item in IMPORTS[module]]  # those under TYPE_CHECKING, too
+        graph[module] = {source for name in needed if (source := longest_module(name))} - {module}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -175,9 +210,24 @@ def test_slow_and_optional_packages_are_imported_where_they_are_used(package):
         for item in IMPORTS[module]
         if item.at_module_import
         and item.name.split(".")[0] == package
-        and room(module) not in IMPORTED_WHERE_USED[package]
+        and not module.startswith(IMPORTED_WHERE_USED[package] or "-")
     ]
     assert not offences, f"import {package} inside the function that needs it: {', '.join(offences)}"
+
+
+@pytest.mark.parametrize("package", EXPORTS)
+def test_no_exported_name_is_that_of_a_module(package):
+    """Importing the module would put it in the place of the name."""
+    modules = {name.rpartition(".")[2] for name in MODULES if name.rpartition(".")[0] == package}
+    assert not modules & EXPORTS[package].keys()
+
+
+@pytest.mark.parametrize("package", EXPORTS)
+def test_every_exported_name_is_there(package):
+    module = import_module(package)
+    assert set(module.__all__) == EXPORTS[package].keys()
+    for name, defined in EXPORTS[package].items():
+        assert getattr(module, name) is getattr(import_module(defined), name)
 
 
 def test_import_forcegp_loads_no_library():
@@ -195,6 +245,11 @@ def test_help_needs_neither_torch_nor_numpy():
     loaded = modules_loaded_by(
         "import sys; sys.argv = ['forcegp', '--help']; from forcegp.cli.main import main; main()"
     )
+    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
+
+
+def test_a_missing_input_is_refused_before_anything_slow_is_imported():
+    loaded = modules_loaded_by("from forcegp.cli.main import main; assert main(['evaluate', 'nope', 'test.h5']) == 2")
     assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
 
 

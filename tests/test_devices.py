@@ -198,8 +198,8 @@ def test_fits_with_several_starts_on_the_pretended_device():
         assert all(isinstance(value, PretendTensor) for value in posterior.parameters.values())
         assert posterior.result.value == pytest.approx(expected.result.value, rel=1e-8)
         assert evaluate(posterior, test).mae == pytest.approx(evaluate(expected, test).mae, rel=1e-6)
-        learned = StructuredGP(system).fit(
-            data, restarts=1, options=QUICK, learn=system.robot.link("hand").inertial("mass")
+        learned = StructuredGP(system).identify(
+            data, system.robot.link("hand").inertial("mass"), restarts=1, options=QUICK
         )
         assert math.isfinite(learned.result.value)
         forces = StructuredGP(system, mean="zero", noise=Noise(0.05, 0.02, learn=True)).fit(

@@ -133,6 +133,10 @@ class WorkerWarning(UserWarning):
     """A process at work died and its task began anew; the outcome is the same."""
 
 
+class OutdatedWarning(UserWarning):
+    """Stored results were computed by other code or with other settings, and are computed anew."""
+
+
 class DataWarning(UserWarning):
     """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
 

@@ -6,13 +6,13 @@ import torch
 from tests.models.arm import URDF
 from tests.robots.robot_models import TREE
 
-from forcegp.analytical.bodies import ConsistentBodies, FreeBodies, pseudo_inertias_of, upper_cholesky
+from forcegp.analytical.bodies import ConsistentBodies, FreeBodies, upper_cholesky
 from forcegp.analytical.identified_robot import thickened, with_bodies, with_joint_dynamics
 from forcegp.analytical.regressor import body_pseudo_inertias, standard_parameters
 from forcegp.errors import NonPhysicalInertia
-from forcegp.models.objective import squared_distance
+from forcegp.models.structured.objective import squared_distance
 from forcegp.robots import Robot
-from forcegp.robots.inertia import parameters_from_physical
+from forcegp.robots.inertia import parameters_from_physical, pseudo_inertia_of_standard
 
 KINDS = [FreeBodies, ConsistentBodies]
 
@@ -102,7 +102,7 @@ def test_joint_dynamics_stand_in_the_urdf():
 
 def test_pseudo_inertias_of_standard_parameters():
     robot = Robot.from_urdf_text(TREE)
-    found = pseudo_inertias_of(standard_parameters(robot).numpy().reshape(-1, 10))
+    found = pseudo_inertia_of_standard(standard_parameters(robot).reshape(-1, 10)).numpy()
     np.testing.assert_allclose(found, body_pseudo_inertias(robot), atol=1e-13)
 
 

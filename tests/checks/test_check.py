@@ -104,7 +104,7 @@ def test_a_gap_is_not_differentiated_across():
     report = check(clean(6).rows(np.r_[0:700, 780:1400]))
     (lost,) = report.of("lost samples")
     assert lost.numbers["gaps"] == 1
-    assert len(report.evidence.even.episodes) == 2
+    assert len(report.inputs.even.episodes) == 2
     assert not report.of("torque sign")
     assert report.of("torque")[0].severity == "ok"
 
@@ -135,8 +135,8 @@ def test_a_prepared_log_is_told_with_the_price_that_was_paid():
     prepared = Preparation(cutoff=8.0, every=4, trim=0.2).apply(noisy)
     report = check(prepared.dataset)
     assert report.severity == "ok", told(report)
-    assert report.evidence.prepared is not None
-    assert report.evidence.prepared.preparation.cutoff is None  # it is not filtered twice
+    assert report.inputs.prepared is not None
+    assert report.inputs.prepared.preparation.cutoff is None  # it is not filtered twice
     assert report.to_dict()["cutoff"] == 8.0
     paid = prepared.report["acceleration_noise"]["after"]
     assert [each["noise_after"] for each in report.per_joint()] == pytest.approx(paid)
@@ -191,7 +191,7 @@ def test_positions_that_jump_otherwise_end_the_check_of_motion():
     report = check(column(clean(3), "q", 1, lambda x: x + 5.0 * (np.arange(len(x)) > 700)))
     (found,) = report.of("jumps")
     assert found.numbers["row"] == 700
-    assert report.evidence.prepared is None
+    assert report.inputs.prepared is None
     assert report.comparison is None
 
 
@@ -210,8 +210,8 @@ def test_the_report_is_json_and_sorted_by_severity():
 
 def test_a_check_changes_with_its_filter():
     given = check(clean(1), preparation=Preparation(cutoff=9.0))
-    assert given.evidence.prepared is not None
-    assert given.evidence.prepared.preparation.cutoff == 9.0
+    assert given.inputs.prepared is not None
+    assert given.inputs.prepared.preparation.cutoff == 9.0
     assert "as asked for" in given.of("noise")[0].seen
 
 

@@ -210,22 +210,22 @@ def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path)
 
 
 @pytest.mark.nightly
-def test_ctrl_c_during_reproduce_keeps_the_finished_cells_and_says_so(executable, tmp_path):
+def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable, tmp_path):
     pytest.importorskip("pybullet")
     command = [executable, "reproduce", "fig2b", "--preset", "smoke", "--jobs", "1", "--out", "out"]
     group = {
         "start_new_session": True,
         "preexec_fn": interruptible,
     }  # as in a terminal, which interrupts the workers, too
-    finished = "[!.]*/[!.]*/cell.json"  # a cell at work has a hidden folder
+    finished = "[!.]*/[!.]*/job.json"  # a job at work has a hidden folder
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **group) as process:
-        while not list((tmp_path / "out" / "cells").glob(finished)):
+        while not list((tmp_path / "out" / "jobs").glob(finished)):
             assert process.poll() is None
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
         _, told = process.communicate(timeout=600)  # a guard against a hang
     assert process.returncode == 130
     last = told.decode().splitlines()[-1]
-    assert last == "forcegp: interrupted; finished cells are kept, and the same command goes on from there."
+    assert last == "forcegp: interrupted; finished jobs are kept, and the same command goes on from there."
     assert b"Traceback" not in told
-    assert list((tmp_path / "out" / "cells").glob(finished))
+    assert list((tmp_path / "out" / "jobs").glob(finished))

@@ -43,7 +43,7 @@ def test_the_table_has_a_line_per_candidate_and_the_verdict_follows(forcegp, fol
         assert 0.0 < float(row[2].split()[-1]) < 10.0  # the error on the test data
     assert done.stdout.count("±") == 3
     told = " ".join(done.stdout.split())
-    assert re.search(r"The data support joint-friction|joint-friction.* cannot be told apart", told)
+    assert re.search(r"The data support joint-friction|joint-friction.* cannot be distinguished", told)
     assert re.search(r"Next: forcegp fit train\.h5 --prior \S+ --points 30 --out run", told)
     assert re.search(r"Not converged: joint\b.*--iterations", told)
     assert not list(folder.glob(".*"))

@@ -208,7 +208,7 @@ def test_the_report_of_a_fit_tells_how_the_search_ended(capsys, converged, statu
         "converged": converged,
         "status": status,
     }
-    Terminal(json=False).say(*_report(Path("run"), summary))
+    Terminal(json=False).show(*_report(Path("run"), summary))
     assert shown in " ".join(capsys.readouterr().out.split())
 
 

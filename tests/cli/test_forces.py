@@ -125,7 +125,7 @@ def test_what_cannot_move_is_refused_in_one_line(arm, forcegp, tmp_path, capfd):
     assert "cannot move to another" in told
     dataclasses.replace(Dataset.load(arm / "test.h5"), system=None).save(tmp_path / "bare.h5")
     told = refused(("evaluate", arm / "run", tmp_path / "bare.h5", "--system", "data"), capfd)
-    assert "the data know no robot" in told
+    assert "the data carry no robot" in told
     assert "--system" in refused(("evaluate", arm / "run", arm / "test.h5", "--system", "moon"), capfd)
 
 

@@ -12,7 +12,7 @@ from tests.models.arm import NOISE, URDF, arm_data, arm_system
 from forcegp import Robot, load_posterior
 from forcegp.cli.main import main
 from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
-from forcegp.models.physical_parameters import PhysicalParameters
+from forcegp.models.identification.physical_parameters import PhysicalParameters
 from forcegp.robots import LinkInertia
 
 

@@ -47,7 +47,7 @@ def test_more_points_than_windows_takes_all_windows(forcegp, folder):
         (("--window", "0.1"), "--window means nothing to accelerations; add --learn-from weak-form"),
         (("--learn-from", "weak-form", "--window", "0.004"), "a window of 0.004 s has 3 rows"),
         (("--learn-from", "weak-form", "--window", "-1"), "WeakForm seconds is -1.0; it must be positive"),
-        (("--learn-from", "weak-form", "--engine", "inducing"), "windows (observe=...) are conditioned on exactly"),
+        (("--learn-from", "weak-form", "--engine", "inducing"), "windows are conditioned on exactly"),
         (("--learn-from", "positions"), "learn-from"),
     ],
 )

@@ -50,7 +50,7 @@ def test_published_values_stand_beside_ours(reproduced):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("all", "--preset", "paper", "--out", "out"), "holds results of preset 'smoke', not 'paper'"),
+        (("all", "--preset", "paper", "--out", "out"), "holds results with another preset ('smoke', not 'paper')"),
         (("all", "--out", "docs"), "was not written by `forcegp reproduce`"),
         (("all", "--out", "out", "--docs", "docs/reproduction.md"), "cannot be made"),
     ],
@@ -59,20 +59,24 @@ def test_refusals_are_one_line_and_leave_everything(reproduced, arguments, messa
     reproduced.check_refusal(arguments, message)
 
 
-def test_a_half_written_cell_and_another_version_are_named_and_nothing_is_lost(reproduced, installed, tmp_path):
+def test_a_half_written_job_is_named_and_nothing_is_lost(reproduced, installed, tmp_path):
     shutil.copytree(reproduced.folder / "out", tmp_path / "out")
-    file = next((tmp_path / "out" / "cells" / "fits").glob("**/cell.json"))
+    file = next((tmp_path / "out" / "jobs" / "fits").glob("**/job.json"))
     whole = file.read_text()
     file.write_text(whole[:100])
     refused = installed("reproduce", "all", "--out", "out", folder=tmp_path)
     assert refused.returncode == 2
     assert str(file.relative_to(tmp_path)) in refused.stderr
-    assert "only this cell is computed anew" in refused.stderr
+    assert "only this job is computed anew" in refused.stderr
     assert file.read_text() == whole[:100]
-    file.write_text(whole)
-    description = tmp_path / "out" / "reproduction.json"
-    stored = json.loads(description.read_text())
-    description.write_text(json.dumps({**stored, "forcegp_version": "0.0.1"}))
-    refused = installed("reproduce", "all", "--out", "out", folder=tmp_path)
-    assert refused.returncode == 2
-    assert "holds results of forcegp 0.0.1" in refused.stderr
+
+
+def test_results_of_other_code_are_computed_anew_with_one_sentence(reproduced, installed, tmp_path):
+    shutil.copytree(reproduced.folder / "out", tmp_path / "out")
+    for file in (tmp_path / "out" / "jobs" / "fits").glob("analytical/**/job.json"):
+        stored = json.loads(file.read_text())
+        file.write_text(json.dumps({**stored, "digest": "0", "code": "0", "result": {}}))
+    done = installed("reproduce", "all", "--out", "out", folder=tmp_path, timeout=600.0)
+    assert done.returncode == 0, done.stderr
+    assert re.findall("warning: .* were computed by other code; they are computed anew", done.stderr)
+    assert reproduced.text(tmp_path / "out") == reproduced.text()

@@ -10,7 +10,7 @@ from tests.models.arm import URDF, arm_data, arm_system
 from tests.robots.test_nearest_inertia import BROKEN
 
 from forcegp.cli.arguments import parse_arguments
-from forcegp.cli.robot_choice import SYSTEM_FILE
+from forcegp.cli.robot_options import SYSTEM_FILE
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError, NonPhysicalInertia
 from forcegp.mechanics import CoulombJointFriction

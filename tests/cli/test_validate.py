@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 
 import pytest
 from tests.cli.one_line import assert_refused
@@ -67,7 +68,7 @@ def test_the_page_says_what_was_done(found, folder):
     assert {name: stored[name] for name in found if name != "out"} == {k: v for k, v in found.items() if k != "out"}
     assert len(stored["source"]["sha256"]) == 64
     assert stored["configuration"]["points"] == 40
-    assert len(list((folder / "results" / "cells").glob("*.json"))) == 2 * (1 + len(MODELS))
+    assert len(list((folder / "results" / "jobs").glob("*/job.json"))) == 2 * (1 + len(MODELS))
     for name in ("errors", "calibration", "motions"):
         assert f"({name}.png)" in page
         assert (folder / "results" / f"{name}.png").stat().st_size > 5000
@@ -75,8 +76,8 @@ def test_the_page_says_what_was_done(found, folder):
 
 def test_the_same_command_goes_on_and_another_is_refused(forcegp, found, folder):
     words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, *QUICK, "--out", "results")
-    (lost,) = (folder / "results" / "cells").glob("*seed1-analytical.json")
-    lost.unlink()
+    (lost,) = (folder / "results" / "jobs").glob("*seed1-analytical")
+    shutil.rmtree(lost)
     done = forcegp(*words, "--seeds", 2, "--models", *MODELS, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)

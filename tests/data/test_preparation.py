@@ -141,7 +141,7 @@ def test_a_torque_that_never_changes_tells_nothing():
     nothing = estimate_delay(replace(data, u=np.zeros_like(u)))
     assert np.isnan(nothing.common)
     assert nothing.significant == 0.0
-    assert nothing.told == "the torques show no common delay"
+    assert nothing.reason == "the torques show no common delay"
 
 
 def test_what_a_delay_needs_is_said():

@@ -1,4 +1,4 @@
-"""One small fitted arm for all tests of this room."""
+"""One small fitted arm for all tests of this package."""
 
 import pytest
 from tests.models.arm import arm_data, arm_system

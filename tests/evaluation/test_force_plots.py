@@ -136,7 +136,7 @@ def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, 
 
 def test_large_models_say_how_many_curves_are_shown_and_others_can_be_chosen(monkeypatch):
     model = fitted(JointFriction() + PeriodicJointForces(1.0), iterations=1)
-    monkeypatch.setattr("forcegp.evaluation.friction_curves_plot.LARGEST_GRID", 2)
+    monkeypatch.setattr("forcegp.evaluation.plots.friction_curves.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
     assert len(figure.axes) == 2
     assert "2 of 6 curves" in figure.get_suptitle()

@@ -14,8 +14,8 @@ from forcegp.evaluation import (
     summary_figure,
     tool_path_figure,
 )
-from forcegp.evaluation.figure_style import new_figure, short_joint_names, window
-from forcegp.evaluation.tool_path_plot import tool_motion
+from forcegp.evaluation.plots.style import new_figure, short_joint_names, window
+from forcegp.evaluation.plots.tool_path import tool_motion
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

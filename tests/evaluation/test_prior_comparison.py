@@ -75,9 +75,9 @@ def test_the_same_arguments_give_the_same(comparison, train):
 
 
 def test_many_rows_are_conditioned_on_exactly_with_parameters_from_some(train, monkeypatch):
-    for module in ("inference.engines", "models.many_rows"):
+    for module in ("inference.engines", "models.structured.engine_selection"):
         monkeypatch.setattr(f"forcegp.{module}.MOST_EXACT_ROWS", 20)
-    monkeypatch.setattr("forcegp.models.many_rows.LEARNING_ROWS", 15)
+    monkeypatch.setattr("forcegp.models.structured.engine_selection.LEARNING_ROWS", 15)
     assert StructuredGP(train.system, JointFriction()).fit(train, points=30, **QUICK).engine.name == "inducing"
     found = compare_priors(train, PRIORS, points=30, **QUICK)
     for posterior in found.posteriors.values():
@@ -188,7 +188,7 @@ def test_one_that_is_clearly_best():
 def test_of_equals_the_simplest_is_preferred():
     found = told(score("a", 3.0, 3.0, 0.0, latents=9), score("b", 2.1, 3.0, 0.5), score("c", 1.0, 3.0, 0.5, latents=1))
     assert found.verdict == (
-        "a and b cannot be told apart in left-out stretches of 2.5 s; b is the simplest, with 2 latent functions."
+        "a and b cannot be distinguished in left-out stretches of 2.5 s; b is the simplest, with 2 latent functions."
     )
     assert (found.best.name, found.preferred.name) == ("a", "b")
     assert [s.name for s in found.supported] == ["a", "b"]
@@ -196,7 +196,7 @@ def test_of_equals_the_simplest_is_preferred():
 
 def test_of_equally_many_functions_that_with_the_fewest_parameters():
     found = told(score("a", 3.0, 3.0, 0.0, parameters=12), score("b", 2.9, 3.0, 0.5), score("c", 2.8, 3.0, 0.5))
-    assert "a, b and c cannot be told apart" in found.verdict
+    assert "a, b and c cannot be distinguished" in found.verdict
     assert found.verdict.endswith("equally many latent functions; b has the fewest parameters.")
     alike = told(score("a", 2.9, 3.0, 0.5), score("b", 3.0, 3.0, 0.0))
     assert alike.preferred.name == "b"

@@ -1,9 +1,9 @@
-"""One short `kuka-surface` motion, as it is and as the data cell of a run, for tests of the experiments' numbers."""
+"""One short `kuka-surface` motion, as it is and as the data job of a run, for tests of the experiments' numbers."""
 
 import pytest
-from tests.experiments.stored_cells import DATA, keep
+from tests.experiments.stored_jobs import DATA, keep
 
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 
 
 @pytest.fixture(scope="session")
@@ -17,11 +17,11 @@ def motion():
 
 @pytest.fixture(scope="module")
 def run(motion, tmp_path_factory):
-    """Results with one data cell: 60 rows to train on, and the motion itself as test trajectory."""
+    """JobStore with one data job: 60 rows to train on, and the motion itself as test trajectory."""
     from forcegp.data import farthest_rows
     from forcegp.experiments.data import TEST, TRAIN
 
-    results = Results.open(tmp_path_factory.mktemp("run") / "out", "smoke")
+    results = JobStore.open(tmp_path_factory.mktemp("run") / "out", "a test", {})
 
     def write(folder):
         farthest_rows(motion, 60).save(folder / TRAIN)

@@ -25,10 +25,10 @@ def test_networks_are_told_their_steps_only_where_the_preset_has_some():
 
 
 def test_a_series_begins_where_the_fit_with_fewer_points_ended():
-    cells = fit_series("s-gp", "data/seed3", 3, [400, 100, 200], SETTINGS)
-    assert [cell.spec["points"] for cell in cells] == [100, 200, 400]
-    assert [cell.spec["start"] for cell in cells] == [None, cells[0].name, cells[1].name]
-    assert [cell.spec["restarts"] for cell in cells] == [4, 2, 2]
-    assert cells[0].after == ("data/seed3",)
-    assert all(cell.after == ("data/seed3", cell.spec["start"]) for cell in cells[1:])
-    assert all(cell.spec["seed"] == 3 for cell in cells)
+    jobs = fit_series("s-gp", "data/seed3", 3, [400, 100, 200], SETTINGS)
+    assert [job.spec["points"] for job in jobs] == [100, 200, 400]
+    assert [job.spec["start"] for job in jobs] == [None, jobs[0].name, jobs[1].name]
+    assert [job.spec["restarts"] for job in jobs] == [4, 2, 2]
+    assert jobs[0].inputs == ("data/seed3",)
+    assert all(job.inputs == ("data/seed3", job.spec["start"]) for job in jobs[1:])
+    assert all(job.spec["seed"] == 3 for job in jobs)

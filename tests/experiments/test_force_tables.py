@@ -1,17 +1,18 @@
-"""What the experiments on force priors make of their cells: medians over seeds, rows of CSV, tables and figures."""
+"""What the experiments on force priors make of their jobs: medians over seeds, rows of CSV, tables and figures."""
 
 import io
 
 import pytest
-from tests.experiments.stored_cells import keep
+from tests.experiments.stored_jobs import keep
 
-from forcegp.experiments.experiment import DataSettings, spread
+from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.experiments.experiment import DataSettings
 from forcegp.experiments.fits import FitSettings
 from forcegp.experiments.force_experiment import TEST_SEED, ForceExperiment, Trial, trial_name
 from forcegp.experiments.force_tables import dots_figure, only_test, score_table
-from forcegp.experiments.results import Results
 from forcegp.experiments.transfer import Transfer
 from forcegp.experiments.unilateral_contact import UnilateralContact
+from forcegp.jobs import JobStore
 
 DATA = DataSettings(train_seconds=3.0, rows=50, test_seconds=2.0, every=5)
 SEARCH = FitSettings(restarts={"0": 2}, iterations=7, tolerance={"0": 1e-4})
@@ -34,7 +35,7 @@ class OneTrial(ForceExperiment):
 
 @pytest.fixture
 def results(tmp_path):
-    return Results.open(tmp_path / "out", "forces-smoke")
+    return JobStore.open(tmp_path / "out", "a test", {})
 
 
 def store(results, trial, seed, tests, curves=(), **more):
@@ -43,9 +44,9 @@ def store(results, trial, seed, tests, curves=(), **more):
     keep(results, trial_name(trial, seed), {}, found)
 
 
-def test_a_cell_is_told_all_that_its_trial_says():
-    cells = {cell.name: cell for cell in experiment(OneTrial).cells()}
-    fit = cells["force-fits/tilted-extrapolation/tool-friction-analytical-on-sphere-viscous/n10/seed8"]
+def test_a_job_is_told_all_that_its_trial_says():
+    jobs = {job.name: job for job in experiment(OneTrial).jobs()}
+    fit = jobs["force-fits/tilted-extrapolation/tool-friction-analytical-on-sphere-viscous/n10/seed8"]
     assert fit.spec == {
         "train": "force-data/tilted/train/seed8",
         "tests": {"plane": "force-data/viscous/test/seed8", "ball": "force-data/sphere/test/seed8"},
@@ -58,9 +59,9 @@ def test_a_cell_is_told_all_that_its_trial_says():
         "iterations": 7,
         "tolerance": 1e-4,
     }
-    assert fit.after == (fit.spec["train"], *fit.spec["tests"].values())
-    assert len(cells) == 3 * 4
-    train, test = cells[fit.spec["train"]].spec, cells[fit.spec["tests"]["ball"]].spec
+    assert fit.inputs == (fit.spec["train"], *fit.spec["tests"].values())
+    assert len(jobs) == 3 * 4
+    train, test = jobs[fit.spec["train"]].spec, jobs[fit.spec["tests"]["ball"]].spec
     assert train == {"scenario": {"surface": "tilted"}, "seed": 8, "seconds": 3.0, "rows": 50, "every": 5}
     assert test == {"scenario": {"surface": "sphere"}, "seed": TEST_SEED + 8, "seconds": 2.0, "rows": None, "every": 5}
 
@@ -101,8 +102,8 @@ def test_transfer_is_told_relative_to_where_it_was_learned(results):
 def test_shares_of_contact_are_medians_over_seeds(results):
     bullet = experiment(UnilateralContact)
     for seed, share in ((7, 0.8), (8, 0.9), (9, 0.7)):
-        cell = bullet.data_cell("bullet", seed, training=True)
-        keep(results, cell.name, {}, {"in_contact_truth": share, "in_contact_detected": share - 0.1})
+        job = bullet.data_job("bullet", seed, training=True)
+        keep(results, job.name, {}, {"in_contact_truth": share, "in_contact_detected": share - 0.1})
         for trial in bullet.trials():
             store(results, trial, seed, {"bullet": {"mae": 0.5, "mae_in_the_air": None}})
     summary = bullet.summary(results)
@@ -113,7 +114,11 @@ def test_shares_of_contact_are_medians_over_seeds(results):
 
 
 def trial(label, **tests):
-    return {"label": label, "points": 5, "tests": {name: {"mae": spread(values)} for name, values in tests.items()}}
+    return {
+        "label": label,
+        "points": 5,
+        "tests": {name: {"mae": median_and_range(values)} for name, values in tests.items()},
+    }
 
 
 def test_tables_have_a_row_per_trial_and_test():
@@ -125,7 +130,7 @@ def test_tables_have_a_row_per_trial_and_test():
         "| two | 5 | 1.0000 | – |",
         "| two | 5 | 2.0000 | – |",
     ]
-    assert only_test(given[0]) == {"mae": spread([0.5, 0.7, 0.6])}
+    assert only_test(given[0]) == {"mae": median_and_range([0.5, 0.7, 0.6])}
     with pytest.raises(ValueError, match="too many values"):
         only_test(given[1])
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from forcegp.errors import InvalidInput
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import markdown_table, number, shown, spread
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_scenarios import SCENARIOS
 from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 from forcegp.experiments.presets import PRESETS, experiments_of
 from forcegp.experiments.report import report
 from forcegp.experiments.reproduction import as_csv, read_document
+from forcegp.jobs import Job
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 COMMITTED = [
@@ -22,13 +22,13 @@ COMMITTED = [
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_cells_that_experiments_share_are_the_same(preset):
-    known: dict[str, Cell] = {}
+def test_jobs_that_experiments_share_are_the_same(preset):
+    known: dict[str, Job] = {}
     for experiment in PRESETS[preset]:
         experiment.require_possible()
-        for cell in experiment.cells():
-            assert known.setdefault(cell.name, cell) == cell
-    assert all(name in known for cell in known.values() for name in cell.after)
+        for job in experiment.jobs():
+            assert known.setdefault(job.name, job) == job
+    assert all(name in known for job in known.values() for name in job.inputs)
 
 
 def test_figure_2b_has_the_seeds_and_points_that_it_promises():
@@ -63,7 +63,7 @@ def test_the_committed_page_is_made_of_the_committed_numbers(preset):
     for experiment in experiments:
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
-        assert all((folder / f"{name}{ending}").exists() for name in document["figures"] for ending in (".png", ".svg"))
+        assert all((folder / f"{name}.png").exists() for name in document["figures"])
 
 
 def test_the_page_of_the_paper_is_committed():
@@ -72,7 +72,7 @@ def test_the_page_of_the_paper_is_committed():
 
 @pytest.mark.parametrize("preset", ["forces", "forces-smoke"])
 def test_trials_are_told_apart_by_their_names(preset):
-    """One name is one model on one scenario, in all experiments: they share cells, and no cell is of two trials."""
+    """One name is one model on one scenario, in all experiments: they share jobs, and no job is of two trials."""
     known: dict[str, Trial] = {}
     for experiment in PRESETS[preset]:
         assert isinstance(experiment, ForceExperiment)
@@ -97,10 +97,10 @@ def test_what_differs_between_trials_shows_in_their_names(change):
 
 
 def test_spreads_and_tables():
-    assert spread([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
-    assert spread([1.0, None]) is None
-    assert shown(spread([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
-    assert shown(spread([0.5])) == "0.5000"
-    assert shown(None) == "–"
+    assert median_and_range([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
+    assert median_and_range([1.0, None]) is None
+    assert formatted(median_and_range([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
+    assert formatted(median_and_range([0.5])) == "0.5000"
+    assert formatted(None) == "–"
     assert [number(value) for value in (0.0, 1.2e-9, 0.08311, 23456.7)] == ["0.0000", "1.2e-09", "0.0831", "2.3e+04"]
     assert markdown_table(["a", "b"], [["x", "1"]]) == "| a | b |\n|---|---:|\n| x | 1 |"

@@ -4,11 +4,11 @@ import torch
 from gpytorch.constraints import Positive
 from gpytorch.priors import GammaPrior, LogNormalPrior
 from tests.inference.dense import squared_exponential
+from tests.inference.kernel_functions import kernel_cross, kernel_diagonal, kernel_matrix
 from tests.inference.problems import normal
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import LatentKernels
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal, kernel_matrix
 
 
 def scaled_rbf(dimension: int | None = None) -> gk.ScaleKernel:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from gpytorch.kernels import CosineKernel, LinearKernel, MaternKernel, RBFKernel, ScaleKernel
+from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import ExactPosterior, LatentKernels
-from forcegp.inference.kernels import kernel_cross, kernel_matrix
 from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
 from forcegp.priors.kernels import kernel_of
 

@@ -15,9 +15,9 @@ from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference import LatentKernels, OptimizerOptions, minimize_objective
 from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
 from forcegp.models import Coefficients, Noise, StructuredGP, load_posterior, save_posterior
-from forcegp.models.curvature import FLAT, curvature_about
-from forcegp.models.objective import squared_distance, with_variance_priors
-from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.models.identification.curvature import FLAT, curvature_about
+from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.models.structured.objective import squared_distance, with_variance_priors
 from forcegp.priors import NoForces
 from forcegp.priors.kernels import squared_exponential_kernel
 from forcegp.robots import LinkInertia, pseudo_inertia_from_parameters
@@ -61,7 +61,7 @@ def analytical():
     data = measured(damped(), 150, seed=4)
     wrong = PhysicalParameters.of(damped(), LEARN)
     z = 0.3 * torch.as_tensor(np.random.default_rng(1).standard_normal(len(wrong.zero)))
-    return StructuredGP(wrong.system_at(z), prior=NoForces()).fit(data, learn=LEARN), data
+    return StructuredGP(wrong.system_at(z), prior=NoForces()).identify(data, LEARN), data
 
 
 def test_standard_errors_of_the_analytical_model_are_those_of_least_squares(analytical):
@@ -110,7 +110,7 @@ def test_the_posterior_needs_nothing_but_its_system(analytical, tmp_path):
 def test_noise_is_learned_with_the_physical_parameters():
     data = measured(damped(), 60, seed=8)
     model = StructuredGP(damped(damping=(0.1, 0.1, 0.3)), prior=NoForces(), noise=Noise(0.2, learn=True))
-    posterior = model.fit(data, learn=LEARN)
+    posterior = model.identify(data, LEARN)
     assert posterior.noise_std.tolist() == pytest.approx([NOISE] * 3, rel=0.35)
     assert posterior.identification.values["viscous-joint-friction.bend"] == pytest.approx(0.1, abs=0.05)
 
@@ -119,7 +119,7 @@ def test_what_no_motion_shows_is_named():
     # nothing turns about the x axis of the hand's centre of mass but through pan, and the links above it are as unknown
     data = measured(damped(0), 40, seed=2)
     learn = (LinkInertia("upper", ("mass", "com")), LinkInertia("hand", ("mass",)))
-    found = StructuredGP(damped(0), prior=NoForces()).fit(data, learn=learn).identification
+    found = StructuredGP(damped(0), prior=NoForces()).identify(data, learn).identification
     # pan turns upper about a vertical axis: gravity and the angle it starts from show nothing of com.z
     named = {
         max(direction.weights, key=lambda name: abs(direction.weights[name])) for direction in found.weak_directions
@@ -212,7 +212,7 @@ def test_the_prior_is_the_affine_invariant_distance_and_pulls_to_the_start():
     data = measured(damped(), 20, seed=6)
     system = PhysicalParameters.of(damped(), LEARN[0]).system_at(torch.tensor([0.5, 0.1, 0.1, 0.1]).double())
     model = StructuredGP(system, prior=NoForces())
-    free, held = (model.fit(data, learn=LEARN[0], prior_strength=w).identification for w in (0.0, 1e12))
+    free, held = (model.identify(data, LEARN[0], prior_strength=w).identification for w in (0.0, 1e12))
     assert held.values == pytest.approx(held.start, rel=1e-3)
     assert free.values["hand.mass"] != pytest.approx(free.start["hand.mass"], rel=0.05)
     assert held.standard_errors["hand.mass"] < 0.01 * free.standard_errors["hand.mass"]
@@ -221,7 +221,7 @@ def test_the_prior_is_the_affine_invariant_distance_and_pulls_to_the_start():
 def test_every_iterate_of_a_structured_fit_is_kept():
     data = arm_data(25, seed=9, system=damped())
     learn = LinkInertia("hand", ("mass",))
-    posterior = StructuredGP(damped()).fit(data, learn=learn, restarts=2, options=OptimizerOptions(iterations=4))
+    posterior = StructuredGP(damped()).identify(data, learn, restarts=2, options=OptimizerOptions(iterations=4))
     result, found = posterior.result, posterior.identification
     assert len(result.iterates) == len(result.history) == len(found.history)
     for point, value in zip(result.iterates, result.history, strict=True):
@@ -255,7 +255,7 @@ def quiet_joint(rows, seed):
 
 def test_a_variance_does_not_collapse():
     data, learn, options = quiet_joint(12, 1), LinkInertia("hand", ("mass",)), OptimizerOptions(iterations=100)
-    posterior = StructuredGP(damped()).fit(data, learn=learn, restarts=1, options=options)
+    posterior = StructuredGP(damped()).identify(data, learn, restarts=1, options=options)
     objective = posterior.identification.objective
     bare = replace(objective, kernels=objective.likelihood.kernels())  # the same without priors on variances
     names = [f"kernels.{k}.raw_outputscale" for k in range(3)]
@@ -301,7 +301,7 @@ def test_the_prior_on_variances_is_log_normal_and_has_its_gradient():
 def test_a_negative_strength_is_refused():
     data = arm_data(5, seed=0, system=damped())
     with pytest.raises(InvalidInput, match="prior_strength is -1"):
-        StructuredGP(damped()).fit(data, learn=LEARN, prior_strength=-1.0)
+        StructuredGP(damped()).identify(data, LEARN, prior_strength=-1.0)
 
 
 def test_estimates_at_the_limit_of_what_is_allowed_count_as_unknown():
@@ -309,7 +309,7 @@ def test_estimates_at_the_limit_of_what_is_allowed_count_as_unknown():
     data = arm_data(30, 1)
     system = data.system
     learn = system.robot.link("hand").inertial("mass")
-    posterior = StructuredGP(system, NoForces(), "zero").fit(data, learn=learn)
+    posterior = StructuredGP(system, NoForces(), "zero").identify(data, learn)
     found = posterior.identification
     at_limit = replace(
         found,

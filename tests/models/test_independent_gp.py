@@ -13,8 +13,8 @@ from tests.models.model_conformance import ModelConformance
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.models import Noise, StructuredGP
-from forcegp.models.independent_gp import IndependentGP
-from forcegp.models.independent_posterior import joint_part, one_joint
+from forcegp.models.baselines.independent_gp import IndependentGP
+from forcegp.models.baselines.independent_posterior import joint_part, one_joint
 from forcegp.priors import JointAccelerations
 
 QUICK = OptimizerOptions(iterations=15)

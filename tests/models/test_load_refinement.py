@@ -13,7 +13,8 @@ from forcegp.data import Dataset
 from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.inference import OptimizerOptions
 from forcegp.models import StructuredGP, load_posterior, save_posterior
-from forcegp.models.load_refinement import SETTLED, fit_with_refined_loads
+from forcegp.models.structured.load_refinement import SETTLED, fit_with_refined_loads
+from forcegp.models.structured.search import Search
 from forcegp.parallel import Serial
 from forcegp.priors import ContactFriction, JointFriction, Payload, SumPrior
 
@@ -61,8 +62,8 @@ def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
 
 def first_fit(model: StructuredGP, data: Dataset):
     """The fit under the nominal normal force, which `fit` does not stop at."""
-    how = {"seed": 0, "backend": Serial(), "hyperprior": True, "options": OPTIONS, "progress": None}
-    return model._fit(data, data, 1, None, None, 0.0, **how)
+    search = Search(Serial(), restarts=1, seed=0, hyperprior=True, options=OPTIONS, start=None, progress=None)
+    return model._fit(data, data, search)
 
 
 def errors(posterior, test: Dataset) -> dict[str, float]:
@@ -185,8 +186,8 @@ def test_an_expectation_that_was_given_stays():
 def test_fits_that_learn_physical_parameters_take_the_nominal_normal_force():
     data = sliding_data(20, 0)
     learn = data.system.robot.link("hand").inertial("mass")
-    posterior = StructuredGP(data.system, LOAD).fit(
-        data, restarts=1, options=OptimizerOptions(iterations=3), learn=learn, prior_strength=1.0
+    posterior = StructuredGP(data.system, LOAD).identify(
+        data, learn, restarts=1, options=OptimizerOptions(iterations=3), prior_strength=1.0
     )
     assert posterior.model.prior == LOAD
     assert posterior.identification is not None

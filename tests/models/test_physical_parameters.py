@@ -17,7 +17,7 @@ from forcegp.mechanics import (
     ViscousJointFriction,
 )
 from forcegp.models import Coefficients, StructuredGP
-from forcegp.models.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.models.search import with_steps_before
 from forcegp.priors import NoForces
 from forcegp.robots import LinkInertia
@@ -114,8 +114,8 @@ def test_contact_points_do_not_know_the_centre_of_mass():
 def test_gradient_of_the_objective_in_every_number(mean):
     data = arm_data(6, seed=3, system=system())
     learn = everything() if mean == "analytical" else everything()[:1]
-    posterior = StructuredGP(system(), mean=mean).fit(
-        data, restarts=1, learn=learn, options=OptimizerOptions(iterations=1)
+    posterior = StructuredGP(system(), mean=mean).identify(
+        data, learn, restarts=1, options=OptimizerOptions(iterations=1)
     )
     identification = posterior.identification
     physical, objective = identification.physical, identification.objective
@@ -139,7 +139,7 @@ def test_quiet_data_give_the_true_inertia_back(contacts):
     quiet = replace(data, a=exact.numpy() + noise, truth={}, noise_std=np.full(3, 1e-6))
     wrong = PhysicalParameters.of(truth, LinkInertia("hand", ("mass", "com")))
     system = wrong.system_at(moved(wrong, 2, 0.5))
-    posterior = StructuredGP(system, prior=NoForces()).fit(quiet, learn=LinkInertia("hand", ("mass", "com")))
+    posterior = StructuredGP(system, prior=NoForces()).identify(quiet, LinkInertia("hand", ("mass", "com")))
     found, true = posterior.system.robot.link("hand"), truth.robot.link("hand")
     assert abs(system.robot.link("hand").mass - true.mass) > 0.05
     assert found.mass == pytest.approx(true.mass, abs=1e-5)
@@ -154,8 +154,8 @@ def test_a_zero_mean_begins_at_the_given_system():
     given = wrong.system_at(moved(wrong, 2, 0.5))
     starts = {}
     for mean in ("analytical", "zero"):
-        posterior = StructuredGP(given, mean=mean).fit(
-            data, restarts=1, learn=learn, options=OptimizerOptions(iterations=0)
+        posterior = StructuredGP(given, mean=mean).identify(
+            data, learn, restarts=1, options=OptimizerOptions(iterations=0)
         )
         starts[mean] = len(posterior.result.iterates), posterior.identification.values["hand.mass"]
     mass = given.robot.link("hand").mass
@@ -168,7 +168,7 @@ def test_a_zero_mean_begins_at_the_given_system():
 def test_a_start_in_the_units_of_another_fit_is_refused():
     data = arm_data(8, seed=7, system=system())
     with pytest.raises(InvalidInput, match=r"start has 'physical'.*StructuredGP\(posterior.system\)"):
-        StructuredGP(system()).fit(data, learn=LinkInertia("hand"), start={PHYSICAL: torch.zeros(10).double()})
+        StructuredGP(system()).identify(data, LinkInertia("hand"), start={PHYSICAL: torch.zeros(10).double()})
 
 
 def test_steps_without_an_objective_do_not_cost_the_fit():

@@ -206,7 +206,7 @@ def test_networks_take_the_level_alone(train, network):
 
 def test_a_noise_that_only_data_can_tell_is_none_without_them(train):
     unknown = dataclasses.replace(train, noise_std=None)
-    with pytest.raises(InvalidInput, match="does not know its noise level"):
+    with pytest.raises(InvalidInput, match="noise level"):
         StructuredGP(train.system, noise=Noise(None, 0.1)).fit(unknown)
     with pytest.raises(InvalidInput, match="from the dataset of a fit"):
         Noise(None).parameters(3)

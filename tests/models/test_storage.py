@@ -1,6 +1,8 @@
 """A fitted model on disk: what comes back predicts the same, and damage is named."""
 
 import json
+import os
+import stat
 import subprocess
 import sys
 
@@ -13,6 +15,7 @@ from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
 from forcegp.models import IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
+from forcegp.models.storage import FORMAT_VERSION
 from forcegp.robots import Robot
 
 FILES = {"model.json", "tensors.safetensors", "robot.urdf"}
@@ -83,10 +86,39 @@ def test_an_interrupted_save_leaves_nothing(posterior, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("forcegp.models.storage.save_file", fail)
+    monkeypatch.setattr("forcegp.models.storage.save", fail)
     with pytest.raises(OSError, match="disk full"):
         save_posterior(posterior, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["write", "rename"])
+def test_the_old_model_can_be_loaded_after_an_overwrite_that_failed(posterior, carried, run, monkeypatch, what):
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    rename = os.rename
+
+    def fail(data, *to):
+        if not to or str(to[0]) == str(run):
+            monkeypatch.undo()
+            raise OSError("disk full")
+        rename(data, *to)
+
+    monkeypatch.setattr(*(("forcegp.models.storage.save", fail) if what == "write" else (os, "rename", fail)))
+    with pytest.raises(OSError, match="disk full"):
+        save_posterior(carried, run, overwrite=True)
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+    assert load_posterior(run).target is None
+    assert [path.name for path in run.parent.iterdir()] == ["run"]
+
+
+def test_others_may_read_what_the_umask_allows(posterior, tmp_path):
+    before = os.umask(0o027)
+    try:
+        save_posterior(posterior, tmp_path / "run")
+    finally:
+        os.umask(before)
+    modes = {stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "run").iterdir()}
+    assert (stat.S_IMODE((tmp_path / "run").stat().st_mode), modes) == (0o750, {0o640})
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
@@ -185,10 +217,40 @@ def test_a_model_that_was_carried_to_another_system_predicts_there_after_loading
     assert torch.equal(load_posterior(again).predict(*states).mean, loaded.predict(*states).mean)
 
 
-def test_a_carried_model_is_of_a_format_that_older_programs_refuse(carried, posterior, run, tmp_path):
+def test_what_a_model_holds_is_declared_by_name(carried, run, tmp_path):
     save_posterior(carried, tmp_path / "carried")
-    versions = [json.loads((path / "model.json").read_text())["format_version"] for path in (run, tmp_path / "carried")]
-    assert versions == [1, 2]
+    documents = [json.loads((path / "model.json").read_text()) for path in (run, tmp_path / "carried")]
+    assert [document["features"] for document in documents] == [[], ["target"]]
+    assert all(document["format_version"] == FORMAT_VERSION for document in documents)
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (
+            ["target", "hysteresis"],
+            r"features 'hysteresis', which this .* use the version .* or fit again",
+        ),
+        (["target"], "target"),
+        (["windows"], "declares 'windows' and holds no features"),
+        (["measured-torque"], "declares 'measured-torque'"),
+        ("target", "not a list of names"),
+        ([5], "not a list of names"),
+    ],
+)
+def test_features_that_are_unknown_or_not_there_are_refused(posterior, run, features, message):
+    document = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(document | {"features": features}))
+    with pytest.raises(FileFormatError, match=message):
+        load_posterior(run)
+
+
+def test_a_feature_that_is_there_must_be_declared(carried, tmp_path):
+    save_posterior(carried, tmp_path / "run")
+    file = tmp_path / "run" / "model.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"features": []}))
+    with pytest.raises(FileFormatError, match="declares no features and holds 'target'"):
+        load_posterior(tmp_path / "run")
 
 
 @pytest.mark.parametrize("damage", ["no file", "other robot", "no target"])

@@ -26,7 +26,7 @@ from forcegp.data import Dataset
 from forcegp.errors import FileFormatError, InvalidInput, NotEnoughMemory
 from forcegp.inference import FunctionalPosterior, OptimizerOptions
 from forcegp.models import MarginalLikelihood, StructuredPosterior, TrainingData
-from forcegp.robots import Robot
+from forcegp.robots import LinkInertia, Robot
 
 HOW = WeakForm(0.1, nodes=8)
 FIT = {"points": 24, "restarts": 1}
@@ -39,7 +39,7 @@ def with_true_accelerations(dataset: Dataset) -> Dataset:
 @cache
 def fitted() -> StructuredPosterior:
     data = motion()
-    return StructuredGP(data.system, JointFriction()).fit(data, observe=HOW, **FIT)
+    return StructuredGP(data.system, JointFriction()).fit_windows(data, HOW, **FIT)
 
 
 def test_positions_alone_teach_as_much_as_exact_accelerations():
@@ -67,7 +67,7 @@ def test_the_noise_that_is_learned_is_that_of_the_sensors_in_a_window():
 @pytest.mark.parametrize("how", [replace(HOW, signal="v", order=1), VelocityIncrements(0.06, 5)], ids=lambda h: h.name)
 def test_velocities_serve_as_well(how):
     data, test = motion(), with_true_accelerations(motion(seed=1))
-    posterior = StructuredGP(data.system, JointFriction()).fit(data, observe=how, **FIT)
+    posterior = StructuredGP(data.system, JointFriction()).fit_windows(data, how, **FIT)
     assert evaluate(posterior, test).mae < 1.3 * evaluate(fitted(), test).mae
 
 
@@ -117,7 +117,7 @@ def test_masses_are_learned_from_positions():
     wrong = arm_system(contacts=0).with_robot(Robot.from_urdf_text(URDF.replace('value="0.6"', 'value="0.9"')))
     data = replace(motion(), system=wrong)
     learn = wrong.robot.link("hand").inertial("mass")
-    posterior = StructuredGP(wrong, JointFriction()).fit(data, observe=replace(HOW, nodes=4), learn=learn, **FIT)
+    posterior = StructuredGP(wrong, JointFriction()).identify(data, learn, observe=replace(HOW, nodes=4), **FIT)
     assert posterior.identification is not None
     (start,), (end,) = posterior.identification.start.values(), posterior.identification.values.values()
     assert start == pytest.approx(0.9)
@@ -134,7 +134,7 @@ def test_a_stored_model_predicts_the_same_and_says_that_it_knows_windows(tmp_pat
     assert len(loaded.training) == 24
     assert loaded.settings["observe"] == posterior.settings["observe"]
     document = json.loads((tmp_path / "run" / "model.json").read_text())
-    assert document["format_version"] == 4
+    assert document["features"] == ["windows"]
     broken = replace(posterior.training, weights=posterior.training.weights[:-1])
     object.__setattr__(posterior.likelihood, "training", broken)
     try:
@@ -165,31 +165,47 @@ def test_what_needs_single_rows_is_refused_with_a_remedy():
         lambda: posterior.update(data.rows([1, 2])),
         lambda: posterior.predictor(covariance="compressed", compile=False),
     ):
-        with pytest.raises(InvalidInput, match="fit to accelerations, without observe"):
+        with pytest.raises(InvalidInput, match="StructuredGP"):
             attempt()
     model = StructuredGP(data.system, JointFriction())
     for how in ({"engine": "inducing"}, {"learning_points": 5}):
         with pytest.raises(InvalidInput, match=r"windows .* are conditioned on exactly"):
-            model.fit(data, observe=HOW, **how)
+            model.identify(data, LinkInertia("hand", ("mass",)), observe=HOW, **how)
     sensor = replace(model, noise=Noise(None, force=0.1, learn=True, measured_torque=True))
-    with pytest.raises(InvalidInput, match=r"windows .* tell that of their mean"):
-        sensor.fit(data, observe=HOW)
+    with pytest.raises(InvalidInput, match=r"windows .* their mean"):
+        sensor.fit_windows(data, HOW)
     with pytest.raises(InvalidInput, match=r"no observation 'weak' .*did you mean 'weak-form'"):
-        model.fit(data, observe="weak")
+        model.fit_windows(data, "weak")
     with pytest.raises(InvalidInput, match=r"points=99 is not between 2 and the \d+ windows of 0.1 s"):
-        model.fit(data, observe=HOW, points=99)
+        model.fit_windows(data, HOW, points=99)
 
 
 def test_more_windows_than_memory_holds_are_refused(monkeypatch):
     monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda device: 10_000)
     data = motion()
     with pytest.raises(NotEnoughMemory, match=r"24 windows of 8 nodes .*fewer points"):
-        StructuredGP(data.system, JointFriction()).fit(data, observe=HOW, **FIT)
+        StructuredGP(data.system, JointFriction()).fit_windows(data, HOW, **FIT)
 
 
 def test_equal_seeds_give_equal_models_from_several_starts():
     data, options = motion(), OptimizerOptions(iterations=5)
     how = {"observe": "weak-form", "points": 8, "restarts": 2, "seed": 3, "options": options}
-    first, second = (StructuredGP(data.system, JointFriction()).fit(data, **how) for _ in range(2))
+    first, second = (StructuredGP(data.system, JointFriction()).fit_windows(data, **how) for _ in range(2))
     assert first.result.value == second.result.value
     assert len(first.settings["restart_objective"]) == 2
+
+
+def test_the_keywords_of_version_0_1_still_work_and_name_their_successors():
+    data = motion()
+    model = StructuredGP(data.system, JointFriction())
+    how = {"points": 6, "restarts": 1, "options": OptimizerOptions(iterations=2)}
+    with pytest.warns(DeprecationWarning, match="fit_windows"):
+        before = model.fit(data, observe=HOW, **how)
+    assert before.result.value == model.fit_windows(data, HOW, **how).result.value
+    mass = LinkInertia("hand", ("mass",))
+    with pytest.warns(DeprecationWarning, match="identify"):
+        before = model.fit(data, observe=HOW, learn=mass, prior_strength=1.0, **how)
+    now = model.identify(data, mass, observe=HOW, prior_strength=1.0, **how)
+    assert before.identification.values == now.identification.values
+    with pytest.raises(TypeError, match="point"):
+        model.fit(data, point=6)

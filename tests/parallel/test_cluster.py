@@ -9,16 +9,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.experiments.test_cells import TOY, next_to, square
+from tests.jobs.test_running import TOY, next_to, square
 from tests.models.arm import arm_data
 from tests.parallel import tasks
 from tests.parallel.conformance import WorkersConformance
 from tests.parallel.two_nodes import another_node, end_session
 
 from forcegp.errors import BackendError, FitError
-from forcegp.experiments.cells import Cell, run_cells
-from forcegp.experiments.results import Results
 from forcegp.inference import OptimizerOptions
+from forcegp.jobs import Job, JobStore, run_jobs
 from forcegp.models import IndependentGP, StructuredGP
 from forcegp.parallel import Joblib, Ray, Serial
 from forcegp.parallel import cluster as cluster_module
@@ -71,34 +70,35 @@ def test_a_fit_is_the_same_on_every_backend(cluster, model):
             torch.testing.assert_close(other.parameters[name], value, rtol=1e-7, atol=1e-9)
 
 
-def test_cells_are_computed_without_seeing_the_folder_of_results(cluster, tmp_path):
+def test_jobs_are_computed_without_seeing_the_folder_of_results(cluster, tmp_path):
     """Those that others are made from travel there, and all files travel back."""
-    results = Results.open(tmp_path / "out", "smoke")
-    last = Cell("last", f"{TOY}:square", {"before": "next/3"}, ("next/3",))
-    assert run_cells(results, [square(3), square(4)], Ray(cluster)) == 2
-    assert run_cells(results, [last, next_to(square(3)), square(3)], Ray(cluster)) == 2
+    results = JobStore.open(tmp_path / "out", "a test", {})
+    last = Job("last", f"{TOY}:square", {"before": "next/3"}, ("next/3",))
+    assert run_jobs(results, [square(3), square(4)], Ray(cluster)) == 2
+    assert run_jobs(results, [last, next_to(square(3)), square(3)], Ray(cluster)) == 2
     assert results.result("last")["value"] == 11
-    assert (results.cell_folder("square/4") / "note.txt").read_text() == "beside the result"
+    assert (results.place("square/4") / "note.txt").read_text() == "beside the result"
     assert results.result("square/3")["process"] != os.getpid()
-    with pytest.raises(FitError, match=r"bad failed \(no luck\); 1 of 2 cells are kept"):
-        run_cells(results, [Cell("bad", f"{TOY}:fail", {}), square(5)], Ray(cluster))
+    with pytest.raises(FitError, match=r"bad failed \(no luck\); 1 of 2 jobs are kept"):
+        run_jobs(results, [Job("bad", f"{TOY}:fail", {}), square(5)], Ray(cluster))
 
 
 def test_a_sweep_whose_driver_is_killed_goes_on(cluster, tmp_path):
     begun = tmp_path / "begun"
     script = (
         "from pathlib import Path\n"
-        "from tests.experiments.test_cells import *\n"
+        "from tests.jobs.test_running import *\n"
         "from forcegp.parallel import Ray\n"
-        f"slow = Cell('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
-        f"run_cells(Results.open(Path({str(tmp_path / 'out')!r}), 'smoke'), [square(2), slow], Ray({cluster!r}))\n"
+        f"slow = Job('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
+        f"store = JobStore.open(Path({str(tmp_path / 'out')!r}), 'a test', {{}})\n"
+        f"run_jobs(store, [square(2), slow], Ray({cluster!r}))\n"
     )
-    results = tmp_path / "out" / "cells"
+    results = tmp_path / "out" / "jobs"
     kill_when(script, begun, lambda: (results / "square" / "2").exists())
-    results = Results.open(tmp_path / "out", "smoke")
+    results = JobStore.open(tmp_path / "out", "a test", {})
     first = results.load("square/2")
-    assert not results.cell_folder("slow").exists()
-    assert run_cells(results, [square(2), square(3)], Ray(cluster)) == 1
+    assert not results.place("slow").exists()
+    assert run_jobs(results, [square(2), square(3)], Ray(cluster)) == 1
     assert results.load("square/2") == first
 
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 from safetensors.torch import load, save
 from tests.inference.dense import dense_negative_log_likelihood
+from tests.inference.kernel_functions import kernel_cross, kernel_diagonal, kernel_matrix
 from tests.inference.problems import normal, problem
 
 from forcegp.inference import LatentKernels, negative_log_likelihood
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal, kernel_matrix
 from forcegp.models.search import perturbed
 from forcegp.priors.kernels import kernel_of
 

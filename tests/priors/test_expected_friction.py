@@ -115,7 +115,7 @@ def test_the_normal_force_solves_the_equations_with_friction_in_them(surface):
     dynamics = rows_of(surface)
     _, speed = friction_direction(dynamics)
     coefficients = torch.tensor(np.interp(speed.numpy(), COEFFICIENT.at, COEFFICIENT.values))
-    names = dynamics.state.kinematics.robot.joint_names
+    names = dynamics.state.robot.joint_names
     joint_force = torch.zeros_like(dynamics.state.v)
     for name, curve in JOINTS:
         k = names.index(name)

@@ -114,13 +114,13 @@ class TestToolForces:
         normal = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
         normal = normal / normal.norm()
         on_the_plane = v - (torch.linalg.pinv(dynamics.A) @ (dynamics.A @ v[..., None]))[..., 0]
-        held = MechanicalSystem(dynamics.state.kinematics.robot, contacts("one", FRAME)).dynamics(q, on_the_plane, u)
+        held = MechanicalSystem(dynamics.state.robot, contacts("one", FRAME)).dynamics(q, on_the_plane, u)
         force = ToolForces().point_force(held)
         torch.testing.assert_close(force.mT @ force, torch.eye(2).double().expand(ROWS, 2, 2), rtol=0.0, atol=1e-12)
         assert float((normal @ force).abs().max()) < 1e-12
         torch.testing.assert_close(ToolForces().mixing(held), J[:, :3].mT @ force, rtol=1e-10, atol=1e-10)
         drifted = v - 0.99 * (v - on_the_plane)
-        moving = MechanicalSystem(dynamics.state.kinematics.robot, contacts("one", FRAME)).dynamics(q, drifted, u)
+        moving = MechanicalSystem(dynamics.state.robot, contacts("one", FRAME)).dynamics(q, drifted, u)
         velocity = (J[:, :3] @ drifted[..., None])[..., 0]
         (z, _), tangents = ToolForces().features(moving), ToolForces().point_force(moving)
         off = float((velocity @ normal).abs().max())
@@ -216,7 +216,7 @@ class TestContactFriction:
 
 def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
     prior = JointFriction(("tilt", "slide"))
-    order = [dynamics.state.kinematics.robot.joint_names.index(name) for name in ("tilt", "slide")]
+    order = [dynamics.state.robot.joint_names.index(name) for name in ("tilt", "slide")]
     force = prior.mixing(dynamics) @ torch.tensor([2.0, 3.0], dtype=torch.float64)
     expected = torch.zeros_like(rows[1])
     expected[:, order] = torch.tensor([-2.0, -3.0], dtype=torch.float64)
@@ -227,7 +227,7 @@ def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
 def test_periodic_forces_repeat(dynamics):
     """Functions of the kernel at q and at q + k periods are perfectly correlated; in between they are not."""
     prior = PeriodicJointForces(0.3)
-    robot = dynamics.state.kinematics.robot
+    robot = dynamics.state.robot
     z = prior.features(dynamics)
     later = [one + 0.3 * torch.arange(ROWS).double()[:, None] for one in z]
     half = [one + 0.15 for one in z]
@@ -243,7 +243,7 @@ def test_periodic_forces_repeat(dynamics):
 def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
     """A unit step of the search, such as a restart takes, is one standard deviation of the prior: 2 %."""
     given = torch.tensor(0.3, dtype=torch.float64)
-    robot = dynamics.state.kinematics.robot
+    robot = dynamics.state.robot
     kernels = LatentKernels(PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()))
     start = kernels.initial_parameters()
     name = "kernels.1.base_kernel.raw_period_length"

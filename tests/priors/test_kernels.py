@@ -6,12 +6,12 @@ import gpytorch.kernels as gk
 import pytest
 import torch
 from tests.inference.dense import squared_exponential
+from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from tests.inference.problems import normal
 from tests.priors.kernel_conformance import KernelConformance
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import ExactPosterior, LatentKernels, minimize_objective, negative_log_likelihood
-from forcegp.inference.kernels import kernel_cross, kernel_matrix
 from forcegp.priors.kernels import KERNELS, check_kernel, kernel_of
 
 

@@ -1,11 +1,16 @@
 """MCAP files chunk by chunk, and message by message where chunks overlap in time: the same messages."""
 
+import importlib
+import sys
+
 import numpy as np
 import pytest
 from tests.recordings.log_files import EPOCH, joint_states, motion, write_bag2
 
+from forcegp.recordings import mcap_chunks as mcap_module
 from forcegp.recordings import open_source
-from forcegp.recordings.raw_messages import _ordered_mcap, topic_messages
+from forcegp.recordings.mcap_chunks import mcap_chunks
+from forcegp.recordings.raw_messages import _ordered_chunks, topic_messages
 
 pytest.importorskip("rosbags")
 
@@ -39,7 +44,7 @@ def test_messages_come_in_the_order_of_time(tmp_path, order, fast):
     positions = np.concatenate([piece["/joint_states:position.elbow"] for piece in pieces])
     np.testing.assert_array_equal(positions, motion()["q"][:, 1])
     with source._open() as reader:
-        assert (_ordered_mcap(reader) is not None) == fast
+        assert (_ordered_chunks(reader) is not None) == fast
 
 
 def test_both_ways_give_the_same_bytes(tmp_path, monkeypatch):
@@ -53,6 +58,66 @@ def test_both_ways_give_the_same_bytes(tmp_path, monkeypatch):
                     yield int(stamp), batch.buffer[begin : begin + length].tobytes()
 
     fast = list(messages())
-    monkeypatch.setattr("forcegp.recordings.raw_messages._ordered_mcap", lambda reader: None)
+    monkeypatch.setattr("forcegp.recordings.raw_messages._ordered_chunks", lambda reader: None)
     assert fast == list(messages())
     assert len(fast) == 267
+
+
+def hidden(place: str, name: str):
+    """An attribute that rosbags itself has, but not for us: it may rename what it does not document."""
+
+    def hide(monkeypatch):
+        module, _, kind = place.rpartition(".")
+        kind = getattr(importlib.import_module(module), kind)
+        own = kind.__getattribute__
+
+        def get(self, wanted):
+            if wanted == name and sys._getframe(1).f_globals["__name__"].startswith("forcegp"):
+                raise AttributeError(name)
+            return own(self, wanted)
+
+        monkeypatch.setattr(kind, "__getattribute__", get)
+
+    return hide
+
+
+def other_offsets(monkeypatch):
+    """Offsets that mean something else."""
+    own = mcap_module._begins_at
+    monkeypatch.setattr(
+        mcap_module,
+        "_begins_at",
+        lambda info, file: own(info._replace(chunk_start_offset=info.chunk_start_offset + 9), file),
+    )
+
+
+CHANGES = [
+    hidden("rosbags.highlevel.AnyReader", "readers"),
+    hidden("rosbags.rosbag2.Reader", "storage"),
+    hidden("rosbags.rosbag2.reader.DirectoryReader", "storages"),
+    hidden("rosbags.rosbag2.storage_mcap.McapReader", "chunks"),
+    hidden("rosbags.rosbag2.storage_mcap.McapReader", "bio"),
+    other_offsets,
+]
+
+
+@pytest.mark.parametrize("compressed", [None, "STORAGE"])
+@pytest.mark.parametrize("change", CHANGES, ids=["readers", "storage", "storages", "chunks", "file", "offsets"])
+def test_where_rosbags_has_changed_inside_the_rows_are_the_same(tmp_path, monkeypatch, change, compressed):
+    write_bag2(tmp_path / "log", motion(), gripper=True, compressed=compressed)
+
+    def imported():
+        source = open_source(tmp_path / "log")
+        names = [f"/joint_states:{name}" for name in ("log_time", "header.stamp", "position.elbow", "effort.elbow")]
+        with source._open() as reader:
+            fast = mcap_chunks(reader) is not None
+        pieces = list(source.chunks(names, 64))
+        return fast, {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
+
+    fast, before = imported()
+    change(monkeypatch)
+    still_fast, now = imported()
+    assert (fast, still_fast) == (True, False)
+    assert before.keys() == now.keys()
+    for name, values in before.items():
+        np.testing.assert_array_equal(now[name], values, err_msg=name)

@@ -1,4 +1,4 @@
-"""URDFs that between them hold every kind of joint and link, for tests of any room."""
+"""URDFs that between them hold every kind of joint and link, for tests of any package."""
 
 from pathlib import Path
 

@@ -16,7 +16,7 @@ from tests.robots.pinocchio_oracle import Oracle
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
 from forcegp.robots.compiled_programs import CompiledProgram, compile_c
-from forcegp.robots.dynamics_programs import INERTIA_ENTRIES, Request, trace
+from forcegp.robots.dynamics_programs import INERTIA_ENTRIES, Request, trace_dynamics
 from forcegp.robots.machine_code import input_arrays, write_c
 from forcegp.robots.unrolled import UnrolledRobot
 
@@ -148,7 +148,7 @@ def test_every_number_of_states(robot, compiled, count):
 def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
     """What is written for other processors runs here, too, only slower; parts of any length do the same."""
     request = Request("forward_dynamics", free_inertias=True, states=True, inertias=True)
-    source = write_c(trace(UnrolledRobot(robot), request), request.inputs, lanes, statements)
+    source = write_c(trace_dynamics(UnrolledRobot(robot), request), request.inputs, lanes, statements)
     compile_c(source, (), tmp_path / "program.so")
     q, v, tau, weights = random(4, 13, 3)
     inertias = robot.tree.inertias[..., 0][:, *zip(*INERTIA_ENTRIES, strict=True)].reshape(1, -1)

@@ -1,12 +1,13 @@
 """A whole comparison: one file per piece of work, resumed, extended, refused, and with a model that fails."""
 
 import json
+import shutil
 
 import pytest
 from tests.validation.moving_arm import given_system, moving_arm
 
-from forcegp.data.whole_files import only_one_process
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
+from forcegp.jobs import JobStore, code_digest
 from forcegp.models import StructuredGP
 from forcegp.priors import NoForces
 from forcegp.validation import (
@@ -19,7 +20,7 @@ from forcegp.validation import (
     split_named,
     validate,
 )
-from forcegp.validation.kept_cells import KIND
+from forcegp.validation.run import KIND
 
 MODELS = ("analytical", "joint-friction", "broken")
 
@@ -46,7 +47,7 @@ def model_of_somebody_else(monkeypatch):
 
 
 def changed(folder) -> dict[str, int]:
-    return {file.name: file.stat().st_mtime_ns for file in (folder / "cells").glob("*.json")}
+    return {file.parent.name: file.stat().st_mtime_ns for file in (folder / "jobs").glob("*/job.json")}
 
 
 def test_a_run_goes_on_where_it_was_and_grows(data, tmp_path):
@@ -55,17 +56,17 @@ def test_a_run_goes_on_where_it_was_and_grows(data, tmp_path):
     assert notes[-1][0] == notes[-1][1]
     kept = changed(folder)
     assert set(kept) == {  # the identification for the mass matrix, and the model
-        "episodes-1-seed0-identification-acceleration.json",
-        "episodes-1-seed0-analytical.json",
+        "episodes-1-seed0-identification-acceleration",
+        "episodes-1-seed0-analytical",
     }
     assert set(first.document["models"]) == {"analytical"}
     grown = validate(comparison(data), folder, models=MODELS, seeds=2)
     assert {name: changed(folder)[name] for name in kept} == kept, "finished pieces are not computed again"
     assert len(changed(folder)) == 1 + 2 * len(MODELS)
     before = changed(folder)
-    lost = folder / "cells" / "episodes-1-seed1-joint-friction.json"
-    lost.unlink()
-    (folder / "cells" / ".episodes-1-seed1-joint-friction.json.abc.tmp").write_text("{")  # of a killed run
+    lost = folder / "jobs" / "episodes-1-seed1-joint-friction"
+    shutil.rmtree(lost)
+    (folder / "jobs" / ".episodes-1-seed1-joint-friction.abc.tmp").mkdir()  # of a killed run
     again = validate(comparison(data), folder, models=MODELS, seeds=2)
     after = changed(folder)
     assert {name for name in before if before[name] != after[name]} == {lost.name}
@@ -96,7 +97,7 @@ def test_processes_find_the_same_as_this_one_also_what_somebody_has_added(data, 
     monkeypatch.setitem(IDENTIFICATIONS, "mine", Identification("leaving it as it is", leave, all_rows=True))
     models = ("identified-mine", "joint-friction@mine")
     one, two = (validate(comparison(data), tmp_path / str(jobs), models=models, seeds=2, jobs=jobs) for jobs in (1, 2))
-    assert len(list((tmp_path / "2" / "cells").glob("*identification-mine*"))) == 1, "of all rows, so once"
+    assert len(list((tmp_path / "2" / "jobs").glob("*identification-mine*"))) == 1, "of all rows, so once"
     for name in models:
         assert two.document["models"][name]["runs"] == 2
         for score in ("nrmse", "force_rms", "nlpd", "motions"):
@@ -126,16 +127,16 @@ def test_all_that_failed_still_makes_a_page(data, tmp_path):
 def test_another_configuration_is_refused_and_overwritten_on_demand(data, tmp_path):
     folder = tmp_path / "out"
     validate(comparison(data), folder, models=("analytical",), seeds=1)
-    with pytest.raises(InvalidInput, match=r"points, restarts.*--out"):
+    with pytest.raises(InvalidInput, match=r"points \(15, not 16\), restarts \(1, not 2\).*--out"):
         validate(comparison(data, points=16, restarts=2), folder, models=("analytical",), seeds=1)
     shorter = moving_arm(0.5, 2)
-    with pytest.raises(InvalidInput, match="another recording_sha256, rows_sha256"):
+    with pytest.raises(InvalidInput, match=r"another recording_sha256.*, rows_sha256"):
         validate(comparison(shorter), folder, models=("analytical",), seeds=1)
-    with only_one_process(folder, KIND), pytest.raises(InvalidInput, match="another `forcegp validate` is at work"):
+    with JobStore(folder, KIND).locked(), pytest.raises(InvalidInput, match="another `forcegp validate` is at work"):
         validate(comparison(data), folder, models=("analytical",), seeds=1)
     found = validate(comparison(data, points=16), folder, models=("analytical",), seeds=1, overwrite=True)
     assert found.document["points"] == 16
-    (folder / "cells" / "episodes-1-seed0-analytical.json").write_text('{"name": ')
+    (folder / "jobs" / "episodes-1-seed0-analytical" / "job.json").write_text('{"name": ')
     with pytest.raises(FileFormatError, match="half written or damaged"):
         validate(comparison(data, points=16), folder, models=("analytical",), seeds=1)
 
@@ -202,3 +203,34 @@ def test_wrong_arguments_are_refused_before_anything_is_written(data, tmp_path, 
 def test_a_comparison_that_cannot_be_made_is_refused(data, changes, message):
     with pytest.raises(InvalidInput, match=message):
         comparison(data, **changes)
+
+
+def test_results_that_do_not_record_their_code_are_not_used(data, tmp_path):
+    folder = tmp_path / "out"
+    validate(comparison(data), folder, models=("analytical",), seeds=1)
+    configuration = {"forcegp": "0.1.0", **comparison(data).configuration()}
+    shutil.rmtree(folder / "jobs")
+    (folder / "jobs.json").unlink()
+    (folder / "cells").mkdir()
+    (folder / "cells" / "episodes-1-seed0-analytical.json").write_text("{}")
+    (folder / "configuration.json").write_text(json.dumps({"kind": KIND, "configuration": configuration}))
+    with pytest.raises(InvalidInput, match=r"another points \(15, not 16\)"):
+        validate(comparison(data, points=16), folder, models=("analytical",), seeds=1)
+    with pytest.warns(OutdatedWarning, match="computed anew, and the old results stay in .*cells"):
+        found = validate(comparison(data), folder, models=("analytical",), seeds=1)
+    assert found.document["models"]["analytical"]["runs"] == 1
+    assert (folder / "cells" / "episodes-1-seed0-analytical.json").read_text() == "{}"
+    validate(comparison(data), folder, models=("analytical",), seeds=1)  # without a word
+
+
+def test_only_what_depends_on_a_changed_model_of_somebody_else_is_computed_anew(data, tmp_path, monkeypatch):
+    models = ("analytical", "broken")
+    validate(comparison(data), tmp_path / "out", models=models, seeds=1)
+    before = changed(tmp_path / "out")
+    digest = code_digest
+    own = CANDIDATES["broken"].fit.__module__
+    monkeypatch.setattr("forcegp.jobs.job.code_digest", lambda *modules: "new" if own in modules else digest(*modules))
+    with pytest.warns(OutdatedWarning, match="1 of the results in .* by other code"):
+        validate(comparison(data), tmp_path / "out", models=models, seeds=1)
+    after = changed(tmp_path / "out")
+    assert {name for name in before if before[name] != after[name]} == {"episodes-1-seed0-broken"}

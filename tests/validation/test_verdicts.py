@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from forcegp.validation.verdicts import against_baseline, best_of, paired, verdicts
+from forcegp.validation.paired_tests import against_baseline, best_of, conclusions, paired_test
 
 
 @pytest.mark.parametrize("score", ["nlpd", "force_rms"])
@@ -12,7 +12,7 @@ def test_intervals_are_those_of_the_paired_test(score):
     generator = np.random.default_rng(1)
     other = generator.uniform(1.0, 2.0, 6)
     one = other * generator.uniform(0.7, 1.05, 6)
-    found = paired(score, "a", "b", one.tolist(), other.tolist())
+    found = paired_test(score, "a", "b", one.tolist(), other.tolist())
     change = (lambda x: x) if score == "nlpd" else np.log
     interval = ttest_rel(change(one), change(other)).confidence_interval(0.95)
     back = (lambda x: x) if score == "nlpd" else np.exp
@@ -22,16 +22,16 @@ def test_intervals_are_those_of_the_paired_test(score):
 
 
 def test_the_verdict_needs_an_interval_on_one_side():
-    better = paired("nrmse", "a", "b", [0.5, 0.52, 0.48], [1.0, 1.0, 1.0])
-    assert better.verdict == "better"
+    better = paired_test("nrmse", "a", "b", [0.5, 0.52, 0.48], [1.0, 1.0, 1.0])
+    assert better.outcome == "better"
     assert better.sentence.startswith("**Yes** by the normalised error of the acceleration: a / b = 0.5")
-    assert paired("nrmse", "a", "b", [1.0, 1.0, 1.0], [0.5, 0.52, 0.48]).verdict == "worse"
-    assert paired("nlpd", "a", "b", [-2.0, 3.0, 1.0], [0.0, 0.0, 0.0]).verdict == "undecided"
-    one = paired("nrmse", "a", "b", [0.1], [1.0])
-    assert (one.verdict, one.interval) == ("undecided", None)
+    assert paired_test("nrmse", "a", "b", [1.0, 1.0, 1.0], [0.5, 0.52, 0.48]).outcome == "worse"
+    assert paired_test("nlpd", "a", "b", [-2.0, 3.0, 1.0], [0.0, 0.0, 0.0]).outcome == "undecided"
+    one = paired_test("nrmse", "a", "b", [0.1], [1.0])
+    assert (one.outcome, one.interval) == ("undecided", None)
     assert "one run, so no interval" in one.sentence
-    assert paired("nrmse", "a", "b", [], []) is None
-    assert paired("nrmse", "a", "b", [0.0], [1.0]) is None
+    assert paired_test("nrmse", "a", "b", [], []) is None
+    assert paired_test("nrmse", "a", "b", [0.0], [1.0]) is None
 
 
 def cell(seed: int, force: float | None, diverged: int = 0, motion: float | None = 0.1) -> dict:
@@ -66,7 +66,7 @@ def test_every_question_is_answered_by_the_best_of_each_kind():
     told = summary(KINDS, cells)
     assert best_of(told, cells, ("identified",), "force_rms") == "ls"
     assert best_of(told, cells, ("black box",), "force_rms") is None
-    found = verdicts(told, cells)
+    found = conclusions(told, cells)
     assert [item["question"] for item in found] == [
         "Is the identified model better than the system as given?",
         "Does a Gaussian process on forces beat the identified model?",

@@ -17,11 +17,10 @@ from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from typing_extensions import override
 
-from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
+from forcegp.robots.inertia import standard_basis
 
 # symmetric matrices Z = sum_k z_k E_k, orthonormal in the Frobenius norm
 _ROWS, _COLUMNS = np.triu_indices(4)
@@ -135,11 +134,6 @@ class ConsistentBodies(BodyCoordinates):
 def upper_cholesky(matrices: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
     """Upper triangular V with V V^T equal to each matrix. Raises numpy.linalg.LinAlgError where one is not definite."""
     return np.linalg.cholesky(matrices[:, ::-1, ::-1])[:, ::-1, ::-1]
-
-
-def pseudo_inertias_of(parameters: Float[np.ndarray, "n 10"]) -> Float[np.ndarray, "n 4 4"]:
-    """Pseudo-inertias of standard parameters."""
-    return pseudo_inertia_of_standard(torch.as_tensor(parameters)).numpy()
 
 
 def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ from forcegp.mechanics import MechanicalSystem
 Inertias = Literal["consistent", "free"]
 Likelihood = Literal["torque", "acceleration"]
 ROWS = 5_000
-"""Rows that are used at most, evenly spread: more of a filtered recording say little more."""
+"""Rows that are used at most, evenly spread: more of a filtered recording add little."""
 REWEIGHTINGS = 2
 """Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
 

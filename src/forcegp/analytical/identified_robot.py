@@ -2,7 +2,7 @@
 
 A body is often several links. With the factors of its old and new pseudo-inertia, ``P = V V^T`` and ``P' = U U^T``
 (upper triangular), every link gets ``C P_k C^T`` with ``C = U V^-1``: they add up to P', each stays physically
-possible, and links that were equal stay equal. Nothing but their sum can be told from motions.
+possible, and links that were equal stay equal. Motions show nothing but their sum.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def with_bodies(robot: Robot, wanted: Float[np.ndarray, "nv 4 4"]) -> Robot:
 
 
 def with_joint_dynamics(robot: Robot, damping: np.ndarray | None, friction: np.ndarray | None) -> Robot:
-    """The robot whose URDF says <dynamics damping friction> (nv,) of every joint; None leaves what is there."""
+    """The robot whose URDF has <dynamics damping friction> (nv,) of every joint; None leaves what is there."""
     text = robot.urdf_text
     for index, joint in enumerate(robot.joints):
         values = {"damping": damping, "friction": friction}

@@ -42,7 +42,7 @@ class Fit:
     """Where least squares ended.
 
     `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k) there, `noise` (nv,) in units of the residual, `weight`
-    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and what the search said.
+    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and the message of the search.
     """
 
     x: Float[np.ndarray, " k"]

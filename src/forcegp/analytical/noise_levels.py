@@ -5,7 +5,7 @@ Residuals r_n = a_n - a^_n that have noise of both kinds are normal with covaria
     S_n = diag(sigma_a^2) + M_n^-1 diag(sigma_F^2) M_n^-1,
 
 so joints of small inertia count less where the noise is one of forces. The two levels of every joint are those of
-largest likelihood (the model of `forcegp.models.Noise`).
+largest likelihood (the model of `forcegp.models.Noise`). One level per joint would let rows of large M^-1 decide.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class NoiseLevels:
             acceleration, force = whole * logs.view_as(whole).exp()
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
             white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)
-            # a weak pull to the start keeps a level that the residuals say nothing about from running away
+            # a weak pull to the start keeps a level that the residuals do not inform from running away
             pull = 0.5 * (logs - torch.as_tensor(start)).square().sum()
             value = 0.5 * white.square().sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum() + pull
             (gradient,) = torch.autograd.grad(value, logs)

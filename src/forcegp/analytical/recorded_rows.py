@@ -24,7 +24,7 @@ from forcegp.mechanics import KnownForce, MechanicalSystem, RigidBodyBias, State
 
 
 class RecordedRows:
-    """States (rows, nv) of a robot, the given forces there, and what the equation of motion says of them."""
+    """States (rows, nv) of a robot, the given forces there, and the terms of the equation of motion."""
 
     def __init__(
         self,
@@ -102,7 +102,7 @@ def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce
         frames = ", ".join(contact.frame for contact in system.contacts)
         raise InvalidInput(
             f"the robot touches something with {frames}, and contact forces are not measured; identify it from a "
-            "motion in the air (system.with_contacts([])), or use StructuredGP.fit(learn=...)."
+            "motion in the air (system.with_contacts([])), or use StructuredGP.identify."
         )
     if not any(type(force) is RigidBodyBias for force in system.known_forces):
         raise InvalidInput("the known forces lack RigidBodyBias(); list it, since its parameters are estimated.")

@@ -11,8 +11,8 @@ import scipy.linalg
 import torch
 from jaxtyping import Float, Int
 
-from forcegp.analytical.base_parameters import BaseParameters
 from forcegp.analytical.bodies import BodyCoordinates, FreeBodies
+from forcegp.analytical.identifiability import BaseParameters
 from forcegp.analytical.identified_robot import with_bodies, with_joint_dynamics
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import Fit, correlation_time
@@ -104,7 +104,7 @@ class AnalyticalIdentification:
     def standard_errors(self) -> dict[str, float]:
         """By name: of the posterior under the prior, with residuals that resemble their neighbours accounted for.
 
-        Where the data say nothing it is the prior's spread. Linearised (delta method).
+        Without information in the data it is the prior's spread. Linearised (delta method).
         """
         return dict(zip(self.names, np.linalg.norm(self._spread, axis=1).tolist(), strict=True))
 
@@ -123,7 +123,7 @@ class AnalyticalIdentification:
         moved[split:, split:] = np.diag(self.terms.slopes(self._in_terms).ravel())
         return scipy.linalg.solve_triangular(root, moved.T, trans="T").T
 
-    # ------------------------------------------------------------------ what the data tell
+    # ------------------------------------------------------------------ what the data identify
 
     @cached_property
     def base(self) -> BaseParameters:
@@ -138,7 +138,7 @@ class AnalyticalIdentification:
 
     @cached_property
     def weak_directions(self) -> tuple[tuple[str, float], ...]:
-        """Bodies and the number of their ten directions of which the data say less than the prior, worst first."""
+        """Bodies and the number of their ten directions of which the data hold less than the prior, worst first."""
         out = []
         for body, name in enumerate(body_names(self.given.robot)):
             own = slice(10 * body, 10 * body + 10)

@@ -1,6 +1,5 @@
 """Checks of one log and its robot: what would spoil a model, how bad it is, and what to do."""
 
-from forcegp.checks.check import CheckReport, check
-from forcegp.checks.findings import SEVERITIES, Finding, Severity
+import lazy_loader as lazy
 
-__all__ = ["SEVERITIES", "CheckReport", "Finding", "Severity", "check"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.analytical.base_parameters import base_parameters, excitation
-from forcegp.checks.evidence import Evidence
+from forcegp.analytical.identifiability import base_parameters, excitation
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, listed
 from forcegp.errors import InvalidInput
 
@@ -24,20 +24,20 @@ STILL = {True: 0.02, False: 0.002}
 """Range in rad or m below which a joint does not move."""
 
 
-def excitation_findings(evidence: Evidence) -> list[Finding]:
+def excitation_findings(inputs: CheckInput) -> list[Finding]:
     """Joints that hardly move or never turn back, and how well base parameters are determined."""
-    if evidence.prepared is None:
+    if inputs.prepared is None:
         return []
-    rows = evidence.prepared.dataset
-    still, one_way, told = [], [], []
-    for joint, name in enumerate(evidence.names):
+    rows = inputs.prepared.dataset
+    still, one_way, motions = [], [], []
+    for joint, name in enumerate(inputs.names):
         v = rows.v[:, joint]
         size = float(np.sqrt(np.square(v).mean()))
         signs = np.sign(v[np.abs(v) > HYSTERESIS * size])
         changes = int((np.diff(signs) != 0).sum())
         span = float(np.ptp(rows.q[:, joint]))
-        told.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
-        if span < STILL[bool(evidence.rotates[joint])]:
+        motions.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
+        if span < STILL[bool(inputs.rotates[joint])]:
             still.append(name)
         elif changes < FEWEST_CHANGES:
             one_way.append(name)
@@ -51,7 +51,7 @@ def excitation_findings(evidence: Evidence) -> list[Finding]:
                 "friction and inertia do not show.",
                 remedy="Move every joint that is to be learned, or lock it in the robot (--lock JOINT=RAD).",
                 joints=tuple(still),
-                numbers={"joints": told},
+                numbers={"joints": motions},
             )
         )
     if one_way:
@@ -60,31 +60,31 @@ def excitation_findings(evidence: Evidence) -> list[Finding]:
                 severity="look",
                 subject="excitation",
                 seen=f"{listed(one_way)} changed direction less than twice: friction of both "
-                "directions cannot be told from gravity.",
+                "directions cannot be separated from gravity.",
                 remedy="Record motion to and fro.",
                 joints=tuple(one_way),
-                numbers={"joints": told},
+                numbers={"joints": motions},
             )
         )
-    return [*found, *_held(evidence, still), *_base_parameters(evidence)]
+    return [*found, *_held(inputs, still), *_base_parameters(inputs)]
 
 
-def _held(evidence: Evidence, still: list[str]) -> list[Finding]:
+def _held(inputs: CheckInput, still: list[str]) -> list[Finding]:
     """Joints that stand still in whole stretches although they move in others."""
-    assert evidence.prepared is not None
-    rows = evidence.prepared.dataset
+    assert inputs.prepared is not None
+    rows = inputs.prepared.dataset
     found = []
     if len(rows.episodes) < 2:
         return []
     spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
-    for joint, name in enumerate(evidence.names):
+    for joint, name in enumerate(inputs.names):
         held = np.flatnonzero(
             (spans[:, joint] < HELD * spans[:, joint].max()) & (spans.max(axis=1) > 5.0 * spans[:, joint])
         )
         if name in still or not len(held) or len(held) > len(spans) // 2:
             continue
         first = int(held[0])
-        unit = "rad" if evidence.rotates[joint] else "m"
+        unit = "rad" if inputs.rotates[joint] else "m"
         begin = float(rows.time[rows.episode == rows.episodes[first]][0])
         found.append(
             Finding(
@@ -102,15 +102,15 @@ def _held(evidence: Evidence, still: list[str]) -> list[Finding]:
     return found
 
 
-def _base_parameters(evidence: Evidence) -> list[Finding]:
-    if evidence.robot is None:
+def _base_parameters(inputs: CheckInput) -> list[Finding]:
+    if inputs.robot is None:
         return []
-    rows = evidence.rows()
+    rows = inputs.rows()
     try:
-        seen = excitation(evidence.robot, rows.q, rows.v, rows.a)
+        seen = excitation(inputs.robot, rows.q, rows.v, rows.a)
     except InvalidInput:  # nothing moves and nothing weighs
         return []
-    every = base_parameters(evidence.robot)
+    every = base_parameters(inputs.robot)
     numbers = {"condition": seen.condition, "seen": seen.rank, "base_parameters": every.rank}
     size = f"condition number {seen.condition:.3g} of {seen.rank} base parameters"
     if seen.rank < every.rank:
@@ -133,7 +133,7 @@ def _base_parameters(evidence: Evidence) -> list[Finding]:
             remedy=""
             if severity == "ok"
             else "Inertias of single links will be uncertain; record faster motion of all "
-            "joints at once, and keep the URDF's values where data say little.",
+            "joints at once, and keep the URDF's values where the data are not informative.",
             numbers=numbers,
         )
     ]

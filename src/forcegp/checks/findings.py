@@ -15,13 +15,13 @@ SEVERITIES: tuple[Severity, ...] = ("ok", "look", "wrong")
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing that a check has to say.
+    """One result of a check.
 
     severity: ok, nothing to do; look, a person should judge; wrong, results would be wrong.
     subject: what was checked, in a few words, the same for all logs.
     seen: what was seen, with joint, row, time and numbers.
     remedy: what to do about it; empty if nothing.
-    joints: names of the joints concerned; numbers: what `seen` says, for programs.
+    joints: names of the joints concerned; numbers: the numbers of `seen`, for programs.
     """
 
     severity: Severity
@@ -49,7 +49,7 @@ def worst(findings: Sequence[Finding]) -> Severity:
 
 
 def plain(values: np.ndarray) -> list[float | None]:
-    """Numbers for JSON, which knows no NaN."""
+    """Numbers for JSON, which has no NaN."""
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.evidence import DEGREE, Evidence
+from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.findings import Finding, listed
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
@@ -34,15 +34,15 @@ FEW = 0.05
 
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2
-"""Time steps by which v must be late or early to be told."""
+"""Time steps by which v must be late or early to be reported."""
 
 
-def motion_findings(evidence: Evidence) -> list[Finding]:
+def motion_findings(inputs: CheckInput) -> list[Finding]:
     """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, joint by joint."""
-    if evidence.prepared is None:
+    if inputs.prepared is None:
         return []
-    cutoff = evidence.prepared.preparation.cutoff
-    even = evidence.even
+    cutoff = inputs.prepared.preparation.cutoff
+    even = inputs.even
     if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
     found = []
@@ -50,8 +50,8 @@ def motion_findings(evidence: Evidence) -> list[Finding]:
         if name == "a" and found:
             break  # of wrong velocities nothing better can come
         fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
-        told = [_finding(evidence, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
-        found += _merged([item for item in told if item is not None], even.nv)
+        findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
+        found += _merged([item for item in findings if item is not None], even.nv)
         if not found and name == "v":
             found_ok = [fit for fit in fits if fit is not None]
             if found_ok:
@@ -93,12 +93,12 @@ def _compared(data: Dataset, name: str, source: str, joint: int) -> tuple[float,
 
 
 def _finding(
-    evidence: Evidence, fit: tuple[float, float, float] | None, joint: int, name: str, what: str, derivative: str
+    inputs: CheckInput, fit: tuple[float, float, float] | None, joint: int, name: str, what: str, derivative: str
 ) -> Finding | None:
     if fit is None:
         return None
     factor, shift, unexplained = fit
-    label = evidence.names[joint]
+    label = inputs.names[joint]
     numbers = {"quantity": name, "factor": factor, "delay": shift if np.isfinite(shift) else None}
     numbers["unexplained"] = unexplained
     if unexplained > UNEXPLAINED:
@@ -132,7 +132,7 @@ def _finding(
             joints=(label,),
             numbers=numbers,
         )
-    step = float(np.median(np.diff(evidence.even.time)))
+    step = float(np.median(np.diff(inputs.even.time)))
     if unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
         return Finding(
             severity="look",
@@ -148,7 +148,7 @@ def _finding(
 
 
 def _merged(findings: list[Finding], nv: int) -> list[Finding]:
-    """One finding for all joints where they say the same."""
+    """One finding for all joints where they are the same."""
     kinds: dict[tuple, list[Finding]] = {}
     for item in findings:
         factor = item.numbers["factor"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from forcegp.checks.evidence import Evidence
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, plain
 
 MUCH = 0.2
@@ -18,38 +18,38 @@ LARGE_TORQUE = 0.5
 """Noise times M, relative to the spread of the torque."""
 
 
-def noise_findings(evidence: Evidence) -> list[Finding]:
+def noise_findings(inputs: CheckInput) -> list[Finding]:
     """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
-    if evidence.prepared is None:
+    if inputs.prepared is None:
         return []
-    report = evidence.price
+    report = inputs.price
     cutoff = report.get("cutoff")
     if cutoff is None or "acceleration_noise" not in report:
         return [Finding(severity="ok", subject="noise", seen="the positions show no noise worth a filter.")]
     before, after = (numbers_of(report["acceleration_noise"][when]) for when in ("before", "after"))
-    spread = np.std(evidence.prepared.dataset.a, axis=0)
-    why = "where the spectrum shows the end of the motion" if evidence.automatic else "as asked for"
-    if report is not evidence.prepared.report:
+    spread = np.std(inputs.prepared.dataset.a, axis=0)
+    why = "where the spectrum shows the end of the motion" if inputs.automatic else "as asked for"
+    if report is not inputs.prepared.report:
         why = "when this dataset was prepared"
     found = []
     if np.isfinite(after).any():
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
-        unit = "rad/s²" if evidence.rotates[worst] else "m/s²"
+        unit = "rad/s²" if inputs.rotates[worst] else "m/s²"
         found.append(
             Finding(
                 severity="ok",
                 subject="noise",
                 seen=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
-                f"{evidence.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
+                f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
                 numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
             )
         )
-    raw = "preparation" not in evidence.log.metadata
+    raw = "preparation" not in inputs.log.metadata
     with np.errstate(invalid="ignore"):
         loud = np.flatnonzero(before > MUCH * spread)
         left = np.flatnonzero(after > MUCH * spread)
-    if raw and len(loud) and _measured_noise(evidence, loud):
-        names = tuple(evidence.names[joint] for joint in loud)
+    if raw and len(loud) and _measured_noise(inputs, loud):
+        names = tuple(inputs.names[joint] for joint in loud)
         found.append(
             Finding(
                 severity="look",
@@ -61,9 +61,9 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
                 joints=names,
             )
         )
-    found += _in_torques(evidence, after)
+    found += _in_torques(inputs, after)
     if len(left):
-        names = tuple(evidence.names[joint] for joint in left)
+        names = tuple(inputs.names[joint] for joint in left)
         found.append(
             Finding(
                 severity="look",
@@ -77,44 +77,44 @@ def noise_findings(evidence: Evidence) -> list[Finding]:
     return found
 
 
-def _in_torques(evidence: Evidence, after: np.ndarray) -> list[Finding]:
+def _in_torques(inputs: CheckInput, after: np.ndarray) -> list[Finding]:
     """Noise of the acceleration that is as large as the torques when multiplied by M."""
-    assert evidence.prepared is not None
-    noise = torque_noise(evidence, after)
-    if noise is None or evidence.contacts:
+    assert inputs.prepared is not None
+    noise = torque_noise(inputs, after)
+    if noise is None or inputs.contacts:
         return []
-    spread = np.std(evidence.prepared.dataset.u, axis=0)
+    spread = np.std(inputs.prepared.dataset.u, axis=0)
     with np.errstate(invalid="ignore"):
         loud = np.flatnonzero((noise > LARGE_TORQUE * spread) & (spread > 0.0))
     if not len(loud):
         return []
-    told = ", ".join(f"{evidence.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
+    text = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
     return [
         Finding(
             severity="look",
             subject="noise",
-            seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {told} Nm or N.",
+            seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
             remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "
             "accelerations bears it.",
-            joints=tuple(evidence.names[joint] for joint in loud),
+            joints=tuple(inputs.names[joint] for joint in loud),
             numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
         )
     ]
 
 
-def _measured_noise(evidence: Evidence, joints: np.ndarray) -> bool:
+def _measured_noise(inputs: CheckInput, joints: np.ndarray) -> bool:
     """Whether the accelerations of the log are really that noisy: a log may hold better ones than differences."""
-    assert evidence.prepared is not None
-    spread = np.std(evidence.prepared.dataset.a, axis=0)[joints]
-    return bool((np.std(evidence.log.a, axis=0)[joints] > 1.0 * np.hypot(1.0, MUCH) * spread).any())
+    assert inputs.prepared is not None
+    spread = np.std(inputs.prepared.dataset.a, axis=0)[joints]
+    return bool((np.std(inputs.log.a, axis=0)[joints] > 1.0 * np.hypot(1.0, MUCH) * spread).any())
 
 
-def torque_noise(evidence: Evidence, noise: np.ndarray) -> np.ndarray | None:
+def torque_noise(inputs: CheckInput, noise: np.ndarray) -> np.ndarray | None:
     """Standard deviation of M times the noise of a [Nm or N]."""
-    if evidence.robot is None:
+    if inputs.robot is None:
         return None
     with torch.no_grad():
-        M = evidence.robot.mass_matrix(torch.tensor(evidence.rows().q, device=evidence.robot.device)).cpu().numpy()
+        M = inputs.robot.mass_matrix(torch.tensor(inputs.rows().q, device=inputs.robot.device)).cpu().numpy()
     return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.evidence import GAP, Evidence, consecutive
+from forcegp.checks.check_input import GAP, CheckInput, consecutive
 from forcegp.checks.findings import Finding
 from forcegp.data.filtering import JITTER
 
@@ -27,9 +27,9 @@ OFTEN_REPEATED = 0.02
 """Share of rows that repeat the one before while the robot moves, which a logger without new values leaves."""
 
 
-def sampling_findings(evidence: Evidence) -> list[Finding]:
+def sampling_findings(inputs: CheckInput) -> list[Finding]:
     """Rate and duration; jitter; lost samples and gaps; repeated rows; what importing had to mend."""
-    log = evidence.log
+    log = inputs.log
     steps = np.diff(log.time)[consecutive(log)[:-1]]
     if not len(steps):
         return []
@@ -46,7 +46,7 @@ def sampling_findings(evidence: Evidence) -> list[Finding]:
             numbers=numbers,
         )
     ]
-    found += _lost(evidence, steps, median)
+    found += _lost(inputs, steps, median)
     regular = steps[steps < LOST * median]
     spread = float(np.abs(regular - median).max()) / median
     if spread > JITTER:
@@ -61,11 +61,11 @@ def sampling_findings(evidence: Evidence) -> list[Finding]:
                 numbers={"relative_deviation": spread},
             )
         )
-    return [*found, *_repeated(evidence), *_imported(log.metadata)]
+    return [*found, *_repeated(inputs), *_imported(log.metadata)]
 
 
-def _lost(evidence: Evidence, steps: np.ndarray, median: float) -> list[Finding]:
-    log = evidence.log
+def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> list[Finding]:
+    log = inputs.log
     long = steps > LOST * median
     if not long.any():
         return []
@@ -90,9 +90,9 @@ def _lost(evidence: Evidence, steps: np.ndarray, median: float) -> list[Finding]
     ]
 
 
-def _repeated(evidence: Evidence) -> list[Finding]:
-    """Rows in which every position is that of the row before although velocities say that the robot moves."""
-    log = evidence.log
+def _repeated(inputs: CheckInput) -> list[Finding]:
+    """Rows in which every position is that of the row before although velocities show that the robot moves."""
+    log = inputs.log
     follows = consecutive(log)[:-1]
     same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
     speed = np.abs(log.v).max(axis=1)[1:]
@@ -114,17 +114,17 @@ def _repeated(evidence: Evidence) -> list[Finding]:
 
 
 def _imported(metadata: Mapping[str, Any]) -> list[Finding]:
-    """What `forcegp import` met in the log files and mended, as `metadata["import"]` tells it."""
-    told = metadata.get("import")
-    if not isinstance(told, Mapping) or not told.get("recordings"):
+    """What `forcegp import` found in the log files and repaired, from `metadata["import"]`."""
+    report = metadata.get("import")
+    if not isinstance(report, Mapping) or not report.get("recordings"):
         return []
-    logs = told["recordings"]
+    logs = report["recordings"]
     repeated = sum(item.get("repeated_stamps_dropped", 0) for item in logs)
     gaps = sum(len(item.get("gaps", ())) for item in logs)
     uneven = max(float(item.get("largest_deviation_of_a_step", 0.0)) for item in logs)
     met = [f"{repeated} repeated time stamps (dropped)"] if repeated else []
     met += [f"{gaps} gaps (split there)"] if gaps else []
-    if told.get("resampled_to_step") is not None and uneven > JITTER:
+    if report.get("resampled_to_step") is not None and uneven > JITTER:
         met.append(f"time steps up to {100.0 * uneven:.0f} % off their median (resampled)")
     if not met:
         return []

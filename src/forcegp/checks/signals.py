@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.evidence import Evidence, consecutive
+from forcegp.checks.check_input import CheckInput, consecutive
 from forcegp.checks.findings import Finding, listed
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
@@ -24,48 +24,48 @@ COARSE = {"q": 1e-3, "v": 1e-2, "u": 1e-2}
 """Resolution relative to the range that shows: in positions early, since they are differentiated twice."""
 
 
-def signal_findings(evidence: Evidence) -> list[Finding]:
+def signal_findings(inputs: CheckInput) -> list[Finding]:
     """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
-    found = [*_leaps(evidence), *_constant(evidence)]
+    found = [*_leaps(inputs), *_constant(inputs)]
     for name in QUANTITY:
-        found += [finding for joint in range(evidence.log.nv) for finding in _frozen(evidence, name, joint)]
-    found += [finding for joint in range(evidence.log.nv) for finding in _clipped(evidence, joint)]
-    return [*found, *_limits(evidence), *_resolution(evidence)]
+        found += [finding for joint in range(inputs.log.nv) for finding in _frozen(inputs, name, joint)]
+    found += [finding for joint in range(inputs.log.nv) for finding in _clipped(inputs, joint)]
+    return [*found, *_limits(inputs), *_resolution(inputs)]
 
 
-def _leaps(evidence: Evidence) -> list[Finding]:
+def _leaps(inputs: CheckInput) -> list[Finding]:
     found = []
     for places, how, remedy in (
-        (evidence.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
-        (evidence.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
+        (inputs.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
+        (inputs.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
          "torque were not checked. Are the units right (degrees for radians)?"),
     ):  # fmt: skip
         if places.any():
             row, joint = (int(index) for index in np.argwhere(places)[0])
-            name = evidence.names[joint]
+            name = inputs.names[joint]
             found.append(
                 Finding(
                     severity="wrong",
                     subject="jumps",
-                    seen=f"the position of {name} jumps {how} after row {row} at {evidence.log.time[row]:.3f} s "
+                    seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
                     f"({int(places.sum())} times in all).",
                     remedy=remedy,
-                    joints=tuple(evidence.names[k] for k in np.flatnonzero(places.any(axis=0))),
+                    joints=tuple(inputs.names[k] for k in np.flatnonzero(places.any(axis=0))),
                     numbers={"row": row, "count": int(places.sum())},
                 )
             )
     return found
 
 
-def _constant(evidence: Evidence) -> list[Finding]:
+def _constant(inputs: CheckInput) -> list[Finding]:
     found = []
-    log = evidence.log
+    log = inputs.log
     for name, quantity in QUANTITY.items():
         values = getattr(log, name)
         dead = [joint for joint in range(log.nv) if np.ptp(values[:, joint]) == 0.0]
         if not dead:
             continue
-        names = tuple(evidence.names[joint] for joint in dead)
+        names = tuple(inputs.names[joint] for joint in dead)
         all_passive = name == "u" and len(dead) == log.nv and not values.any()
         seen = (
             "no torque was logged at all (every u is 0)."
@@ -101,9 +101,9 @@ def _runs(same: np.ndarray) -> tuple[int, int]:
     return int(edges[2 * longest]), int(lengths[longest])
 
 
-def _frozen(evidence: Evidence, name: str, joint: int) -> list[Finding]:
+def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
     """A channel that stands still, to the last digit, while the joint's other channels do not."""
-    log = evidence.log
+    log = inputs.log
     values = getattr(log, name)[:, joint]
     if np.ptp(values) == 0.0:
         return []
@@ -125,10 +125,10 @@ def _frozen(evidence: Evidence, name: str, joint: int) -> list[Finding]:
         Finding(
             severity="wrong",
             subject="frozen channel",
-            seen=f"the {QUANTITY[name]} of {evidence.names[joint]} stands still at {values[start]:.6g} for "
+            seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
             f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
             remedy="Leave this stretch out, and look at the logger.",
-            joints=(evidence.names[joint],),
+            joints=(inputs.names[joint],),
             numbers={"quantity": name, "row": start, "seconds": length * step},
         )
     ]
@@ -138,9 +138,9 @@ def _is_extreme(values: np.ndarray, value: float) -> bool:
     return bool(value in (values.min(), values.max()))
 
 
-def _clipped(evidence: Evidence, joint: int) -> list[Finding]:
+def _clipped(inputs: CheckInput, joint: int) -> list[Finding]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
-    log = evidence.log
+    log = inputs.log
     speed = np.abs(log.v[:, joint])
     u = log.u[speed > MOVES * np.sqrt(np.square(speed).mean()), joint]
     if len(u) < CLIPPED_ROWS or np.ptp(log.u[:, joint]) == 0.0:
@@ -158,24 +158,24 @@ def _clipped(evidence: Evidence, joint: int) -> list[Finding]:
                 Finding(
                     severity="wrong",
                     subject="saturation",
-                    seen=f"the torque of {evidence.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
+                    seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
                     f"{at} "
                     f"rows of motion; the longest stretch, {length} rows, begins at row {start} at "
                     f"{log.time[start]:.3f} s.",
-                    remedy="The robot received another torque than the log says, or the sensor is at its end: leave "
+                    remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
                     "these stretches out, or move more gently.",
-                    joints=(evidence.names[joint],),
+                    joints=(inputs.names[joint],),
                     numbers={"value": sign * extreme, "rows": at, "row": start},
                 )
             )
     return found
 
 
-def _limits(evidence: Evidence) -> list[Finding]:
+def _limits(inputs: CheckInput) -> list[Finding]:
     """Positions, velocities and torques beyond the limits of the URDF, the worst joint of each first."""
-    if evidence.robot is None:
+    if inputs.robot is None:
         return []
-    log, joints = evidence.log, evidence.robot.joints
+    log, joints = inputs.log, inputs.robot.joints
     lower = np.array([-np.inf if joint.type == "continuous" else joint.lower for joint in joints])
     upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
     bounds = {"q": (lower, upper)}
@@ -193,14 +193,14 @@ def _limits(evidence: Evidence) -> list[Finding]:
         if not (excess > 0.0).any():
             continue
         row, joint = (int(index) for index in np.unravel_index(np.argmax(excess), excess.shape))
-        beyond = tuple(evidence.names[k] for k in np.flatnonzero((excess > 0.0).any(axis=0)))
-        others = f" (also {listed(tuple(k for k in beyond if k != evidence.names[joint]))})" if len(beyond) > 1 else ""
+        beyond = tuple(inputs.names[k] for k in np.flatnonzero((excess > 0.0).any(axis=0)))
+        others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
         unit = log.units[name] if isinstance(log.units[name], str) else log.units[name][joint]
         found.append(
             Finding(
                 severity="look",
                 subject="limits",
-                seen=f"the {QUANTITY[name]} of {evidence.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
+                seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
                 f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
                 f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
                 remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
@@ -212,28 +212,28 @@ def _limits(evidence: Evidence) -> list[Finding]:
     return found
 
 
-def _resolution(evidence: Evidence) -> list[Finding]:
+def _resolution(inputs: CheckInput) -> list[Finding]:
     """Channels with few different values, and how coarse they are against their range."""
     found = []
     for name, quantity in QUANTITY.items():
-        told, joints, quanta = [], [], {}
-        for joint, label in enumerate(evidence.names):
-            values = np.unique(getattr(evidence.log, name)[:, joint])
-            if len(values) < 3 or len(values) > 0.2 * len(evidence.log):
+        quantized, joints, quanta = [], [], {}
+        for joint, label in enumerate(inputs.names):
+            values = np.unique(getattr(inputs.log, name)[:, joint])
+            if len(values) < 3 or len(values) > 0.2 * len(inputs.log):
                 continue
             steps = np.diff(values)
             quantum = float(np.median(steps[steps > 1e-9 * np.ptp(values)]))
             if quantum < COARSE[name] * np.ptp(values):
                 continue
-            told.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
+            quantized.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
             joints.append(label)
             quanta[label] = quantum
-        if told:
+        if quantized:
             found.append(
                 Finding(
                     severity="look",
                     subject="resolution",
-                    seen=f"the {quantity} was logged in coarse steps: {', '.join(told)}.",
+                    seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
                     remedy="Log more digits, or expect noise from this.",
                     joints=tuple(joints),
                     numbers={"quantity": name, "quantum": quanta},

@@ -1,4 +1,4 @@
-"""What the comparison of torques with inverse dynamics says to people: factor, unit, delay, what is left."""
+"""Findings of the comparison of torques with inverse dynamics: factor, unit, delay, what is left."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.evidence import Evidence
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, listed, plain
-from forcegp.checks.mistakes import Hypothesis
+from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH
 from forcegp.errors import DatasetError
@@ -28,19 +28,19 @@ SAME = 0.1
 
 UNEXPLAINED = 0.5
 LEAST_DELAY = 0.25
-"""Time steps below which a delay is not told."""
+"""Time steps below which a delay is not reported."""
 
 MUCH = 0.5
 """A delay that leaves less of what was unexplained is wrong to leave in."""
 
 
-def torque_findings(evidence: Evidence, log: Hypothesis) -> list[Finding]:
-    """Factor and unit, delay, and what remains unexplained, of a log without the mistakes that were found."""
-    found = [*_factors(evidence, log), *_passive(evidence, log), *_unexplained(evidence, log)]
-    return [*found, *_delays(evidence, log)]
+def torque_findings(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+    """Factor and unit, delay, and what remains unexplained, of a log with the errors corrected that were found."""
+    found = [*_factors(inputs, log), *_passive(inputs, log), *_unexplained(inputs, log)]
+    return [*found, *_delays(inputs, log)]
 
 
-def _factors(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+def _factors(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
     """Torques that are a multiple of what the motion needs."""
     fit = log.fit
     with np.errstate(invalid="ignore"):
@@ -50,7 +50,7 @@ def _factors(evidence: Evidence, log: Hypothesis) -> list[Finding]:
     off = np.flatnonzero(ratio > ROUGHLY)
     if not len(off):
         return []
-    joints = tuple(evidence.names[joint] for joint in off)
+    joints = tuple(inputs.names[joint] for joint in off)
     factors = fit.factor[off]
     common = float(np.exp(np.log(factors).mean()))
     alike = len(off) == int(means.sum()) and len(off) > 1 and np.ptp(np.log(factors)) < SAME
@@ -83,21 +83,21 @@ def _factors(evidence: Evidence, log: Hypothesis) -> list[Finding]:
     ]
 
 
-def _passive(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+def _passive(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
     """Joints whose torque is zero throughout although the motion needs one."""
     found = []
-    for joint, name in enumerate(evidence.names):
+    for joint, name in enumerate(inputs.names):
         u, tau = log.rows.u[:, joint], log.tau[:, joint]
-        if np.ptp(evidence.log.u[:, joint]) > 0.0 or not evidence.log.u.any():
+        if np.ptp(inputs.log.u[:, joint]) > 0.0 or not inputs.log.u.any():
             continue
-        others = [np.std(log.tau[:, other]) for other in range(len(evidence.names)) if np.ptp(log.rows.u[:, other]) > 0]
+        others = [np.std(log.tau[:, other]) for other in range(len(inputs.names)) if np.ptp(log.rows.u[:, other]) > 0]
         if np.std(tau) > 0.1 * max(others, default=np.inf):
             found.append(
                 Finding(
                     severity="wrong",
                     subject="dead torque",
                     seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
-                    f"{np.std(tau):.3g} {_unit(evidence, joint)} rms.",
+                    f"{np.std(tau):.3g} {_unit(inputs, joint)} rms.",
                     remedy="The channel is dead, unless the joint has no motor and the URDF is wrong.",
                     joints=(name,),
                     numbers={"needed": float(np.std(tau))},
@@ -106,7 +106,7 @@ def _passive(evidence: Evidence, log: Hypothesis) -> list[Finding]:
     return found
 
 
-def _unexplained(evidence: Evidence, log: Hypothesis) -> list[Finding]:
+def _unexplained(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
     """How well the torques fit at all."""
     left = log.fit.unexplained
     known = np.isfinite(left)
@@ -117,10 +117,10 @@ def _unexplained(evidence: Evidence, log: Hypothesis) -> list[Finding]:
     what = (
         f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance of a "
     )
-    what += f"torque unexplained ({evidence.names[worst]})"
+    what += f"torque unexplained ({inputs.names[worst]})"
     if not len(bad):
         return [Finding(severity="ok", subject="torque", seen=f"{what}.")]
-    shares = ", ".join(f"{evidence.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
+    shares = ", ".join(f"{inputs.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
     return [
         Finding(
             severity="look",
@@ -129,24 +129,24 @@ def _unexplained(evidence: Evidence, log: Hypothesis) -> list[Finding]:
             "their variance.",
             remedy="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
             "nearly all friction or noise.",
-            joints=tuple(evidence.names[joint] for joint in bad),
+            joints=tuple(inputs.names[joint] for joint in bad),
             numbers={"unexplained": plain(left[bad])},
         )
     ]
 
 
-def _delays(evidence: Evidence, log: Hypothesis) -> list[Finding]:
-    assert evidence.compared is not None
-    data = log.correction.applied(evidence.compared)
+def _delays(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+    assert inputs.compared is not None
+    data = log.correction.applied(inputs.compared)
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:
         return []  # too short
-    step = float(np.median(np.diff(evidence.even.time)))
+    step = float(np.median(np.diff(inputs.even.time)))
     found = []
     if delay.significant and abs(delay.common) > LEAST_DELAY * step:
-        found.append(_delay(evidence.names, delay, delay.common, delay.common_std, delay.remains))
-    for joint, name in enumerate(evidence.names):
+        found.append(_delay(inputs.names, delay, delay.common, delay.common_std, delay.remains))
+    for joint, name in enumerate(inputs.names):
         own, std = float(delay.seconds[joint]), float(delay.std[joint])
         remains = float(delay.residual[1, joint] / max(delay.residual[0, joint], 1e-12))
         differs = abs(own - delay.significant) > max(SIGNIFICANT * std, 2.0 * step, 2e-3)
@@ -176,13 +176,13 @@ def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, rem
     )
 
 
-def _unit(evidence: Evidence, joint: int) -> str:
-    return "Nm" if evidence.rotates[joint] else "N"
+def _unit(inputs: CheckInput, joint: int) -> str:
+    return "Nm" if inputs.rotates[joint] else "N"
 
 
-def not_compared(evidence: Evidence) -> Finding:
-    """What is said where torques cannot be compared."""
-    if evidence.contacts:
+def not_compared(inputs: CheckInput) -> Finding:
+    """The finding where torques cannot be compared."""
+    if inputs.contacts:
         return Finding(
             severity="ok",
             subject="torque",

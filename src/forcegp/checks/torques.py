@@ -64,7 +64,7 @@ class TorqueFit:
     `unexplained` (nv,) is the share of the torque's variance that is left, NaN for a torque that never changes;
     `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque, with w = `slow` (nv,).
     `friction` (nv,) is the share that is left without inverse dynamics and armature, `plain` (nv,) that without
-    armature, whose s is `factor` (nv,): where tau is nearly proportional to a, s and I are not to be told apart.
+    armature, whose s is `factor` (nv,): where tau is nearly proportional to a, s and I cannot be separated.
     """
 
     unexplained: Float[np.ndarray, " nv"]

@@ -36,17 +36,17 @@ or step by step:
   forcegp fit train.h5 --points 100 --out run
   forcegp evaluate run test.h5 --plots figures
 
-Every command has --help, --json and --debug. forcegp --version tells the version."""
+Every command has --help, --json and --debug. forcegp --version prints the version."""
 
 COMMANDS: dict[str, tuple[type[Command], str]] = {
     "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
     "simulate": (Simulate, "make a dataset with ground truth"),
     "import": (Import, "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot"),
     "check": (Check, "what would spoil a model of this log, and what to do about it"),
-    "prepare": (Prepare, "filter and differentiate a raw log, and say what that costs"),
+    "prepare": (Prepare, "filter and differentiate a raw log, and report what that costs"),
     "fit": (Fit, "learn the unknown forces from a dataset"),
     "compare": (Compare, "which kind of unknown force the data support"),
-    "identify": (Identify, "estimate masses, inertias and friction coefficients, and how sure they are"),
+    "identify": (Identify, "estimate masses, inertias and friction coefficients, and their standard errors"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
@@ -101,6 +101,6 @@ def one_line(box: str) -> str:
             sections.append([])
         elif line.strip() and not line.startswith(" " * 8):  # what is indented so far is the help of an option
             sections[-1].append(line.strip())
-    told = [" ".join(section) for section in sections if section]
-    told = [section for section in told if not section.startswith(("For full helptext", "Argument helptext"))]
-    return " ".join(section if section.endswith(".") else f"{section}." for section in told)
+    sentences = [" ".join(section) for section in sections if section]
+    sentences = [section for section in sentences if not section.startswith(("For full helptext", "Argument helptext"))]
+    return " ".join(section if section.endswith(".") else f"{section}." for section in sentences)

@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+from rich.table import Table
+from rich.text import Text
 from tyro.conf import Positional, arg
 
-from forcegp.cli.command import Debug, Json
+import forcegp
+import forcegp.evaluation
+from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.preparation_options import CutoffOptions
-from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import DatasetError
-
-if TYPE_CHECKING:
-    from forcegp.checks import CheckReport
 
 KIND = "forcegp check"
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
@@ -27,7 +30,7 @@ COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 class Check(CutoffOptions, RobotOptions):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
-    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and says what to do. Nothing is
+    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is
     changed.
 
     For instance:
@@ -35,7 +38,7 @@ class Check(CutoffOptions, RobotOptions):
       forcegp check log.h5 --robot arm.urdf --plots look --strict
     """
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to check (HDF5)."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Filter for the comparison of q, v, a and u. auto: where the spectrum shows that motion ends and noise begins."""
@@ -54,19 +57,17 @@ class Check(CutoffOptions, RobotOptions):
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
         if self.plots is not None:
             require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
-        from forcegp.checks import check
-        from forcegp.data import Dataset
 
         preparation = self._preparation()
-        dataset = Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.data)
         needs_robot = self.robot is not None or self.identified is not None or dataset.system is not None
         system = self.chosen_system(dataset, self.data) if needs_robot else None
         with terminal.progress("checking"):
-            report = check(dataset, system, preparation=preparation)
+            report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
             self._draw(terminal, report, content)
-        terminal.say(*_shown(self.data, report))
+        terminal.show(*_shown(self.data, report))
         wrong = [finding for finding in report.findings if finding.severity == "wrong"]
         if self.strict and wrong:
             what = ", ".join(dict.fromkeys(finding.subject for finding in wrong))
@@ -75,24 +76,18 @@ class Check(CutoffOptions, RobotOptions):
             )
         return content
 
-    def _draw(self, terminal: Terminal, report: CheckReport, content: Mapping[str, Any]) -> None:
-        from forcegp.evaluation.check_plot import check_figure
-        from forcegp.evaluation.figure_style import save_figure
-
+    def _draw(self, terminal: Terminal, report: forcegp.CheckReport, content: Mapping[str, Any]) -> None:
         assert self.plots is not None
-        with folder_written_whole(self.plots) as folder:
+        with atomic_folder(self.plots) as folder:
             folder.mkdir()
-            save_figure(check_figure(report), folder / "check.png")
+            forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
             write_json(folder / "check.json", content)
             write_config(folder, KIND, {"data": str(self.data)})
         terminal.note(f"plots: {self.plots}")
 
 
-def _shown(data: Path, report: CheckReport) -> list[Any]:
+def _shown(data: Path, report: forcegp.CheckReport) -> list[Any]:
     """One paragraph per finding, worst first, and the numbers of every joint."""
-    from rich.table import Table
-    from rich.text import Text
-
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
@@ -100,18 +95,16 @@ def _shown(data: Path, report: CheckReport) -> list[Any]:
     findings.add_column(no_wrap=True)
     findings.add_column(overflow="fold")
     for finding in report.findings:
-        told = Text(f"{finding.subject}: ", style="bold")
-        told.append(finding.seen, style="not bold")
-        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), told)
+        text = Text(f"{finding.subject}: ", style="bold")
+        text.append(finding.seen, style="not bold")
+        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
         if finding.remedy:
             findings.add_row("", Text(f"→ {finding.remedy}", style="dim"))
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
     return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
 
 
-def _numbers(report: CheckReport, content: Mapping[str, Any]) -> Any:
-    from forcegp.cli.tables import NONE, columns
-
+def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:
     def shown(value: float | None, pattern: str = "{:.3g}") -> str:
         return NONE if value is None else pattern.format(value)
 
@@ -126,6 +119,6 @@ def _numbers(report: CheckReport, content: Mapping[str, Any]) -> Any:
         ]
         for each in content["joints"]
     ]
-    units = report.evidence.log.units
+    units = report.inputs.log.units
     unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
     return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)

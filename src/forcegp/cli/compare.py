@@ -6,29 +6,32 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
+from rich.text import Text
 from tyro.conf import UseAppendAction, arg
 
-from forcegp.cli.command import Debug, Json
+import forcegp
+import forcegp.evaluation
+import forcegp.inference
+import forcegp.models
+import forcegp.priors
+from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.fit_options import POINTS
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.model_choice import POINTS, resolved_noise
+from forcegp.cli.model_choice import resolved_noise
+from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.evaluation import PriorComparison, PriorScore
-    from forcegp.mechanics import MechanicalSystem
-    from forcegp.priors import ForcePrior
 
 KIND = "forcegp compare"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(LearningOptions):
-    """Fit several priors on the unknown forces to the same rows, and say which of them the data support.
+    """Fit several priors on the unknown forces to the same rows, and report which of them the data support.
 
     Each --prior is one candidate, and may be a sum. Candidates are scored by the log density of stretches of time that
     are left out of the training rows, without another fit; with --test also on another recording.
@@ -56,8 +59,8 @@ class Compare(LearningOptions):
     block_seconds: Annotated[
         float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: a twentieth of the recording)")
     ] = None
-    """Length of the stretches of time that are left out; longer than what one moment tells about the next."""
-    test: Annotated[Path | None, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
+    """Length of the stretches of time that are left out; longer than the time over which motion is correlated."""
+    test: Annotated[Path | None, DATASET, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
     """Another recording to score the candidates on as well."""
     json: Json = False
     debug: Debug = False
@@ -71,13 +74,12 @@ class Compare(LearningOptions):
             raise InvalidInput(f"--prior names the candidates, and there is {given}; give it twice or more.")
         if self.out is not None:
             require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
-        from forcegp.data import Dataset
 
-        dataset = Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
         priors = self._priors(system)
         dataset, rows_note = self._rows(dataset, system)
-        test = None if self.test is None else Dataset.load(self.test)
+        test = None if self.test is None else forcegp.Dataset.load(self.test)
         comparison = self._compare(terminal, dataset, system, priors, test)
         for warning in comparison.warnings:
             terminal.warn(warning)
@@ -88,15 +90,13 @@ class Compare(LearningOptions):
             self._write(self.out, comparison, content, folders)
         if rows_note is not None:
             terminal.note(rows_note)
-        terminal.say(*self._report(comparison, folders))
+        terminal.show(*self._report(comparison, folders))
         return content
 
-    def _priors(self, system: MechanicalSystem) -> dict[str, ForcePrior]:
-        from forcegp.priors import named_prior
-
-        priors: dict[str, ForcePrior] = {}
+    def _priors(self, system: forcegp.MechanicalSystem) -> dict[str, forcegp.priors.ForcePrior]:
+        priors: dict[str, forcegp.priors.ForcePrior] = {}
         for expression in self.prior:
-            prior = named_prior(expression, system)
+            prior = forcegp.priors.named_prior(expression, system)
             same = next((name for name, other in priors.items() if other == prior), None)
             if same is not None:
                 raise InvalidInput(f"--prior {expression!r} is the same as {same!r}; give each candidate once.")
@@ -106,18 +106,14 @@ class Compare(LearningOptions):
     def _compare(
         self,
         terminal: Terminal,
-        dataset: Dataset,
-        system: MechanicalSystem,
-        priors: Mapping[str, ForcePrior],
-        test: Dataset | None,
-    ) -> PriorComparison:
-        from forcegp.evaluation import compare_priors
-        from forcegp.inference import OptimizerOptions
-        from forcegp.models.search import default_restarts
-
+        dataset: forcegp.Dataset,
+        system: forcegp.MechanicalSystem,
+        priors: Mapping[str, forcegp.priors.ForcePrior],
+        test: forcegp.Dataset | None,
+    ) -> forcegp.PriorComparison:
         points = min(POINTS, len(dataset)) if self.points is None else self.points
-        options = OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps)
-        restarts = default_restarts(points) if self.restarts is None else self.restarts
+        options = forcegp.inference.OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps)
+        restarts = forcegp.models.default_restarts(points) if self.restarts is None else self.restarts
         names, steps = list(priors), options.iterations + options.adam_steps
         with terminal.progress(f"comparing: {points} points", may_end_early=True) as report:
 
@@ -125,7 +121,7 @@ class Compare(LearningOptions):
                 done = (names.index(name) * restarts + restart) * steps + min(iteration, steps)
                 report(done, len(names) * restarts * steps, f"{name}, iteration {iteration}, objective {value:.1f}")
 
-            return compare_priors(
+            return forcegp.compare_priors(
                 dataset,
                 priors,
                 points=points,
@@ -143,22 +139,20 @@ class Compare(LearningOptions):
             )
 
     def _write(
-        self, out: Path, comparison: PriorComparison, content: Mapping[str, Any], folders: Mapping[str, str]
+        self,
+        out: Path,
+        comparison: forcegp.PriorComparison,
+        content: Mapping[str, Any],
+        folders: Mapping[str, str],
     ) -> None:
-        from forcegp.models import save_posterior
-
-        with folder_written_whole(out) as folder:
+        with atomic_folder(out) as folder:
             folder.mkdir()
             for name, posterior in comparison.posteriors.items():
-                save_posterior(posterior, folder / folders[name])
+                forcegp.save_posterior(posterior, folder / folders[name])
             write_json(folder / "comparison.json", {**content, "models": dict(folders)})
             write_config(folder, KIND, self._given())
 
-    def _report(self, comparison: PriorComparison, folders: Mapping[str, str]) -> list[Any]:
-        from rich.text import Text
-
-        from forcegp.cli.tables import columns
-
+    def _report(self, comparison: forcegp.PriorComparison, folders: Mapping[str, str]) -> list[Any]:
         header = ["prior", "latents,\nparam.", "NLL", "row\nout", "stretch\nout", "below\nthe best"]
         header += [] if self.test is None else ["MAE,\ntest"]
         title = (
@@ -178,9 +172,7 @@ class Compare(LearningOptions):
         warning = [Text(f"Not converged: {unfinished}; give more --iterations.")] if unfinished else []
         return [table, Text(comparison.verdict), *warning, Text(following)]
 
-    def _row(self, score: PriorScore, comparison: PriorComparison) -> list[str]:
-        from forcegp.cli.tables import NONE, number
-
+    def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best
         return [
             score.name,
@@ -194,11 +186,11 @@ class Compare(LearningOptions):
 
 
 def _density(value: float) -> str:
-    """Three decimals, none where the whole number says enough: the table has to fit into 80 columns."""
+    """Three decimals, none for numbers of 100 and more: the table has to fit into 80 columns."""
     return f"{value:.3f}" if abs(value) < 100.0 else f"{value:.0f}"
 
 
-def _folders(comparison: PriorComparison) -> dict[str, str]:
+def _folders(comparison: forcegp.PriorComparison) -> dict[str, str]:
     """A folder name for every candidate: its own, of letters that every file system takes."""
     plain = {name: re.sub(r"[^\w.+-]+", "_", name.replace(" ", "")) for name in comparison.posteriors}
     taken = list(plain.values())

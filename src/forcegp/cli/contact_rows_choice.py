@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.mechanics import MechanicalSystem
+import forcegp
+import forcegp.data
+from forcegp.errors import ContactError
 
 RowsChoice = Literal["auto", "in-contact", "all"]
 
@@ -17,30 +17,29 @@ HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
 
 
-def rows_to_learn(dataset: Dataset, system: MechanicalSystem, choice: RowsChoice) -> tuple[Dataset, str | None]:
-    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and what to say of it.
+def rows_to_learn(
+    dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, choice: RowsChoice
+) -> tuple[forcegp.Dataset, str | None]:
+    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and a note on it.
 
-    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all and says what it saw.
-    The sentence is for after the fit: an error before that shall stand alone. Raises ContactError with "in-contact" if
+    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all, with a note.
+    The note is printed after the fit, so that an error before it stands alone. Raises ContactError with "in-contact" if
     there are none.
     """
-    from forcegp.data import rows_in_contact
-    from forcegp.errors import ContactError
-
     if choice == "all" or not system.contacts:
         return dataset, None
     try:
-        touching = rows_in_contact(replace(dataset, system=system))
+        touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
     except ContactError:
         if choice == "in-contact":
             raise
-        return dataset, None  # the fit has more to say about it
+        return dataset, None  # the fit raises a clearer error
     share = len(touching) / len(dataset)
     if choice == "auto" and share >= NEARLY_ALL:
         return dataset, None
-    told = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+    text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
     if choice == "auto" and share < HARDLY_ANY:
-        return dataset, f"{told}; all were learned from. Check the contact, or give --rows in-contact."
+        return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
     return replace(
         touching, system=dataset.system
-    ), f"{told}; these alone were learned from (--rows all takes every row)"
+    ), f"{text}; these alone were learned from (--rows all takes every row)"

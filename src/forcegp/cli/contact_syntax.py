@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+import forcegp
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.mechanics import Contact
 
 SYNTAX = {
     "plane": ("nx,ny,nz,offset", 4),
@@ -20,7 +17,7 @@ SYNTAX = {
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
 
 
-def parse_contacts(texts: Sequence[str]) -> tuple[Contact, ...]:
+def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
     """One contact per text; the single text `none` is no contact. Raises InvalidInput for anything else."""
     if "none" in texts:
         if len(texts) > 1:
@@ -29,13 +26,11 @@ def parse_contacts(texts: Sequence[str]) -> tuple[Contact, ...]:
     return tuple(parse_contact(text) for text in texts)
 
 
-def parse_contact(text: str) -> Contact:
+def parse_contact(text: str) -> forcegp.Contact:
     """`FRAME@x,y,z:SURFACE:numbers` as a contact; without `@x,y,z` the point is the origin of the frame.
 
     Raises InvalidInput saying what is wrong with the text, and what is right.
     """
-    from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
-
     place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
     if kind not in SYNTAX or not place:
         forms = ", ".join(f"{name}:{form}" for name, (form, _) in SYNTAX.items())
@@ -47,12 +42,12 @@ def parse_contact(text: str) -> Contact:
     frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
     x, y, z = _numbers(text, "the point", point, "x,y,z", 3)
     if kind == "plane":
-        surface = Plane((values[0], values[1], values[2]), values[3])
+        surface = forcegp.Plane((values[0], values[1], values[2]), values[3])
     elif kind == "sphere":
-        surface = Sphere((values[0], values[1], values[2]), values[3])
+        surface = forcegp.Sphere((values[0], values[1], values[2]), values[3])
     else:
-        surface = Cylinder((values[0], values[1], values[2]), (values[3], values[4], values[5]), values[6])
-    return Contact(frame, (x, y, z), surface)
+        surface = forcegp.Cylinder((values[0], values[1], values[2]), (values[3], values[4], values[5]), values[6])
+    return forcegp.Contact(frame, (x, y, z), surface)
 
 
 def _numbers(text: str, what: str, given: str, form: str, count: int) -> list[float]:

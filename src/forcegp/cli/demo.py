@@ -8,29 +8,24 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
+import forcegp
+import forcegp.evaluation
+import forcegp.inference
+import forcegp.models
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.command import Command, Debug, Json
-from forcegp.cli.evaluate import draw, score
-from forcegp.cli.fit import fit, fit_summary
-from forcegp.cli.simulate import simulate
+from forcegp.cli.evaluate import draw, evaluate_with_progress
+from forcegp.cli.fit import fit_summary, fit_with_progress
+from forcegp.cli.output_folders import holds_only_own_files, require_free_folder, write_config
+from forcegp.cli.simulate import simulate_with_progress
+from forcegp.cli.tables import NONE, NORMAL_FORCES, columns, multiplier_scores, nats, number, percent
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import (
-    folder_written_whole,
-    holds_only_own_files,
-    require_free_folder,
-    write_config,
-    write_json,
-)
 from forcegp.errors import InvalidInput
 from forcegp.experiments import published
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.evaluation import Evaluation
-    from forcegp.models import StructuredPosterior
 
 KIND = "forcegp demo"
 NOISE = 0.1  # rad/s^2, as in the paper
@@ -81,13 +76,13 @@ class Demo(Command):
         replaceable = self.overwrite or holds_only_own_files(self.out, KIND)
         require_free_folder(self.out, kind=KIND, overwrite=replaceable)
         start = time.monotonic()
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             folder.mkdir()
             train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
             models, evaluations, fit_seconds = {}, {}, {}
             for name, (place, mean) in MODELS.items():
                 models[name], fit_seconds[name] = self._fitted(terminal, folder / place, train, name, mean)
-                evaluations[name] = score(terminal, models[name], test, f"predicting with {name}")
+                evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
             pictures = _draw_all(terminal, folder, models, test)
             terminal.note(f"drew {', '.join(pictures)}")
             results = self._results(models, evaluations, fit_seconds, time.monotonic() - start)
@@ -100,43 +95,40 @@ class Demo(Command):
     def _seeds(self) -> dict[str, int]:
         return {"train": self.seed, "test": self.seed + 1}
 
-    def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> Dataset:
+    def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> forcegp.Dataset:
         start = time.monotonic()
-        dataset = simulate(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
+        dataset = simulate_with_progress(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
         dataset.save(folder / f"{name}.h5")
         terminal.note(f"simulated {name}: {len(dataset)} rows, seed {seed} ({time.monotonic() - start:.1f} s)")
         return dataset
 
     def _fitted(
-        self, terminal: Terminal, run: Path, train: Dataset, name: str, mean: Any
-    ) -> tuple[StructuredPosterior, float]:
+        self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: Any
+    ) -> tuple[forcegp.models.StructuredPosterior, float]:
         """The fitted model, and the seconds that the fit alone took."""
-        from forcegp.inference import OptimizerOptions
-        from forcegp.models import StructuredGP, save_posterior
-
         assert train.system is not None
         start = time.monotonic()
-        posterior = fit(
+        posterior = fit_with_progress(
             terminal,
-            StructuredGP(train.system, mean=mean),
+            forcegp.StructuredGP(train.system, mean=mean),
             train,
             name=f"fitting {name}",
             points=min(self.points, len(train)),
             restarts=None,
             seed=0,
             jobs=self.jobs,
-            options=OptimizerOptions(iterations=self.iterations),
+            options=forcegp.inference.OptimizerOptions(iterations=self.iterations),
         )
         seconds = time.monotonic() - start
-        save_posterior(posterior, run)
+        forcegp.save_posterior(posterior, run)
         iterations = len(posterior.result.history) - 1
         terminal.note(f"fitted {name}: {iterations} iterations ({seconds:.1f} s)")
         return posterior, seconds
 
     def _results(
         self,
-        models: Mapping[str, StructuredPosterior],
-        evaluations: Mapping[str, Evaluation],
+        models: Mapping[str, forcegp.models.StructuredPosterior],
+        evaluations: Mapping[str, forcegp.Evaluation],
         fit_seconds: Mapping[str, float],
         wall_seconds: float,
     ) -> dict[str, Any]:
@@ -158,9 +150,7 @@ class Demo(Command):
             "wall_seconds": wall_seconds,
         }
 
-    def _show(self, terminal: Terminal, evaluations: Mapping[str, Evaluation], wall_seconds: float) -> None:
-        from forcegp.cli.tables import NONE, columns, nats, number, percent
-
+    def _show(self, terminal: Terminal, evaluations: Mapping[str, forcegp.Evaluation], wall_seconds: float) -> None:
         header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
         rows = []
         for name, evaluation in evaluations.items():
@@ -173,26 +163,27 @@ class Demo(Command):
         rows.insert(0, ["known physics alone", *known, *[NONE] * 4])
         rows.append(["noise floor", number(first.noise_floor), NONE, number(0.0), *[NONE] * 4])
         title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
-        terminal.say(
+        terminal.show(
             columns(title, header, rows),
             *([_multiplier_line(evaluations)] if first.multiplier_mae is not None else []),
             f"{self.out}/summary.png shows it; results.json, models and data lie beside it ({wall_seconds:.0f} s).",
         )
 
 
-def _multiplier_line(evaluations: Mapping[str, Evaluation]) -> str:
-    from forcegp.cli.tables import NORMAL_FORCES, multiplier_scores
-
+def _multiplier_line(evaluations: Mapping[str, forcegp.Evaluation]) -> str:
     scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
     return f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
 
 
-def _draw_all(terminal: Terminal, folder: Path, models: Mapping[str, StructuredPosterior], test: Dataset) -> list[str]:
-    from forcegp.evaluation import likelihood_figure, save_figure
-
+def _draw_all(
+    terminal: Terminal,
+    folder: Path,
+    models: Mapping[str, forcegp.models.StructuredPosterior],
+    test: forcegp.Dataset,
+) -> list[str]:
     pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-    save_figure(
-        likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
+    forcegp.evaluation.save_figure(
+        forcegp.evaluation.likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
         folder / "likelihood.png",
     )
     return pictures

@@ -5,21 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from forcegp.cli.command import Command, Debug, Json
+import forcegp
+import forcegp.evaluation
+import forcegp.models
+from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
 from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.system_choice import SystemChoice, carried_over
+from forcegp.cli.tables import (
+    NORMAL_FORCES,
+    NORMAL_FORCES_KNOWN,
+    NORMAL_FORCES_SEEN,
+    evaluation_table,
+    facts,
+    force_facts,
+    number,
+)
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.evaluation import Evaluation
-    from forcegp.models import Posterior
 
 KIND = "forcegp evaluate"
 
@@ -34,9 +42,9 @@ class Evaluate(Command):
       forcegp evaluate run elsewhere.h5 --contact tool@0,0,0.1:plane:0,0,1,0.05
     """
 
-    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote."""
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to predict (HDF5)."""
     every: Annotated[int, arg(metavar="K")] = 1
     """Take every K-th row only."""
@@ -60,18 +68,15 @@ class Evaluate(Command):
             raise InvalidInput(f"--every is {self.every}; it must be at least 1.")
         if self.plots is not None:
             require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
-        from forcegp.data import Dataset
-        from forcegp.evaluation import force_scores, normal_force_rests_on_prior
-        from forcegp.models import load_posterior
 
-        posterior = load_posterior(self.run_folder)
-        dataset = Dataset.load(self.data).rows(slice(None, None, self.every))
+        posterior = forcegp.load_posterior(self.run_folder)
+        dataset = forcegp.Dataset.load(self.data).rows(slice(None, None, self.every))
         posterior = carried_over(terminal, posterior, dataset, self.system)
         if self.contact:
             posterior = posterior.with_system(posterior.system.with_contacts(parse_contacts(self.contact)))
-        evaluation = score(terminal, posterior, dataset)
-        forces = force_scores(posterior, dataset)
-        rests_on_prior = normal_force_rests_on_prior(posterior)
+        evaluation = evaluate_with_progress(terminal, posterior, dataset)
+        forces = forcegp.evaluation.force_scores(posterior, dataset)
+        rests_on_prior = forcegp.evaluation.normal_force_rests_on_prior(posterior)
         scores = {
             "run": str(self.run_folder),
             "data": str(self.data),
@@ -85,77 +90,65 @@ class Evaluate(Command):
             "normal_force_rests_on_prior": rests_on_prior,
         }
         if self.plots is not None:
-            with folder_written_whole(self.plots) as folder:
+            with atomic_folder(self.plots) as folder:
                 folder.mkdir()
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
                 options = ("run", "data", "every", "system", "contact")
                 write_config(folder, KIND, {"options": {name: scores[name] for name in options}})
             terminal.note(f"plots: {self.plots}")
-        from forcegp.cli.tables import NORMAL_FORCES, NORMAL_FORCES_KNOWN, NORMAL_FORCES_SEEN, force_facts
 
         learned = NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
-        told = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
-        terminal.say(*_report(posterior, evaluation, dataset, self.data, told))
+        forces_table = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
+        terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
         return scores
 
 
-def score(terminal: Terminal, posterior: Posterior, dataset: Dataset, name: str = "predicting") -> Evaluation:
+def evaluate_with_progress(
+    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, name: str = "predicting"
+) -> forcegp.Evaluation:
     """`forcegp.evaluation.evaluate` with a progress bar; warnings go to stderr."""
-    from forcegp.evaluation import evaluate
-
     with terminal.progress(f"{name}: {len(dataset)} rows") as report:
-        evaluation = evaluate(posterior, dataset, progress=report)
+        evaluation = forcegp.evaluation.evaluate(posterior, dataset, progress=report)
     for warning in evaluation.warnings:
         terminal.warn(warning)
     return evaluation
 
 
-def draw(terminal: Terminal, folder: Path, posterior: Posterior, dataset: Dataset) -> list[str]:
+def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
-    from forcegp.evaluation import (
-        curve_panels,
-        friction_curves_figure,
-        likelihood_figure,
-        normal_force_figure,
-        prediction_figure,
-        save_figure,
-        summary_figure,
-        tool_path_figure,
-    )
-
     figures = {
-        "prediction.png": lambda: prediction_figure(posterior, dataset),
-        "likelihood.png": lambda: likelihood_figure(
+        "prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset),
+        "likelihood.png": lambda: forcegp.evaluation.likelihood_figure(
             {posterior.description: posterior.result.history}, objective=posterior.objective
         ),
     }
     if posterior.system.contacts:
-        figures["tool_path.png"] = lambda: tool_path_figure(posterior, dataset)
-        figures["summary.png"] = lambda: summary_figure(posterior, dataset)
-        if posterior.speaks_of_forces:
-            figures["normal_force.png"] = lambda: normal_force_figure(posterior, dataset)
-    if curve_panels(posterior):
-        figures["forces.png"] = lambda: friction_curves_figure(posterior, dataset)
+        figures["tool_path.png"] = lambda: forcegp.evaluation.tool_path_figure(posterior, dataset)
+        figures["summary.png"] = lambda: forcegp.evaluation.summary_figure(posterior, dataset)
+        if posterior.predicts_forces:
+            figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
+    if forcegp.evaluation.curve_panels(posterior):
+        figures["forces.png"] = lambda: forcegp.evaluation.friction_curves_figure(posterior, dataset)
     with terminal.progress("drawing") as report:
         for done, (name, figure) in enumerate(figures.items()):
             report(done, len(figures), name)
-            save_figure(figure(), folder / name)
+            forcegp.evaluation.save_figure(figure(), folder / name)
     return list(figures)
 
 
-def _learns_forces(posterior: Posterior) -> bool:
+def _learns_forces(posterior: forcegp.models.Posterior) -> bool:
     """False for known forces alone."""
-    from forcegp.models import StructuredPosterior
-
-    return not isinstance(posterior, StructuredPosterior) or bool(posterior.latent_names)
+    return not isinstance(posterior, forcegp.models.StructuredPosterior) or bool(posterior.latent_names)
 
 
 def _report(
-    posterior: Posterior, evaluation: Evaluation, dataset: Dataset, data: Path, forces: Mapping[str, str]
+    posterior: forcegp.models.Posterior,
+    evaluation: forcegp.Evaluation,
+    dataset: forcegp.Dataset,
+    data: Path,
+    forces: Mapping[str, str],
 ) -> list[Any]:
-    from forcegp.cli.tables import evaluation_table, facts, number
-
     points = len(posterior.training)
     units = dataset.units["a"]
     unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"

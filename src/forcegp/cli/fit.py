@@ -4,56 +4,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any
 
-from tyro.conf import UseAppendAction, arg
-
+import forcegp
+import forcegp.inference
+import forcegp.models
+import forcegp.robots
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.model_choice import (
-    ITERATIONS_HINT,
-    POINTS_HINT,
-    WINDOW,
-    LearnFrom,
-    ModelName,
-    make_model,
-    resolved,
-    search_arguments,
-    window_observation,
-)
+from forcegp.cli.fit_options import ModelOptions
+from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
+from forcegp.cli.output_folders import require_free_folder
+from forcegp.cli.tables import facts
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.inference import OptimizerOptions
-    from forcegp.models import Posterior
 
 KIND = "forcegp fit"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions(LearningOptions):
-    """What every command asks that writes one fitted model."""
-
-    out: Annotated[Path, arg(metavar="RUN")] = field()
-    """The folder to write."""
-
-    def _write(self, folder: Path, posterior: Posterior, kind: str, more: Mapping[str, str] | None = None) -> None:
-        """The model, `more` files by name with their text, and how it was made."""
-        from forcegp.models import save_posterior
-
-        save_posterior(posterior, folder)
-        for name, text in (more or {}).items():
-            (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
-        write_config(folder, kind, {**self._given(), "resolved": dict(posterior.settings)})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fit(FitOptions):
+class Fit(ModelOptions):
     """Learn the unknown forces from a dataset, and write the model to a folder.
 
     The dataset carries its robot and contacts, so nothing else is needed; --robot, --contact and --known-force
@@ -68,53 +40,6 @@ class Fit(FitOptions):
       forcegp fit raw.h5 --learn-from weak-form --window 0.1 --points 100 --out run
     """
 
-    model: ModelName = "structured"
-    """structured: Gaussian processes on the unknown forces, inside the dynamics and contacts that are known.
-    unconstrained: on the acceleration that the robot would have without contacts. analytical: known physics alone.
-    independent-gp: one Gaussian process per joint, without physics. neural-network: one small network.
-    ensemble: several networks with variances."""
-    points: Annotated[
-        int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint=POINTS_HINT),
-    ] = None
-    """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N as far as
-    --engine is exact."""
-    engine: Annotated[Literal["auto", "exact", "iterative", "inducing", "stochastic"], arg(metavar="NAME")] = "auto"
-    """How the posterior is computed. exact: from the covariance of all points. iterative: by conjugate gradients.
-    inducing: through fewer points, for friction curves and the like. stochastic: the same, on mini-batches. auto: by
-    the number of points, the features and the free memory, and says why. See docs/large-data.md."""
-    learning_points: Annotated[
-        int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint="(default: all points up to 1500, else 600)"),
-    ] = None
-    """Find the hyper-parameters on N of the points; the posterior is that of all points."""
-    mean: Annotated[
-        Literal["analytical", "zero"] | None, arg(metavar="analytical|zero", help_behavior_hint="(default: analytical)")
-    ] = None
-    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
-    prior: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(repeatable, they add up; default: joint)"),
-    ] = ()
-    """What the unknown forces may be. joint: a force at every joint, on (q, v, u). joint-friction: on its own velocity.
-    tool-friction: tangential forces at the contact, on its velocity. contact-friction: isotropic; load-friction:
-    the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md."""
-    learn_from: Annotated[LearnFrom, arg(metavar="accelerations|increments|weak-form")] = "accelerations"
-    """accelerations: of the dataset. increments, weak-form: from raw velocities or positions over short windows, of
-    which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
-    window: Annotated[
-        float | None, arg(metavar="SECONDS", constructor=float, help_behavior_hint=f"(default: {WINDOW})")
-    ] = None
-    """Length of the windows."""
-    iterations: Annotated[
-        int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint=ITERATIONS_HINT),
-    ] = None
-    """Most L-BFGS iterations of each start, or training steps of a network."""
-    device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
-    """Where to compute; see docs/gpu.md. The folder that is written can be used on any machine."""
-    measured_torque: bool = False
-    """u comes from sensors as noisy as --force-noise says, and predictions know it. Not for commanded torques."""
     json: Json = False
     debug: Debug = False
 
@@ -126,12 +51,10 @@ class Fit(FitOptions):
         command = resolved(self)
         self._backend()  # refused now, not after the data are read
         assert command.points is not None, "a resolved command has points"
-        from forcegp.data import Dataset
-        from forcegp.robots.devices import usable_device
 
-        usable_device(self.device)
+        forcegp.robots.usable_device(self.device)
         start = time.monotonic()
-        dataset = Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
         rows_note = None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
@@ -139,38 +62,40 @@ class Fit(FitOptions):
         model = make_model(command, system.to(self.device), dataset)
         observe = window_observation(command.learn_from, command.window)
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
-        posterior = fit(terminal, model, dataset, points=points, **search_arguments(command, points))
+        posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             command._write(folder, posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)
-        terminal.say(*_report(self.out, summary))
+        terminal.show(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 
 
-def fit(terminal: Terminal, model: Any, dataset: Dataset, *, name: str = "fitting", **how: Any) -> Any:
-    """`model.fit(dataset, **how)` with a bar that shows the restart, the iteration and the objective."""
-    from forcegp.models.search import ALL_ROWS, default_restarts
-
-    options: OptimizerOptions | None = how.get("options")  # networks have none, but steps of their own
+def fit_with_progress(
+    terminal: Terminal, model: Any, dataset: forcegp.Dataset, *, name: str = "fitting", **how: Any
+) -> Any:
+    """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
+    # networks have no options, but steps of their own
+    options: forcegp.inference.OptimizerOptions | None = how.get("options")
     steps = model.steps if options is None else options.iterations + options.adam_steps
     wanted = how.get("restarts", 1)
-    restarts = default_restarts(how["points"]) if wanted is None else wanted
+    restarts = forcegp.models.default_restarts(how["points"]) if wanted is None else wanted
     with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
 
         def progress(restart: int, iteration: int, value: float) -> None:
-            if restart == ALL_ROWS:
+            if restart == forcegp.models.ALL_ROWS:
                 report(restarts * steps, restarts * steps, f"all {how['points']} points: {iteration}, {value:.3g}")
                 return
             start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
             note = f"{start}iteration {iteration}, objective {_short(value)}"
             report(restart * steps + min(iteration, steps), restarts * steps, note)
 
-        return model.fit(dataset, **how, progress=progress)
+        learn = model.identify if "learn" in how else model.fit_windows if "observe" in how else model.fit
+        return learn(dataset, **how, progress=progress)
 
 
-def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
+def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
     result, settings = posterior.result, posterior.settings
     force_noise = posterior.parameters.get("noise.log_force")
@@ -196,7 +121,7 @@ def fit_summary(posterior: Posterior, wall_seconds: float) -> dict[str, Any]:
     }
 
 
-def _told_points(summary: Mapping[str, Any]) -> str:
+def _points_used(summary: Mapping[str, Any]) -> str:
     """How many points were conditioned on, and where parameters were found on fewer of them, on how many."""
     points, learning = summary["points"], summary["learning_points"]
     if learning == points:
@@ -206,13 +131,11 @@ def _told_points(summary: Mapping[str, Any]) -> str:
 
 
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
-    from forcegp.cli.tables import facts
-
     forces = summary.get("force_noise_std")
     status = summary["status"]  # names failed evaluations, too, and the number of starts
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
-        f"{run}: {summary['model']}, learned from {_told_points(summary)}",
+        f"{run}: {summary['model']}, learned from {_points_used(summary)}",
         {
             **({"engine": summary["engine"]} if "engine" in summary else {}),
             "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",

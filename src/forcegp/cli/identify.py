@@ -7,22 +7,24 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any
 
-from tyro.conf import UseAppendAction, arg
+from rich.text import Text
 
+import forcegp
+import forcegp.inference
+import forcegp.models
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.fit import FitOptions, fit, fit_summary
+from forcegp.cli.fit import fit_summary, fit_with_progress
+from forcegp.cli.identify_options import IdentifyOptions
 from forcegp.cli.identify_regression import INERTIAS, identify_by_regression
 from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
 from forcegp.cli.model_choice import resolved_noise
+from forcegp.cli.output_folders import require_free_folder
+from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.models import Identification
 
 KIND = "forcegp identify"
 COEFFICIENT_NAMES = (
@@ -35,8 +37,8 @@ COEFFICIENT_NAMES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Identify(FitOptions):
-    """Estimate physical parameters of the robot along with the unknown forces, and say how sure they are.
+class Identify(IdentifyOptions):
+    """Estimate physical parameters of the robot along with the unknown forces, and report their standard errors.
 
     The estimates start from the URDF and always belong to a body that can exist (but those of least-squares). The
     folder holds identified.urdf, identification.json, and the model as `forcegp fit` writes it, or system.json for
@@ -49,41 +51,6 @@ class Identify(FitOptions):
         --noise learned --out identified
     """
 
-    learn: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LINK:PARTS|FORCE", help_behavior_hint="")] = ()
-    """What to estimate (repeatable): LINK:PARTS with parts out of mass, com (centre of mass) and inertia, or
-    viscous-joint-friction, coulomb-joint-friction, armature: of all joints, or of FORCE:JOINT,JOINT; from the URDF's
-    coefficients, or from FORCE=START. The next two models estimate all of it instead."""
-    model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
-    """structured: Gaussian processes carry the forces that nobody knows. analytical: there are none but noise.
-    least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
-    """
-    friction: Annotated[str, arg(metavar="NAME,NAME")] = "viscous,coulomb"
-    """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset; none for no friction."""
-    rotors: Literal["armature", "rotor", "none"] = "armature"
-    """With the last two models: armature: one rotor inertia per joint. rotor: those of the system's coupled rotors."""
-    likelihood: Literal["torque", "acceleration"] = "torque"
-    """With the last two models: torque: residuals of inverse dynamics, where torque sensors are good. acceleration: of
-    forward dynamics, where arms are light."""
-    robust: Annotated[bool, arg(help_behavior_hint="")] = False
-    """With the last two models: count outliers by their absolute value."""
-    test: Annotated[Path | None, arg(metavar="TEST.h5", constructor=Path, help_behavior_hint="(default: none)")] = None
-    """With the last two models: score on this recording, too."""
-    prior_strength: Annotated[
-        float | None, arg(metavar="W", constructor=float, help_behavior_hint="(default: 0; 1 for the last two models)")
-    ] = None
-    """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
-    points: Annotated[int, arg(metavar="N")] = 200
-    """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
-    learning_points: Annotated[
-        int | None, arg(metavar="N", constructor=int, help_behavior_hint="(default: all points)")
-    ] = None
-    """Find the estimates and all other parameters on N of the points; standard errors are those of N points."""
-    mean: Literal["analytical", "zero"] = "analytical"
-    """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
-    iterations: Annotated[int, arg(metavar="N")] = 200
-    """Most L-BFGS iterations of each start."""
-    restarts: Annotated[int, arg(metavar="R")] = 1
-    """Starts of the search; the best is kept. They differ in the kernels only: the physical values begin the same."""
     json: Json = False
     debug: Debug = False
 
@@ -97,18 +64,14 @@ class Identify(FitOptions):
             return identify_by_regression(self, terminal, KIND)
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
         learn = parse_learn(self.learn)
-        from forcegp.data import Dataset
-        from forcegp.inference import OptimizerOptions
-        from forcegp.models import StructuredGP
-        from forcegp.priors import JointForces, NoForces
 
         begin = time.monotonic()
-        dataset = Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.data)
         system, added = with_learned_forces(self._system(dataset), learn)
         dataset, rows_note = self._rows(dataset, system)
-        prior = NoForces() if self.model == "analytical" else JointForces()
-        model = StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
-        posterior = fit(
+        prior = forcegp.NoForces() if self.model == "analytical" else forcegp.JointForces()
+        model = forcegp.StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
+        posterior = fit_with_progress(
             terminal,
             model,
             dataset,
@@ -118,7 +81,7 @@ class Identify(FitOptions):
             seed=self.seed,
             backend=self._backend(),
             hyperprior=self.hyperprior,
-            options=OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
+            options=forcegp.inference.OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
             learn=learn,
             prior_strength=self.prior_strength or 0.0,
             learning_points=self.learning_points,
@@ -128,24 +91,20 @@ class Identify(FitOptions):
             found = replace(posterior.identification, progress=report)
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
-        with folder_written_whole(self.out) as folder:
-            told = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        with atomic_folder(self.out) as folder:
+            identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
             urdf = posterior.system.robot.to_urdf()
-            self._write(folder, posterior, KIND, {"identification.json": told, "identified.urdf": urdf})
+            self._write(folder, posterior, KIND, {"identification.json": identification, "identified.urdf": urdf})
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:
             terminal.note(rows_note)
-        terminal.say(*_report(self, found, summary))
+        terminal.show(*_report(self, found, summary))
         del content["history"]
         return {"run": str(self.out), "data": str(self.data), **summary, **content}
 
 
-def _report(command: Identify, found: Identification, summary: Mapping[str, Any]) -> list[Any]:
-    from rich.text import Text
-
-    from forcegp.cli.tables import NONE, columns
-
+def _report(command: Identify, found: forcegp.models.Identification, summary: Mapping[str, Any]) -> list[Any]:
     rows, owner = [], None
     for name, unit in found.units.items():
         unit, factor = ("mm", 1e3) if unit == "m" else (unit, 1.0)

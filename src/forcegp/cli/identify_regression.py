@@ -5,38 +5,37 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from rich.text import Text
+
+import forcegp
+import forcegp.analytical
+from forcegp.atomic_files import atomic_folder
 from forcegp.cli.friction_laws import friction_laws
-from forcegp.cli.robot_choice import SYSTEM_FILE
+from forcegp.cli.identify_options import IdentifyOptions
+from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.robot_options import SYSTEM_FILE
+from forcegp.cli.tables import columns
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config
 from forcegp.errors import InvalidInput, NonPhysicalInertia
-
-if TYPE_CHECKING:
-    from forcegp.analytical import AnalyticalIdentification
-    from forcegp.cli.identify import Identify
-    from forcegp.mechanics import MechanicalSystem
 
 INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 """Names of models on the command line, and what `identify_analytical` calls their inertias."""
 
 
-def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> Mapping[str, Any]:
+def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: str) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
     _refuse_what_does_nothing(command)
     friction = friction_laws(command.friction)
     require_free_folder(command.out, kind=kind, overwrite=command.overwrite)
-    from forcegp.analytical import identify_analytical, motion_residuals, residual_scores
-    from forcegp.analytical.least_squares import ROUNDS
-    from forcegp.data import Dataset
 
     begin = time.process_time()
-    dataset = Dataset.load(command.data)
-    test = None if command.test is None else Dataset.load(command.test)
+    dataset = forcegp.Dataset.load(command.data)
+    test = None if command.test is None else forcegp.Dataset.load(command.test)
     system = command._system(dataset)
     with terminal.progress("identifying", may_end_early=True) as report:
-        found = identify_analytical(
+        found = forcegp.identify_analytical(
             system,
             dataset,
             friction=friction,
@@ -45,19 +44,21 @@ def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> 
             likelihood=command.likelihood,
             prior_strength=1.0 if command.prior_strength is None else command.prior_strength,
             robust=command.robust,
-            progress=lambda done, rms: report(min(done, ROUNDS), ROUNDS, f"rms of the residual {rms:.3g}"),
+            progress=lambda done, rms: report(
+                min(done, forcegp.analytical.ROUNDS), forcegp.analytical.ROUNDS, f"rms of the residual {rms:.3g}"
+            ),
         )
     content = {"model": command.model, **found.to_dict(), "cpu_seconds": time.process_time() - begin}
     for name, rows in (("training", dataset), ("test", test)):
         if rows is not None:
-            before = residual_scores(*motion_residuals(system, rows), rows)
+            before = forcegp.analytical.residual_scores(*forcegp.analytical.motion_residuals(system, rows), rows)
             content[name] = {"before": before, "after": found.scores(rows)}
     try:
         identified, why_not = found.system, None
     except NonPhysicalInertia as error:
         identified, why_not = None, str(error)
     content["robot"] = "no" if identified is None else "yes"
-    with folder_written_whole(command.out) as folder:
+    with atomic_folder(command.out) as folder:
         folder.mkdir()
         (folder / "identification.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
         if identified is not None:
@@ -66,11 +67,11 @@ def identify_by_regression(command: Identify, terminal: Terminal, kind: str) -> 
         write_config(folder, kind, command._given())
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
-    terminal.say(*_report(command, found, content, identified))
+    terminal.show(*_report(command, found, content, identified))
     return {"run": str(command.out), "data": str(command.data), **content}
 
 
-def _refuse_what_does_nothing(command: Identify) -> None:
+def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
     """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
     given = {"learn": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
     changed = [name for name, default in given.items() if getattr(command, name) != default]
@@ -83,12 +84,11 @@ def _refuse_what_does_nothing(command: Identify) -> None:
 
 
 def _report(
-    command: Identify, found: AnalyticalIdentification, content: Mapping[str, Any], identified: MechanicalSystem | None
+    command: IdentifyOptions,
+    found: forcegp.AnalyticalIdentification,
+    content: Mapping[str, Any],
+    identified: forcegp.MechanicalSystem | None,
 ) -> list[Any]:
-    from rich.text import Text
-
-    from forcegp.cli.tables import columns
-
     joints = found.given.robot.joint_names
     tables: list[Any] = []
     for name in ("training", "test"):
@@ -114,13 +114,13 @@ def _report(
     if rows:
         tables.append(columns("friction and rotors", ["", "identified", "std. error"], rows))
     base = found.base
-    told = (
+    summary = (
         f"{base.rank} base parameters, condition number {base.condition:.3g}; "
         f"{content['rows']} rows, {content['cpu_seconds']:.1f} s CPU"
         f"{'' if content['converged'] else ', not converged'}."
     )
     weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
-    lines = [told, f"Directions that the prior decides, not the data: {weak or 'none'}."]
+    lines = [summary, f"Directions that the prior decides, not the data: {weak or 'none'}."]
     if found.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(found.thickened)}.")
     if identified is not None:

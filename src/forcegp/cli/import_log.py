@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from forcegp.cli.command import Debug, Json
+import forcegp
+import forcegp.data
+import forcegp.inference
+import forcegp.recordings
+from forcegp.atomic_files import atomic_file, write_text
+from forcegp.cli.command import LOG, URDF, Debug, Json
+from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import require_free_file
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Preparation
-    from forcegp.mechanics import MechanicalSystem
-    from forcegp.recordings import ColumnMapping
 
 COPIES = 10
 """Times the size of its file that a dataset is taken to need while it is prepared: numbers hardly shrink in it."""
@@ -33,10 +33,10 @@ Seconds = Annotated[float | None, arg(metavar="S", constructor=float, help_behav
 class Import(PreparationOptions, RobotOptions):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
-    Say which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or in
-    a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
+    State which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or
+    in a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
     pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered unless
-    --cutoff and its sisters say so.
+    --cutoff, --delay, --every or --trim is given.
 
     For instance:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
@@ -44,22 +44,22 @@ class Import(PreparationOptions, RobotOptions):
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
     """
 
-    robot: Annotated[Path | None, arg(metavar="ARM.urdf", constructor=Path, help_behavior_hint="(default: none)")] = (
-        None
-    )
+    robot: Annotated[
+        Path | None, URDF, arg(metavar="ARM.urdf", constructor=Path, help_behavior_hint="(default: none)")
+    ] = None
     """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
-    logs: Positional[Annotated[tuple[Path, ...], arg(metavar="LOG...")]]
+    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     mapping: Annotated[
         Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: beside)")
     ] = None
-    """What the columns mean; flags replace what it says. Default: log.yaml or forcegp.yaml beside the log."""
+    """What the columns mean; flags replace its entries. Default: log.yaml or forcegp.yaml beside the log."""
     write_mapping: Annotated[
         Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: no)")
     ] = None
-    """Write what flags and --mapping said together."""
+    """Write the mapping that results from flags and --mapping."""
     time: Columns = None
     """Time stamps."""
     step: Annotated[float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: --time)")] = None
@@ -90,7 +90,7 @@ class Import(PreparationOptions, RobotOptions):
     """Text without names of columns: how many numbers make a row, for all files or for each: 1,7,7."""
     delimiter: Annotated[
         str | None,
-        arg(metavar="comma|tab|semicolon|blanks|LETTER", constructor=str, help_behavior_hint="(default: told)"),
+        arg(metavar="comma|tab|semicolon|blanks|LETTER", constructor=str, help_behavior_hint="(default: detected)"),
     ] = None
     """What separates the columns of a text."""
     side_by_side: bool = False
@@ -127,12 +127,8 @@ class Import(PreparationOptions, RobotOptions):
         require_free_file(self.out, overwrite=self.overwrite)
         if self.write_mapping is not None:
             require_free_file(self.write_mapping, overwrite=self.overwrite)
-        from forcegp.data.hdf5 import file_written_whole
-        from forcegp.data.whole_files import write_text
-        from forcegp.recordings import ImportOptions, import_recordings, mapping_text
-
         mapping = self._mapping(terminal)
-        options = ImportOptions(
+        options = forcegp.ImportOptions(
             gap=self.gap,
             resample=self.resample,
             rate=self.rate,
@@ -143,16 +139,18 @@ class Import(PreparationOptions, RobotOptions):
             most_rows=self.max_rows,
         )
         system, preparation = self._system(), self._preparation()
-        with file_written_whole(self.out) as temporary, terminal.progress("importing") as report:
-            done = import_recordings(self.logs, temporary, mapping, system=system, options=options, report=report)
+        with atomic_file(self.out) as temporary, terminal.progress("importing") as report:
+            done = forcegp.import_recordings(
+                self.logs, temporary, mapping, system=system, options=options, report=report
+            )
             if not preparation.changes_nothing:
                 done |= _prepared(temporary, preparation, done["rows"])
         if self.write_mapping is not None:
-            write_text(self.write_mapping, mapping_text(mapping))
-        _tell(terminal, self.out, done)
+            write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
+        _report(terminal, self.out, done)
         return {"out": str(self.out), **done}
 
-    def _system(self) -> MechanicalSystem | None:
+    def _system(self) -> forcegp.MechanicalSystem | None:
         """The robot of the options, with the known forces of --identified if that was given."""
         found = self._identified_system()
         if found is not None:
@@ -160,63 +158,53 @@ class Import(PreparationOptions, RobotOptions):
         robot = self.chosen_robot()
         if robot is None:
             return None
-        from forcegp.mechanics import MechanicalSystem
 
-        return MechanicalSystem(robot)
+        return forcegp.MechanicalSystem(robot)
 
-    def _mapping(self, terminal: Terminal) -> ColumnMapping:
+    def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""
-        from forcegp.recordings import ColumnMapping, read_mapping
-        from forcegp.recordings.mapping_file import beside
-
         path = self.mapping
         if path is None:
-            found = {beside(log) for log in self.logs} - {None}
+            found = {forcegp.recordings.beside(log) for log in self.logs} - {None}
             if len(found) > 1:
-                raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); say --mapping.")
+                raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); give --mapping.")
             path = next(iter(found), None)
             if path is not None:
                 terminal.note(f"the columns are mapped by {path}")
-        stored = ColumnMapping() if path is None else read_mapping(path)
+        stored = forcegp.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
         return stored.changed_by(self._flags())
 
-    def _flags(self) -> ColumnMapping:
-        from forcegp.recordings.delimited_text import DELIMITERS
-        from forcegp.recordings.mapping_file import by_quantity, factors_of, mapping_of
-
+    def _flags(self) -> forcegp.ColumnMapping:
         names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes")
         given: dict[str, Any] = {name: getattr(self, name) for name in names}
         given["side_by_side"] = self.side_by_side
         if self.delimiter is not None:
-            given["delimiter"] = DELIMITERS.get(self.delimiter, self.delimiter)
+            given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
             words = self.headerless.split(",")
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
             given["headerless"] = [int(word) for word in words]
         if self.unit is not None:
-            given["unit"] = by_quantity("unit", self.unit)
+            given["unit"] = forcegp.recordings.by_quantity("unit", self.unit)
         for name in ("sign", "scale", "offset"):
             text = getattr(self, name)
             if text is not None:
-                given[name] = factors_of(name, text)
-        return mapping_of(given)
+                given[name] = forcegp.recordings.factors_of(name, text)
+        return forcegp.recordings.mapping_of(given)
 
 
-def _prepared(path: Path, preparation: Preparation, rows: int) -> dict[str, Any]:
-    """Prepare the dataset in a file, in its place, and return what to tell of it.
+def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[str, Any]:
+    """Prepare the dataset in a file, in its place, and return what was done.
 
     Raises NotEnoughMemory where the whole of it does not fit into memory, which filters need.
     """
-    import torch
-
-    from forcegp.data import Dataset
-    from forcegp.inference.memory import require_memory
+    import torch  # 2 s that only a preparation costs
 
     required = COPIES * path.stat().st_size
     remedy = "import without --cutoff, --delay, --every and --trim, or fewer logs at once."
-    require_memory(required, f"preparing {rows} rows", remedy, torch.device("cpu"))
-    prepared = preparation.apply(Dataset.load(path))
+    forcegp.inference.require_memory(required, f"preparing {rows} rows", remedy, torch.device("cpu"))
+    prepared = preparation.apply(forcegp.Dataset.load(path))
     prepared.dataset.save(path)
     return {"rows": len(prepared.dataset), "preparation": prepared.report}
 
@@ -225,23 +213,23 @@ def _list(paths: set[Path | None]) -> str:
     return ", ".join(sorted(str(path) for path in paths))
 
 
-def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
+def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
     """What was guessed, repaired and left out, and what came out."""
     for found in done["guessed"]:
         terminal.note(f"found by name: {found}")
     for recording in done["recordings"]:
-        told = list(recording["notes"])
+        notes = list(recording["notes"])
         if recording["repeated_stamps_dropped"]:
-            told.append(f"{_counted(recording['repeated_stamps_dropped'], 'row')} with a repeated time stamp dropped")
+            notes.append(f"{_counted(recording['repeated_stamps_dropped'], 'row')} with a repeated time stamp dropped")
         if recording["gaps"]:
             count, longest = len(recording["gaps"]), max(recording["gaps"])
-            told.append(f"{_counted(count, 'gap')} of up to {longest:.4g} s {'splits' if count == 1 else 'split'} it")
+            notes.append(f"{_counted(count, 'gap')} of up to {longest:.4g} s {'splits' if count == 1 else 'split'} it")
         if recording["rows_in_stretches_too_short"]:
-            told.append(
+            notes.append(
                 f"{_counted(recording['rows_in_stretches_too_short'], 'row')} in stretches of fewer than 5 left out"
             )
-        if told:
-            terminal.note(f"{recording['name']}: {'; '.join(told)}")
+        if notes:
+            terminal.note(f"{recording['name']}: {'; '.join(notes)}")
     if done["resampled_to_step"] is not None:
         worst = max(recording["largest_deviation_of_a_step"] for recording in done["recordings"])
         terminal.note(
@@ -259,7 +247,7 @@ def _tell(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
         how = "filtered and differentiated anew"
     seconds = sum(recording["seconds"] for recording in done["recordings"])
     rows, episodes = _counted(done["rows"], "row"), _counted(len(done["episodes"]), "episode")
-    terminal.say(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
+    terminal.show(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
 
 
 def _counted(count: int, what: str) -> str:

@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
+import forcegp
+import forcegp.mechanics
+import forcegp.models
+import forcegp.robots
 from forcegp.errors import InvalidInput
 
-if TYPE_CHECKING:
-    from forcegp.mechanics import MechanicalSystem
-    from forcegp.models.physical_parameters import Learned
 
-
-def parse_learn(words: Sequence[str]) -> tuple[Learned, ...]:
+def parse_learn(words: Sequence[str]) -> tuple[forcegp.models.Learned, ...]:
     """`LINK:mass,com,inertia`, or `FORCE`, `FORCE:joint,joint`, either with `=START`. Raises InvalidInput."""
-    from forcegp.mechanics.known_forces import KNOWN_FORCES
-    from forcegp.models.physical_parameters import Coefficients
-    from forcegp.robots import LinkInertia
-
     if not words:
         raise InvalidInput("nothing to estimate; add --learn LINK:mass,com, or another that --help names.")
-    forces = [name for name, kind in KNOWN_FORCES.items() if kind.learned is not None]
-    learned: list[Learned] = []
+    forces = [name for name, kind in forcegp.mechanics.KNOWN_FORCES.items() if kind.learned is not None]
+    learned: list[forcegp.models.Learned] = []
     for word in words:
         what, _, start = word.partition("=")
         name, _, listed = what.rpartition(":") if ":" in what else (what, "", "")
         entries = tuple(entry for entry in listed.split(",") if entry)
         if name in forces:
-            learned.append(Coefficients(name, entries or None, _number(word, start) if start else None))
+            learned.append(forcegp.Coefficients(name, entries or None, _number(word, start) if start else None))
         elif entries and not start:
-            learned.append(LinkInertia(name, entries))
+            learned.append(forcegp.robots.LinkInertia(name, entries))
         else:
             raise InvalidInput(
                 f"--learn {word} is not LINK:PARTS, with parts out of mass,com,inertia, nor one of {', '.join(forces)} "
@@ -38,23 +34,31 @@ def parse_learn(words: Sequence[str]) -> tuple[Learned, ...]:
     return tuple(learned)
 
 
-def with_learned_forces(system: MechanicalSystem, learn: Sequence[Learned]) -> tuple[MechanicalSystem, list[str]]:
+def with_learned_forces(
+    system: forcegp.MechanicalSystem, learn: Sequence[forcegp.models.Learned]
+) -> tuple[forcegp.MechanicalSystem, list[str]]:
     """The system with every learned force in its list, from the URDF's coefficients, and the names that were added."""
-    from dataclasses import replace
-
-    from forcegp.mechanics import Armature, CoulombJointFriction, LoadJointFriction, RotorInertia, ViscousJointFriction
-    from forcegp.models.physical_parameters import Coefficients
-
     make = {
-        "viscous-joint-friction": (ViscousJointFriction, lambda: ViscousJointFriction.from_robot(system.robot)),
-        "coulomb-joint-friction": (CoulombJointFriction, lambda: CoulombJointFriction.from_robot(system.robot)),
-        "load-joint-friction": (LoadJointFriction, lambda: LoadJointFriction(0.0, 0.0, 0.1)),
-        "armature": (Armature, lambda: Armature(0.0)),
-        "rotor-inertia": (RotorInertia, lambda: RotorInertia(0.0)),
+        "viscous-joint-friction": (
+            forcegp.ViscousJointFriction,
+            lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
+        ),
+        "coulomb-joint-friction": (
+            forcegp.CoulombJointFriction,
+            lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
+        ),
+        "load-joint-friction": (
+            forcegp.LoadJointFriction,
+            lambda: forcegp.LoadJointFriction(0.0, 0.0, 0.1),
+        ),
+        "armature": (forcegp.Armature, lambda: forcegp.Armature(0.0)),
+        "rotor-inertia": (forcegp.RotorInertia, lambda: forcegp.RotorInertia(0.0)),
     }
     added: dict[str, None] = {}
     for entry in learn:
-        if isinstance(entry, Coefficients) and not any(type(f) is make[entry.force][0] for f in system.known_forces):
+        if isinstance(entry, forcegp.Coefficients) and not any(
+            type(f) is make[entry.force][0] for f in system.known_forces
+        ):
             system = replace(system, known_forces=(*system.known_forces, make[entry.force][1]()))
             added[entry.force] = None
     return system, list(added)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from forcegp.cli.backend_choice import BackendOptions
+import forcegp
+from forcegp.cli.backend_options import BackendOptions
+from forcegp.cli.command import DATASET
 from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
-from forcegp.cli.robot_choice import RobotOptions
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.mechanics import MechanicalSystem
+from forcegp.cli.robot_options import RobotOptions
 
 KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
 
@@ -25,7 +23,7 @@ KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction
 class LearningOptions(BackendOptions, RobotOptions):
     """What every command asks that learns from a dataset."""
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
     """The folder to write."""
@@ -62,11 +60,11 @@ class LearningOptions(BackendOptions, RobotOptions):
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
     rows: Annotated[RowsChoice, arg(metavar="auto|in-contact|all")] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
-    every row. auto: in-contact where the tool leaves the surface at times, and says so."""
+    every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
 
-    def _system(self, dataset: Dataset) -> MechanicalSystem:
+    def _system(self, dataset: forcegp.Dataset) -> forcegp.MechanicalSystem:
         """What is known: the dataset's own system, with what the options replace."""
         contacts = parse_contacts(self.contact)
         system = self.chosen_system(dataset, self.data)
@@ -76,8 +74,8 @@ class LearningOptions(BackendOptions, RobotOptions):
             system = _with_known_forces(system, self.known_force)
         return system
 
-    def _rows(self, dataset: Dataset, system: MechanicalSystem) -> tuple[Dataset, str | None]:
-        """The rows to learn from, and what to say of them after the fit."""
+    def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
+        """The rows to learn from, and a note to print after the fit."""
         return rows_to_learn(dataset, system, self.rows)
 
     def _given(self) -> dict[str, Any]:
@@ -91,15 +89,11 @@ class LearningOptions(BackendOptions, RobotOptions):
         return {"options": options, "data": data}
 
 
-def _with_known_forces(system: MechanicalSystem, names: tuple[str, ...]) -> MechanicalSystem:
-    from dataclasses import replace
-
-    from forcegp.mechanics import Actuation, CoulombJointFriction, RigidBodyBias, ViscousJointFriction
-
+def _with_known_forces(system: forcegp.MechanicalSystem, names: tuple[str, ...]) -> forcegp.MechanicalSystem:
     made = {
-        "actuation": lambda: Actuation(),
-        "rigid-body-bias": lambda: RigidBodyBias(),
-        "viscous-joint-friction": lambda: ViscousJointFriction.from_robot(system.robot),
-        "coulomb-joint-friction": lambda: CoulombJointFriction.from_robot(system.robot),
+        "actuation": lambda: forcegp.Actuation(),
+        "rigid-body-bias": lambda: forcegp.RigidBodyBias(),
+        "viscous-joint-friction": lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
+        "coulomb-joint-friction": lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
     }
     return replace(system, known_forces=tuple(made[name]() for name in dict.fromkeys(names)))

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import NoReturn
 
+from forcegp import __version__
 from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.command import Command
 from forcegp.cli.terminal import Terminal
@@ -27,8 +28,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
-        from forcegp import __version__
-
         print(f"forcegp {__version__}")
         return OK
     debug, command = "--debug" in given, None
@@ -40,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
         with Terminal(json=command.json) as terminal:
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
+            command.check_inputs()
             terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:

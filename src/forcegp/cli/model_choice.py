@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, TypeVar
 
+import forcegp
+import forcegp.data
+import forcegp.models
+import forcegp.priors
+from forcegp.cli.fit_options import ITERATIONS, NETWORK_POINTS, POINTS, WINDOW, LearnFrom, ModelOptions
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.cli.fit import Fit
-    from forcegp.data import Dataset, WindowObservation
-    from forcegp.mechanics import MechanicalSystem
-    from forcegp.models import Model, Noise
-
-ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
-
-LearnFrom = Literal["accelerations", "increments", "weak-form"]
 
 NETWORKS = ("neural-network", "ensemble")
 SEARCHED = ("structured", "unconstrained", "independent-gp")
@@ -39,17 +34,13 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
 }
 """Options that mean nothing to some models -> those to which they do."""
 
-POINTS, NETWORK_POINTS = 200, 10_000
-POINTS_HINT = f"(default: {POINTS}; networks {NETWORK_POINTS})"
-WINDOW = 0.1
-"""Length of a window where none is given, in s."""
-ITERATIONS = 200
-ITERATIONS_HINT = f"(default: {ITERATIONS}; networks 5000, ensembles 3000)"
+Options = TypeVar("Options", bound=ModelOptions)
+
 START_NOISE = 0.1
 """Where learning the noise starts if the dataset does not state it, in rad/s^2 or m/s^2."""
 
 
-def resolved(command: Fit) -> Fit:
+def resolved(command: Options) -> Options:
     """The command with the defaults of its model. Raises InvalidInput for options that mean nothing to it."""
     defaults = {field.name: field.default for field in fields(command)}
     for name, models in MEANT_FOR.items():
@@ -76,44 +67,50 @@ def resolved(command: Fit) -> Fit:
     return replace(command, **changes)
 
 
-def make_model(command: Fit, system: MechanicalSystem, dataset: Dataset) -> Model:
+def make_model(
+    command: ModelOptions, system: forcegp.MechanicalSystem, dataset: forcegp.Dataset
+) -> forcegp.models.Model:
     """The model of a resolved command."""
-    from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, StructuredGP
-    from forcegp.priors import JointAccelerations, NoForces, named_prior
-
     if command.model in NETWORKS:
         noise = _known_noise(command.noise, dataset)
         steps = {} if command.iterations is None else {"steps": command.iterations}
-        return (NeuralNetwork if command.model == "neural-network" else NetworkEnsemble)(system, noise, **steps)
+        return (forcegp.NeuralNetwork if command.model == "neural-network" else forcegp.NetworkEnsemble)(
+            system, noise, **steps
+        )
     windows = command.learn_from != "accelerations"
     noise = (noise_of_windows if windows else resolved_noise)(command.noise, dataset, command.force_noise)
     if command.measured_torque:
         noise = of_measured_torque(noise)
     if command.model == "independent-gp":
-        return IndependentGP(system, noise=noise)
+        return forcegp.IndependentGP(system, noise=noise)
     if command.model == "unconstrained":
-        return StructuredGP(system, JointAccelerations(), "zero", noise)
+        return forcegp.StructuredGP(system, forcegp.JointAccelerations(), "zero", noise)
     if command.model == "analytical":
-        return StructuredGP(system, NoForces(), "analytical", noise)
+        return forcegp.StructuredGP(system, forcegp.NoForces(), "analytical", noise)
     assert command.mean is not None, "a resolved command has a mean"
-    prior = named_prior(" + ".join(command.prior), system)
-    return StructuredGP(system, prior, command.mean, noise)
+    prior = forcegp.priors.named_prior(" + ".join(command.prior), system)
+    return forcegp.StructuredGP(system, prior, command.mean, noise)
 
 
-def search_arguments(command: Fit, points: int) -> dict[str, Any]:
+def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
     """What `fit` of the model of a resolved command takes besides the data and so many points."""
-    from forcegp.models.search import default_options
-
     if command.model in NETWORKS:
         return {"seed": command.seed}
     assert command.iterations is not None, "a resolved command has iterations"
     engine = {"engine": command.engine, "learning_points": command.learning_points}
     observe = window_observation(command.learn_from, command.window)
-    options = default_options(points)
+    if observe is not None:
+        if command.engine not in ("auto", "exact") or command.learning_points is not None:
+            raise InvalidInput(
+                f"--engine and --learning-points mean nothing to --learn-from {command.learn_from}: windows are "
+                "conditioned on exactly, and all are learned from; leave both out, and give fewer --points if it takes "
+                "too long."
+            )
+        engine = {"observe": observe}
+    options = forcegp.models.default_options(points)
     return {
         "seed": command.seed,
         **(engine if command.model in MEANT_FOR["engine"] else {}),
-        **({} if observe is None else {"observe": observe}),
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,
@@ -121,51 +118,52 @@ def search_arguments(command: Fit, points: int) -> dict[str, Any]:
     }
 
 
-def window_observation(learn_from: LearnFrom, seconds: float | None) -> WindowObservation | None:
+def window_observation(learn_from: LearnFrom, seconds: float | None) -> forcegp.data.WindowObservation | None:
     """What to observe of windows of that length; None for accelerations. Raises InvalidInput for no length."""
     if learn_from == "accelerations":
         return None
-    from forcegp.data import VelocityIncrements, WeakForm
 
-    return (WeakForm if learn_from == "weak-form" else VelocityIncrements)(WINDOW if seconds is None else seconds)
+    return (forcegp.WeakForm if learn_from == "weak-form" else forcegp.VelocityIncrements)(
+        WINDOW if seconds is None else seconds
+    )
 
 
-def noise_of_windows(given: str, dataset: Dataset, force: float | None = None) -> Noise | None:
+def noise_of_windows(given: str, dataset: forcegp.Dataset, force: float | None = None) -> forcegp.Noise | None:
     """`resolved_noise` of windows, which no dataset states: it is learned unless it is a number."""
-    from forcegp.models import Noise
+    return (
+        resolved_noise(given, dataset, force)
+        if given not in ("dataset", "learned")
+        else forcegp.Noise(None, force, True)
+    )
 
-    return resolved_noise(given, dataset, force) if given not in ("dataset", "learned") else Noise(None, force, True)
 
-
-def of_measured_torque(noise: Noise | None) -> Noise:
+def of_measured_torque(noise: forcegp.Noise | None) -> forcegp.Noise:
     """The noise, with its forces those of torque sensors. Raises InvalidInput where it has none of forces."""
     if noise is None or noise.force is None:
         raise InvalidInput("--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA.")
     return replace(noise, measured_torque=True)
 
 
-def resolved_noise(given: str, dataset: Dataset, force: float | None = None) -> Noise | None:
+def resolved_noise(given: str, dataset: forcegp.Dataset, force: float | None = None) -> forcegp.Noise | None:
     """The model's noise for `learned`, `dataset` or a number, and for the noise of forces.
 
     Raises InvalidInput for anything else.
     """
-    from forcegp.models import Noise
-
     if given == "learned":
-        return Noise(START_NOISE if dataset.noise_std is None else None, force, learn=True)
+        return forcegp.Noise(START_NOISE if dataset.noise_std is None else None, force, learn=True)
     if given == "dataset":
         if dataset.noise_std is None:
             raise InvalidInput(
                 "the dataset does not state its noise; add --noise learned, or --noise SIGMA if it is known."
             )
-        return None if force is None else Noise(None, force)
+        return None if force is None else forcegp.Noise(None, force)
     try:
         sigma = float(given)
     except ValueError:
         raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
-    return Noise(sigma, force)
+    return forcegp.Noise(sigma, force)
 
 
-def _known_noise(given: str, dataset: Dataset) -> Noise | None:
-    """A network's noise: None where neither SIGMA nor the dataset tells, for then it estimates it."""
+def _known_noise(given: str, dataset: forcegp.Dataset) -> forcegp.Noise | None:
+    """A network's noise: None where neither SIGMA nor the dataset states it: the network then estimates it."""
     return None if given == "dataset" and dataset.noise_std is None else resolved_noise(given, dataset)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 from typing_extensions import override
 from tyro.conf import arg
 
+import forcegp
 from forcegp.cli.command import Command
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Preparation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,15 +23,13 @@ class CutoffOptions(Command):
     differentiate: Annotated[Literal["q", "v"], arg(metavar="q|v")] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
 
-    def _preparation(self) -> Preparation:
-        """What the options say. Raises InvalidInput, naming the option, for what is no number."""
-        from forcegp.data import Preparation
-
+    def _preparation(self) -> forcegp.Preparation:
+        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
         if self.cutoff in ("none", "auto"):
             cutoff = None if self.cutoff == "none" else "auto"
         else:
             cutoff = _number("--cutoff", self.cutoff, "a frequency in Hz, auto or none")
-        return Preparation(cutoff=cutoff, differentiate=self.differentiate)
+        return forcegp.Preparation(cutoff=cutoff, differentiate=self.differentiate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +45,7 @@ class PreparationOptions(CutoffOptions):
     """Drop so many seconds at both ends of each episode, after the filter."""
 
     @override
-    def _preparation(self) -> Preparation:
-        from dataclasses import replace
-
+    def _preparation(self) -> forcegp.Preparation:
         delay: float | tuple[float, ...] | Literal["auto"]
         if self.delay == "auto":
             delay = "auto"

@@ -1,30 +1,33 @@
-"""`forcegp prepare`: filter, align, differentiate and thin out a raw log, and say what that costs."""
+"""`forcegp prepare`: filter, align, differentiate and thin out a raw log, and report what that costs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+from rich.text import Text
 from tyro.conf import Positional, arg
 
-from forcegp.cli.command import Debug, Json
+import forcegp
+import forcegp.data
+import forcegp.evaluation
+from forcegp.atomic_files import atomic_folder
+from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.output_folders import require_free_file, require_free_folder, write_config
 from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.tables import NONE, columns, facts
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_file, require_free_folder, write_config
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset, Prepared
 
 KIND = "forcegp prepare"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prepare(PreparationOptions, RobotOptions):
-    """Filter, align, differentiate and thin out a raw log, and say what that costs.
+    """Filter, align, differentiate and thin out a raw log, and report what that costs.
 
     The low-pass filter runs forwards and backwards, so that nothing is delayed; v and a are computed anew.
 
@@ -33,7 +36,7 @@ class Prepare(PreparationOptions, RobotOptions):
       forcegp prepare log.h5 --cutoff 20 --delay auto --robot arm.urdf --trim 0.1 --out data.h5
     """
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to prepare (HDF5), as forcegp import wrote it."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write."""
@@ -51,14 +54,11 @@ class Prepare(PreparationOptions, RobotOptions):
         require_free_file(self.out, overwrite=self.overwrite)
         if self.plots is not None:
             require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
-        from dataclasses import replace
-
-        from forcegp.data import Dataset
 
         preparation = self._preparation()
         if preparation.changes_nothing:
             raise InvalidInput("nothing to do: give --cutoff, --delay, --every or --trim.")
-        dataset = Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.data)
         if self.robot is not None or self.identified is not None or dataset.system is not None:
             dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
         with terminal.progress("preparing"):
@@ -66,27 +66,22 @@ class Prepare(PreparationOptions, RobotOptions):
         prepared.dataset.save(self.out)
         if self.plots is not None:
             self._draw(terminal, dataset, prepared)
-        terminal.say(*_report(self.out, dataset, prepared))
+        terminal.show(*_report(self.out, dataset, prepared))
         return {"out": str(self.out), "data": str(self.data), **prepared.report}
 
-    def _draw(self, terminal: Terminal, dataset: Dataset, prepared: Prepared) -> None:
-        from forcegp.evaluation.figure_style import save_figure
-        from forcegp.evaluation.spectrum_plot import preparation_figure
-
+    def _draw(self, terminal: Terminal, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> None:
         assert self.plots is not None
-        with folder_written_whole(self.plots) as folder:
+        with atomic_folder(self.plots) as folder:
             folder.mkdir()
-            save_figure(preparation_figure(dataset, prepared.preparation), folder / "spectra.png")
+            forcegp.evaluation.save_figure(
+                forcegp.evaluation.preparation_figure(dataset, prepared.preparation), folder / "spectra.png"
+            )
             write_config(folder, KIND, {"data": str(self.data), "preparation": prepared.report})
         terminal.note(f"plots: {self.plots}")
 
 
-def _report(out: Path, dataset: Dataset, prepared: Prepared) -> list[Any]:
+def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> list[Any]:
     """The price, joint by joint."""
-    from rich.text import Text
-
-    from forcegp.cli.tables import NONE, columns, facts
-
     report = prepared.report
     before, after = report["rows"]
     values = {"rows": f"{before} -> {after}"}
@@ -97,8 +92,10 @@ def _report(out: Path, dataset: Dataset, prepared: Prepared) -> list[Any]:
     values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
     delays = report["delay"]
     if any(delays) or "delay" in report["why"]:
-        told = ", ".join(f"{1e3 * delay:.1f}" for delay in (delays if len(set(delays)) > 1 else delays[:1]))
-        values["delay of u"] = f"{told} ms" + (f"; {report['why']['delay']}" if "delay" in report["why"] else "")
+        milliseconds = ", ".join(f"{1e3 * delay:.1f}" for delay in (delays if len(set(delays)) > 1 else delays[:1]))
+        values["delay of u"] = f"{milliseconds} ms" + (
+            f"; {report['why']['delay']}" if "delay" in report["why"] else ""
+        )
     tables: list[Any] = [facts(f"{out}: prepared", values)]
     if cutoff is None:
         return tables

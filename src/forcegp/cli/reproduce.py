@@ -10,7 +10,8 @@ from typing import Annotated, Any, ClassVar
 
 from tyro.conf import Positional, arg
 
-from forcegp.cli.backend_choice import BackendOptions
+import forcegp.experiments
+from forcegp.cli.backend_options import BackendOptions
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
@@ -31,7 +32,7 @@ class Reproduce(BackendOptions):
       forcegp reproduce all --preset paper --backend ray --address 10.0.0.1:6379
     """
 
-    interrupted: ClassVar[str] = "finished cells are kept, and the same command goes on from there"
+    interrupted: ClassVar[str] = "finished jobs are kept, and the same command goes on from there"
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""
@@ -58,19 +59,16 @@ class Reproduce(BackendOptions):
         if any(seed < 0 for seed in self.seeds):
             raise InvalidInput(f"--seeds are {self.seeds}; give numbers of at least 0.")
         backend = self._backend("joblib")
-        from forcegp.experiments.pages import page_of
-        from forcegp.experiments.presets import experiments_of
-        from forcegp.experiments.reproduction import page_name, reproduce
 
         start = time.monotonic()
-        experiments = experiments_of(self.preset, self.figure)
+        experiments = forcegp.experiments.experiments_of(self.preset, self.figure)
         if self.points:
             experiments = tuple(experiment.with_points(self.points) for experiment in experiments)
         if self.seeds:
             experiments = tuple(experiment.with_seeds(self.seeds) for experiment in experiments)
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
-            summaries = reproduce(
+            summaries = forcegp.experiments.reproduce(
                 experiments,
                 self.preset,
                 out,
@@ -79,15 +77,15 @@ class Reproduce(BackendOptions):
                 backend=backend,
                 progress=report,
             )
-        terminal.say(
-            f"{out / page_name(experiments, self.preset)} tells what was found; figures, JSON and CSV lie in "
-            f"{out / page_of(self.preset).name}."
+        terminal.show(
+            f"{out / forcegp.experiments.page_name(experiments, self.preset)} reports the results; figures, JSON and "
+            f"CSV are in {out / forcegp.experiments.page_of(self.preset).name}."
         )
         terminal.note(f"{time.monotonic() - start:.0f} s")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
 
     def _command(self) -> str:
-        """What has to be said for the same numbers."""
+        """The command line that gives the same numbers."""
         words = ["forcegp reproduce", self.figure, "--preset", self.preset]
         for name, numbers in (("--points", self.points), ("--seeds", self.seeds)):
             words += [name, *map(str, numbers)] if numbers else []

@@ -6,28 +6,25 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from forcegp.cli.command import Command, Debug, Json
+import forcegp
+import forcegp.evaluation
+import forcegp.models
+from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
+from forcegp.cli.output_folders import require_free_folder, write_config
 from forcegp.cli.system_choice import SystemChoice, carried_over
+from forcegp.cli.tables import NONE, columns, facts, number, percent
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import folder_written_whole, require_free_folder, write_config, write_json
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from forcegp.data import Dataset
-    from forcegp.evaluation import RecordedMotions, RolloutErrors
-    from forcegp.mechanics import Baumgarte
-    from forcegp.models.rollout import Rollout as Motion
 
 KIND = "forcegp rollout"
 DEFAULT_STARTS = 10
 MOMENTS = (0.1, 0.25, 0.5, 1.0)
-"""Parts of the duration at which the table tells the errors."""
+"""Parts of the duration at which the table shows the errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +36,9 @@ class Rollout(Command):
       forcegp rollout run test.h5 --start 0,240 --integrator projected --samples 20 --out rollout
     """
 
-    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote."""
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """A recording with equal time steps that the model has not seen (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: rollout.json, rollout.h5 and rollout.png."""
@@ -71,21 +68,18 @@ class Rollout(Command):
         rows = self._starts()
         baumgarte = parse_baumgarte(self.baumgarte)
         require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
-        from forcegp.data import Dataset
-        from forcegp.evaluation import recorded_motions, rollout_errors, system_warnings
-        from forcegp.models import load_posterior
 
-        posterior = load_posterior(self.run_folder)
-        dataset = Dataset.load(self.data)
+        posterior = forcegp.load_posterior(self.run_folder)
+        dataset = forcegp.Dataset.load(self.data)
         if tuple(posterior.joint_names) != dataset.joint_names:
             raise InvalidInput(
                 f"{self.data} has joints {', '.join(dataset.joint_names)}; the model was trained on "
                 f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
             )
         posterior = carried_over(terminal, posterior, dataset, self.system)
-        for sentence in system_warnings(posterior, dataset):
+        for sentence in forcegp.evaluation.system_warnings(posterior, dataset):
             terminal.warn(sentence)
-        recorded = recorded_motions(dataset, rows, self.seconds)
+        recorded = forcegp.evaluation.recorded_motions(dataset, rows, self.seconds)
         begun = time.process_time()
         with terminal.progress(f"rolling out: {len(recorded.rows)} motions of {recorded.time[-1]:.3g} s") as report:
             rollout = posterior.rollout(
@@ -100,13 +94,13 @@ class Rollout(Command):
                 progress=report,
             )
         cpu_seconds = time.process_time() - begun
-        errors = rollout_errors(rollout, recorded, posterior.system)
+        errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.system)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
-        with folder_written_whole(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             folder.mkdir()
             self._write(folder, rollout, recorded, errors, dataset, summary)
         terminal.note(f"figure: {self.out / 'rollout.png'}")
-        terminal.say(*_report(summary))
+        terminal.show(*_report(summary))
         return summary
 
     def _starts(self) -> int | list[int]:
@@ -121,10 +115,10 @@ class Rollout(Command):
 
     def _summary(
         self,
-        rollout: Motion,
-        recorded: RecordedMotions,
-        errors: RolloutErrors,
-        dataset: Dataset,
+        rollout: forcegp.models.Rollout,
+        recorded: forcegp.evaluation.RecordedMotions,
+        errors: forcegp.evaluation.RolloutErrors,
+        dataset: forcegp.Dataset,
         cpu_seconds: float,
     ) -> dict[str, Any]:
         steps, baumgarte = len(errors.time) - 1, rollout.baumgarte
@@ -153,15 +147,13 @@ class Rollout(Command):
     def _write(
         self,
         folder: Path,
-        rollout: Motion,
-        recorded: RecordedMotions,
-        errors: RolloutErrors,
-        dataset: Dataset,
+        rollout: forcegp.models.Rollout,
+        recorded: forcegp.evaluation.RecordedMotions,
+        errors: forcegp.evaluation.RolloutErrors,
+        dataset: forcegp.Dataset,
         summary: Mapping[str, Any],
     ) -> None:
-        import h5py
-
-        from forcegp.evaluation import rollout_figure, save_figure
+        import h5py  # here, so that --help does not wait for it
 
         write_json(folder / "rollout.json", summary)
         arrays = {"time": rollout.time, "q": rollout.q, "v": rollout.v, "a": rollout.a}
@@ -177,12 +169,14 @@ class Rollout(Command):
             file.attrs["joint_names"] = list(dataset.joint_names)
         stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
         title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
-        save_figure(rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png")
+        forcegp.evaluation.save_figure(
+            forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png"
+        )
         options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
         write_config(folder, KIND, {"options": {name: summary[name] for name in options}})
 
 
-def parse_baumgarte(given: str) -> Baumgarte | None:
+def parse_baumgarte(given: str) -> forcegp.Baumgarte | None:
     """`none`, `OMEGA` or `OMEGA,ZETA`. Raises InvalidInput for anything else."""
     if given == "none":
         return None
@@ -192,12 +186,11 @@ def parse_baumgarte(given: str) -> Baumgarte | None:
         numbers = []
     if len(numbers) not in (1, 2):
         raise InvalidInput(f"--baumgarte is {given!r}; give none, OMEGA or OMEGA,ZETA, for example 10,1.")
-    from forcegp.mechanics import Baumgarte
 
-    return Baumgarte(*numbers)
+    return forcegp.Baumgarte(*numbers)
 
 
-def _moment(errors: RolloutErrors, row: int) -> dict[str, Any]:
+def _moment(errors: forcegp.evaluation.RolloutErrors, row: int) -> dict[str, Any]:
     """Errors over all motions that have not diverged, at one moment; the joint error is that of the worst joint."""
     worst = errors.joint[:, row].max(-1)
     return {
@@ -211,9 +204,9 @@ def _moment(errors: RolloutErrors, row: int) -> dict[str, Any]:
     }
 
 
-def _number(values: np.ndarray | None, statistic: str) -> float | None:
-    """A statistic of the finite values; None if there are none."""
-    import numpy as np
+def _number(values: Any, statistic: str) -> float | None:
+    """A statistic of the finite values of an array; None if there are none."""
+    import numpy as np  # here, so that --help does not wait for it
 
     if values is None:
         return None
@@ -222,8 +215,6 @@ def _number(values: np.ndarray | None, statistic: str) -> float | None:
 
 
 def _report(summary: Mapping[str, Any]) -> list[Any]:
-    from forcegp.cli.tables import columns, facts, number, percent
-
     contacts, samples = summary["constraint_max"] is not None, summary["samples"] > 0
     header = ["after", "motions", "joint error,\nmedian", "\nlargest"]
     header += ["tool error,\nmedian", "largest |c|\nso far"] if contacts else []
@@ -238,15 +229,13 @@ def _report(summary: Mapping[str, Any]) -> list[Any]:
     count = len(summary["rows"])
     title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
     ended = sum(row >= 0 for row in summary["diverged_at"])
-    told = {"integrator": summary["integrator"], "diverged": f"{ended} of {count}"}
+    values = {"integrator": summary["integrator"], "diverged": f"{ended} of {count}"}
     if summary["integrator"] == "projected" and contacts:
         moved = summary["initial_correction"]
-        told["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
-    told["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
-    return [columns(title, header, rows), facts("", told)]
+        values["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
+    values["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
+    return [columns(title, header, rows), facts("", values)]
 
 
 def _millimetres(metres: float | None) -> str:
-    from forcegp.cli.tables import NONE
-
     return NONE if metres is None else f"{1e3 * metres:.3g} mm"

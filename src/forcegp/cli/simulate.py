@@ -8,16 +8,15 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import forcegp
+import forcegp.simulation
 from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.terminal import Terminal
-from forcegp.cli.whole_folders import require_free_file
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +66,10 @@ class Simulate(Command):
         """Simulate and save."""
         require_free_file(self.out, overwrite=self.overwrite)
         start = time.monotonic()
-        dataset = simulate(terminal, self.scenario, **self._config())
+        dataset = simulate_with_progress(terminal, self.scenario, **self._config())
         dataset.save(self.out)
         seconds = time.monotonic() - start
-        terminal.say(
+        terminal.show(
             f"{self.out}: {len(dataset)} rows ({self.episodes} x {self.seconds:g} s), seed {self.seed}, "
             f"noise {self.noise:g} rad/s², simulated in {seconds:.1f} s"
         )
@@ -96,11 +95,9 @@ class Simulate(Command):
         return fields
 
 
-def simulate(terminal: Terminal, scenario: str, **options: Any) -> Dataset:
+def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
-    from forcegp.simulation import SCENARIOS
-
-    chosen = SCENARIOS[scenario]
+    chosen = forcegp.simulation.SCENARIOS[scenario]
     config = chosen.config(**options)
     _import_silently("pybullet")
     with terminal.progress(f"simulating seed {config.seed}") as report:
@@ -113,7 +110,7 @@ def _import_silently(name: str) -> None:
     with open(os.devnull, "wb") as nothing:  # noqa: PTH123  # a device, not a path
         os.dup2(nothing.fileno(), 2)
     try:
-        with contextlib.suppress(ImportError):  # the simulation says what to install
+        with contextlib.suppress(ImportError):  # the error of the simulation names what to install
             __import__(name)
     finally:
         os.dup2(stderr, 2)

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import forcegp
+import forcegp.models
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
-    from forcegp.models import Posterior
 
 SystemChoice = Literal["model", "data"]
 
 
-def carried_over(terminal: Terminal, posterior: Posterior, dataset: Dataset, choice: SystemChoice) -> Posterior:
+def carried_over(
+    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, choice: SystemChoice
+) -> forcegp.models.Posterior:
     """The posterior for the chosen system.
 
     A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data,
-    which is said on stderr. Raises InvalidInput where the data know no system or the model cannot move there.
+    which is reported on stderr. Raises InvalidInput where the data carry no system or the model cannot move there.
     """
     if choice == "model":
         return posterior
     if dataset.system is None:
-        raise InvalidInput("--system data: the data know no robot and contacts; leave the option out.")
+        raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
     if "learned" not in posterior.settings:
         return posterior.with_system(dataset.system)
     terminal.note("--system data: contacts of the data; the robot stays the identified one")

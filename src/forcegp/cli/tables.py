@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from forcegp.evaluation import Evaluation, ForceScore, ForceScores
-
+import forcegp
+import forcegp.evaluation
 
 NONE = "–"
 NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
@@ -60,7 +58,7 @@ def columns(
     return table
 
 
-def evaluation_table(title: str, evaluation: Evaluation) -> Table:
+def evaluation_table(title: str, evaluation: forcegp.Evaluation) -> Table:
     """One line per joint and their mean."""
     header = ["joint", "MAE", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "MAE, known\nphysics"]
     formats = {
@@ -80,26 +78,26 @@ def evaluation_table(title: str, evaluation: Evaluation) -> Table:
     return columns(title, header, rows, last=["mean (NLPD: joint)", *means])
 
 
-def multiplier_scores(evaluation: Evaluation) -> str:
+def multiplier_scores(evaluation: forcegp.Evaluation) -> str:
     """`MAE 1.2345 N, 90.1 % in the 95 % band`, against the true multipliers."""
     inside = percent(evaluation.multiplier_coverage_95)
     return f"MAE {number(evaluation.multiplier_mae)} N, {inside} in the 95 % band"
 
 
-def force_facts(scores: ForceScores, normal_forces: str) -> dict[str, str]:
-    """One line per force that the truth knows: its errors relative to its size, and whether the intervals hold.
+def force_facts(scores: forcegp.evaluation.ForceScores, normal_forces: str) -> dict[str, str]:
+    """One line per force whose true value is given: its errors relative to its size, and whether the intervals hold.
 
-    `normal_forces` says what the multiplier rests on.
+    `normal_forces` is a remark on what determines the multiplier.
     """
     values = {f"{name}, at the joints": _force_scores(score) for name, score in scores.joint_force.items()}
     values |= {f"{name}, at its point": _force_scores(score) for name, score in scores.point_force.items()}
     if scores.multiplier is not None:
-        told = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
-        values["contact force (multiplier)"] = told
+        text = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
+        values["contact force (multiplier)"] = text
     return values
 
 
-def _force_scores(score: ForceScore) -> str:
+def _force_scores(score: forcegp.evaluation.ForceScore) -> str:
     """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
     if score.relative_rmse is None:
         error = f"{number(score.rmse)} (the true force is zero)"
@@ -117,7 +115,7 @@ def number(value: float | None) -> str:
 
 
 def nats(value: float | None) -> str:
-    """Two decimals: differences below a hundredth of a nat tell nothing."""
+    """Two decimals: differences below a hundredth of a nat are not significant."""
     return NONE if value is None else f"{value:.2f}"
 
 

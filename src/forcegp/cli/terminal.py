@@ -1,4 +1,4 @@
-"""Where a command speaks: results on stdout, everything else on stderr; with --json, only JSON on stdout."""
+"""Output of a command: results on stdout, everything else on stderr; with --json, only JSON on stdout."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
@@ -24,7 +24,7 @@ LEAST_SHARE = 0.02
 """Of the work that must be done before the remaining time is guessed from it."""
 
 
-class Report(Protocol):
+class ProgressCallback(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
 
     def __call__(self, done: int, total: int, note: str = "") -> None:  # noqa: D102
@@ -47,15 +47,11 @@ class Terminal:
     @cached_property
     def out(self) -> Console:
         """What the command found."""
-        from rich.console import Console
-
         return Console(highlight=False, soft_wrap=False)
 
     @cached_property
     def err(self) -> Console:
         """What happens meanwhile."""
-        from rich.console import Console
-
         return Console(stderr=True, highlight=False, soft_wrap=True)
 
     def __enter__(self) -> Terminal:
@@ -85,31 +81,29 @@ class Terminal:
             with os.fdopen(os.dup(self._stdout), "w", encoding="utf-8") as stdout:
                 stdout.write(text)
 
-    def say(self, *renderables: RenderableType) -> None:
-        """Show people the result; silent with --json."""
+    def show(self, *renderables: RenderableType) -> None:
+        """Print the result; nothing with --json."""
         if not self.json:
             for renderable in renderables:
                 self.out.print(renderable)
 
     def note(self, text: str) -> None:
-        """Tell people on stderr what was done."""
+        """Report on stderr what was done."""
         self.err.print(text, style="dim", markup=False)
 
     def warn(self, text: str) -> None:
-        """Warn people on stderr."""
+        """Print a warning on stderr."""
         self.err.print(f"warning: {' '.join(text.split())}", style="yellow", markup=False)
 
     @contextmanager
-    def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[Report]:
+    def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[ProgressCallback]:
         """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
         if self.err.is_terminal:
             yield from self._bar(what, may_end_early)
         else:
             yield _PlainProgress(self, what, may_end_early).report
 
-    def _bar(self, what: str, may_end_early: bool) -> Iterator[Report]:
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
+    def _bar(self, what: str, may_end_early: bool) -> Iterator[ProgressCallback]:
         columns = (
             SpinnerColumn(),
             TextColumn("{task.description}"),

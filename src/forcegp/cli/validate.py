@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
+from rich.text import Text
 from tyro.conf import Positional, arg
 
-from forcegp.cli.backend_choice import BackendOptions
-from forcegp.cli.command import Debug, Json
+import forcegp
+import forcegp.validation
+from forcegp.cli.backend_options import BackendOptions
+from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_choice import RobotOptions
+from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.validation import Comparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +40,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
 
     interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset (HDF5), raw or prepared."""
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder of results; an unfinished one is gone on with."""
@@ -92,14 +94,13 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         backend = self._backend()
         horizons = self._horizons()
         start = time.monotonic()
-        from forcegp.validation import DEFAULT_MODELS, validate
 
         comparison = self._comparison(terminal, horizons)
         with terminal.progress(f"validating: {len(comparison.splits)} split(s), {self.seeds} seed(s)") as report:
-            validation = validate(
+            validation = forcegp.validate(
                 comparison,
                 self.out,
-                models=self.models or DEFAULT_MODELS,
+                models=self.models or forcegp.validation.DEFAULT_MODELS,
                 seeds=self.seeds,
                 backend=backend,
                 source=self._source(),
@@ -107,15 +108,12 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
                 progress=report,
             )
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
-        terminal.say(*self._report(validation.document))
+        terminal.show(*self._report(validation.document))
         brief = ("models", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
         return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
 
-    def _comparison(self, terminal: Terminal, horizons: tuple[float, ...]) -> Comparison:
-        from forcegp.data import Dataset
-        from forcegp.validation import Comparison, split_named
-
-        raw = Dataset.load(self.data)
+    def _comparison(self, terminal: Terminal, horizons: tuple[float, ...]) -> forcegp.Comparison:
+        raw = forcegp.Dataset.load(self.data)
         system = self.chosen_system(raw, self.data)
         raw = replace(raw, system=system)
         preparation = self._preparation()
@@ -126,11 +124,11 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             rows = preparation.apply(raw).dataset
             recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw).dataset
             self._warn_of_memory(terminal, preparation.cutoff, preparation.order)
-        return Comparison(
+        return forcegp.Comparison(
             rows,
             recording,
             system,
-            split_named(self.split, rows, self.guard),
+            forcegp.split_named(self.split, rows, self.guard),
             points=self.points,
             horizons=horizons,
             starts=self.starts,
@@ -145,8 +143,6 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
 
     def _warn_of_memory(self, terminal: Terminal, cutoff: Any, order: int) -> None:
         """A filter mixes what lies on both sides of a border."""
-        import math
-
         if cutoff is None or not (self.split.startswith("blocks") or self.split == "auto"):
             return
         memory = 1.0 / (2.0 * math.pi * cutoff * math.sin(0.5 * math.pi / order))
@@ -168,10 +164,6 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         return {"title": str(self.data), "data": [f"{self.data} (SHA-256 {digest[:16]}…)", *robot], "sha256": digest}
 
     def _report(self, document: Mapping[str, Any]) -> list[Any]:
-        from rich.text import Text
-
-        from forcegp.cli.tables import NONE, columns, number
-
         def median(value: Mapping[str, Any] | None) -> str:
             return number(None if value is None else value["median"])
 
@@ -198,11 +190,11 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             for name, model in document["models"].items()
             if model["failures"]
         ]
-        told = [
+        answers = [
             Text(f"{item['question']} {answer['sentence'].replace('**', '')}")
             for item in document["verdicts"]
             for answer in item["answers"]
             if answer["score"] == "force_rms"
         ]
         page = Text(f"The page: {self.out / 'report.md'}")
-        return [columns(title, header, rows, long_names=True), *failed, *told, page]
+        return [columns(title, header, rows, long_names=True), *failed, *answers, page]

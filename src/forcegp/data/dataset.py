@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
+import forcegp.mechanics
 from forcegp.data.columns import finite_columns, integer_column
 from forcegp.data.frozen_dict import FrozenDict, frozen_json
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.data.units import units_for, validated_units
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.mechanics import MechanicalSystem
 
 TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
 TRUTH_KINDS = ("Q_U.", "force.")
@@ -42,7 +40,7 @@ class Dataset:
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     system: the robot and what it touches, or None.
     noise_std: standard deviation of the noise on `a`, if known: (nv,), or (rows, nv) where it differs between rows.
-    truth: as far as a simulation knows them, noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
+    truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: anything that JSON can hold; frozen.
@@ -62,7 +60,7 @@ class Dataset:
     joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
     units: Mapping[str, Any] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
-    system: MechanicalSystem | None = None
+    system: forcegp.mechanics.MechanicalSystem | None = None
     noise_std: Float[np.ndarray, " nv"] | Float[np.ndarray, "rows nv"] | None = None
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -185,7 +183,7 @@ def _rebuild(arguments: dict[str, Any]) -> Dataset:
     return Dataset(**arguments)
 
 
-def _joint_names(given: Sequence[str], system: MechanicalSystem | None) -> tuple[str, ...]:
+def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSystem | None) -> tuple[str, ...]:
     if isinstance(given, str) or not all(isinstance(name, str) and name for name in given):
         raise DatasetError(f"joint_names must be a sequence of non-empty texts; given: {given!r}.")
     names = tuple(given)
@@ -228,7 +226,10 @@ def _is_table(given: object) -> bool:
 
 
 def _truth(
-    given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, system: MechanicalSystem | None
+    given: Mapping[str, object],
+    joint_names: tuple[str, ...],
+    rows: int,
+    system: forcegp.mechanics.MechanicalSystem | None,
 ) -> FrozenDict:
     unknown = sorted(name for name in given if name not in TRUTH_NAMES and not _of_a_kind(name))
     if unknown:

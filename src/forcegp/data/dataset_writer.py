@@ -1,4 +1,8 @@
-"""`DatasetWriter`: a dataset file written in pieces, for data that need not fit into memory."""
+"""`DatasetWriter`: a dataset file written in pieces, for data that need not fit into memory.
+
+Columns are written by more than one thread: HDF5's deflate takes more time than reading, interpolating and
+differentiating together, and runs on one.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,19 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
 from jaxtyping import Float
 
+import forcegp.mechanics
+from forcegp.atomic_files import atomic_file
 from forcegp.data.columns import finite_columns
 from forcegp.data.frozen_dict import frozen_json
-from forcegp.data.hdf5 import COMPRESSION, describe, file_written_whole
+from forcegp.data.hdf5 import COMPRESSION, describe
 from forcegp.data.units import validated_units
 from forcegp.errors import DatasetError
-
-if TYPE_CHECKING:
-    from forcegp.mechanics import MechanicalSystem
 
 ROWS_PER_CHUNK = 8192
 TABLES = ("q", "v", "u", "a")
@@ -41,7 +44,12 @@ class DatasetWriter:
     __no_type_check__: ClassVar[bool] = True
 
     def __init__(
-        self, path: str | Path, *, joint_names: Sequence[str], units: Mapping[str, Any], system: MechanicalSystem | None
+        self,
+        path: str | Path,
+        *,
+        joint_names: Sequence[str],
+        units: Mapping[str, Any],
+        system: forcegp.mechanics.MechanicalSystem | None,
     ) -> None:
         self.path = Path(path)
         self.joint_names = tuple(joint_names)
@@ -59,7 +67,7 @@ class DatasetWriter:
 
     def __enter__(self) -> DatasetWriter:
         with ExitStack() as stack:
-            temporary = stack.enter_context(file_written_whole(self.path))
+            temporary = stack.enter_context(atomic_file(self.path))
             self._file = stack.enter_context(h5py.File(temporary, "x"))
             self._pool = ThreadPoolExecutor(THREADS)
             stack.callback(self._pool.shutdown, cancel_futures=True)

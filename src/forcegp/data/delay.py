@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
+import forcegp.robots
 from forcegp.data.dataset import Dataset
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.robots import Robot
 
 LARGEST_DELAY = 0.05  # s
 STEPS = 100
@@ -60,7 +58,7 @@ class Delay:
         return self.common if sure else 0.0
 
     @property
-    def told(self) -> str:
+    def reason(self) -> str:
         """The common delay and what became of it, for people."""
         if not np.isfinite(self.common):
             return "the torques show no common delay"
@@ -72,7 +70,9 @@ class Delay:
         return f"{size}, but it explains less than a fifth of what inverse dynamics does not: none is assumed"
 
 
-def estimate_delay(dataset: Dataset, robot: Robot | None = None, *, largest: float = LARGEST_DELAY) -> Delay:
+def estimate_delay(
+    dataset: Dataset, robot: forcegp.robots.Robot | None = None, *, largest: float = LARGEST_DELAY
+) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to `largest` [s] to either side, u is fitted by least squares to what a rigid body with friction
@@ -100,8 +100,8 @@ def estimate_delay(dataset: Dataset, robot: Robot | None = None, *, largest: flo
         residual[:, joint] = profiles[joint, 0, STEPS] / spread[STEPS], profiles[joint, 0].min() / spread[STEPS]
     seconds = np.array([[lowest(profile, parts.shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
-    told = profiles[np.isfinite(residual[0])]
-    likelihoods = np.log(told + TINY * told.max(initial=0.0)).sum(axis=0)
+    finite = profiles[np.isfinite(residual[0])]
+    likelihoods = np.log(finite + TINY * finite.max(initial=0.0)).sum(axis=0)
     common = np.array([lowest(profile, parts.shifts) for profile in likelihoods])
     likelihood = likelihoods[0]
     return Delay(
@@ -110,7 +110,7 @@ def estimate_delay(dataset: Dataset, robot: Robot | None = None, *, largest: flo
         seconds=seconds[:, 0],
         std=_jackknife(seconds[:, 1:]),
         residual=residual,
-        remains=float(np.exp((likelihood.min() - likelihood[STEPS]) / max(len(told), 1))),
+        remains=float(np.exp((likelihood.min() - likelihood[STEPS]) / max(len(finite), 1))),
     )
 
 
@@ -176,7 +176,7 @@ def _shifted(dataset: Dataset, largest: float) -> _Shifts:
     return _Shifts(np.concatenate(rows), np.linspace(-largest, largest, 2 * STEPS + 1), episodes)
 
 
-def _features(robot: Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows 7"]:
+def _features(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows 7"]:
     """What the torque of each joint may be made of, except for its parameters."""
     import torch  # half a second, which only delays should cost
 
@@ -216,7 +216,7 @@ def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shi
     return float(shifts[at] + offset * (shifts[1] - shifts[0]))
 
 
-def _robot(dataset: Dataset, robot: Robot | None) -> Robot:
+def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robots.Robot:
     system = dataset.system
     if robot is None and system is None:
         raise InvalidInput(

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Float, Int
 
+from forcegp.data.dataset import Dataset
 from forcegp.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from forcegp.data.dataset import Dataset
 
 ROUNDING = 1e-13
 """Standard deviation, relative to the largest entry, below which a column is constant but for rounding."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import secrets
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,10 @@ from typing import Any
 import h5py
 import numpy as np
 
+import forcegp.mechanics
 from forcegp import __version__
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+from forcegp.atomic_files import atomic_file
+from forcegp.errors import FileFormatError, ForceGPError
 
 FORMAT = "forcegp-dataset"
 VERSION = 1
@@ -31,27 +32,8 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
 
     Raises InvalidInput if the folder does not exist or `path` is a folder.
     """
-    with file_written_whole(path) as temporary, h5py.File(temporary, "x") as file:
+    with atomic_file(path) as temporary, h5py.File(temporary, "x") as file:
         _write(fields, file)
-
-
-@contextlib.contextmanager
-def file_written_whole(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write a file at: it takes the place of `path` at the end, and vanishes on failure.
-
-    Raises InvalidInput if the folder does not exist or `path` is a folder.
-    """
-    if not path.parent.is_dir():
-        raise InvalidInput(f"cannot write {path}: the folder {path.parent} does not exist; create it first.")
-    if path.is_dir():
-        raise InvalidInput(f"cannot write {path}: it is a folder; give a file name.")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except BaseException:  # also KeyboardInterrupt: nothing half-written may stay
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def read_fields(path: Path) -> dict[str, Any]:
@@ -193,9 +175,8 @@ def _json(path: Path, name: str, text: str) -> dict[str, Any]:
 
 
 def _system(path: Path, text: str) -> Any:
-    from forcegp.mechanics import MechanicalSystem  # brings torch, which a file without a robot does not need
 
     try:
-        return MechanicalSystem.from_json(text)
+        return forcegp.mechanics.MechanicalSystem.from_json(text)
     except ForceGPError as error:
         raise FileFormatError(f"{path}: its robot or contacts cannot be used: {error}") from error

@@ -26,9 +26,6 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""
 
-SPLINE_ROWS = 24
-"""Rows after which a cubic spline has forgotten a value, to `FORGOTTEN`: it falls by 2 - sqrt(3) per row."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
@@ -41,7 +38,7 @@ class Preparation:
     delay: how much later than it acts u was logged [s], one number or one per joint: `u(t) := u_logged(t + delay)`;
         "auto" estimates one for all joints (`estimate_delay`), and uses it where it is sure and explains something.
     every: keep every so many rows.
-    trim: seconds to drop at both ends of each episode, where a filter knows one side only.
+    trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
 
     Raises InvalidInput for values that are not allowed.
@@ -151,7 +148,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
     if given.delay == "auto":
         found = estimate_delay(_filtered(replace(chosen, delay=0.0), dataset))
         chosen = replace(chosen, delay=found.significant)
-        reasons["delay"] = found.told
+        reasons["delay"] = found.reason
         reasons["delay_common"], reasons["delay_common_std"] = _plain(np.array([found.common, found.common_std]))
         reasons["delay_per_joint"], reasons["delay_per_joint_std"] = _plain(found.seconds), _plain(found.std)
     return chosen, reasons

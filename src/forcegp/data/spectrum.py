@@ -50,7 +50,7 @@ class MotionSpectrum:
 
     `density` (frequencies, nv) is the one-sided power density of `source` [unit^2/Hz] at `frequency` [Hz]; `knee` (nv,)
     [Hz], `floor` (nv,) [unit^2/Hz] and `cutoff` (nv,) [Hz] are NaN for a joint whose spectrum shows no noise floor:
-    it does not move, was filtered already, or has no noise to speak of.
+    it does not move, was filtered already, or has hardly any noise.
     """
 
     __no_type_check__: ClassVar[bool] = True  # nothing but arrays that this module makes

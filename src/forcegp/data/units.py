@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
+import forcegp.robots
 from forcegp.data.frozen_dict import FrozenDict
 from forcegp.errors import DatasetError
-
-if TYPE_CHECKING:
-    from forcegp.robots import Robot
 
 ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}
 """Units of a revolute or continuous joint."""
@@ -21,7 +18,7 @@ REVOLUTE_UNITS = FrozenDict({**ROTATION, "time": "s"})
 """Units of a robot whose joints all rotate."""
 
 
-def units_for(robot: Robot) -> FrozenDict:
+def units_for(robot: forcegp.robots.Robot) -> FrozenDict:
     """The units that a Dataset of this robot has: one text where all joints agree, else one per joint."""
     return _per_quantity([TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints])
 

@@ -1,4 +1,4 @@
-"""Windows: what a log tells about accelerations over short stretches of time, without differentiating it.
+"""Windows: what a log shows of accelerations over short stretches of time, without differentiating it.
 
 For a test function phi on a window of length T, int phi dt = 1, integration by parts moves the derivatives from the
 signal to phi:
@@ -108,7 +108,7 @@ class WindowObservation(ABC):
         """The `points` windows whose mean states (q, v, u) lie farthest apart; all of them for None.
 
         Windows follow each other without sharing a row, so their noise is independent. Rows must be in order of time,
-        at the rate of the sensors and unfiltered: noise of filtered signals is not white (a DataWarning says so).
+        at the rate of the sensors and unfiltered: noise of filtered signals is not white (a DataWarning reports it).
         Raises DatasetError for rows in another order, positions that jump by a turn and logs without a window;
         InvalidInput for more points than windows, windows of too few rows and more nodes than rows.
         """

@@ -36,7 +36,7 @@ class Evaluation:
     force_mae: |M (a - a_true)|, the error as a joint force.
     unknown_force_*: against the true Q_U (without an analytical mean: Q_K + Q_U, which the processes then carry). The
         part along A^T presses on the surface and moves nothing, so accelerations cannot show it: prefer `force_mae`.
-    multiplier_*: against the true lambda. Both are None for models that do not speak of forces.
+    multiplier_*: against the true lambda. Both are None for models without forces.
     warnings: sentences for people, for example that test rows are training rows.
     """
 

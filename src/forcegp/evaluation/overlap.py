@@ -1,4 +1,4 @@
-"""Is a model tested on what it was trained on? Sentences that say so."""
+"""Warnings where a model is tested on what it was trained on."""
 
 from __future__ import annotations
 

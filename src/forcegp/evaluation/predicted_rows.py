@@ -25,14 +25,14 @@ ROWS_PER_BLOCK = 1024
 
 @dataclass(frozen=True, eq=False)
 class PredictedRows:
-    """What a model says about every row, and the mechanics there.
+    """What a model predicts for every row, and the mechanics there.
 
     `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the model, or of
     the Dataset where it states a larger one or that of every row; `negative_log_density` of the measured rows under
     that noise; `known_physics` the acceleration of the known forces alone; `moving_force` M (mean - known_physics), the
     part of the unknown force that moves the robot (the other part presses on the surface); `unknown_force` Q_U and
     `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all
-    three None for a model that does not speak of forces; `A`, `b` and the mass matrix `mass`.
+    three None for a model without forces; `A`, `b` and the mass matrix `mass`.
     """
 
     mean: Float[np.ndarray, "rows nv"]
@@ -157,7 +157,7 @@ def _variance(force: Gaussian | None) -> np.ndarray | None:
 
 
 def _not_none(covariance: Tensor | None) -> Tensor:
-    assert covariance is not None, "predict computes the covariance unless told not to"
+    assert covariance is not None, "predict computes the covariance unless asked not to"
     return covariance
 
 

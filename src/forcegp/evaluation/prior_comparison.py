@@ -1,6 +1,8 @@
 """Which prior on the unknown forces do the data support? Candidates fitted to the same rows, and rows left out.
 
-The score is the log predictive density of stretches of time that are left out, in closed form (`posterior.leave_out`).
+The score is the log predictive density of stretches of time that are left out, in closed form (`posterior.leave_out`),
+not the marginal likelihood: candidates differ in the number of parameters by a factor of thirty, and their searches end
+at optima of different quality; the left-out density charges both where it hurts.
 Differences between two candidates are paired, stretch by stretch: with the difference D_b of block b, its rows n_b and
 d = sum D_b / sum n_b per row, the standard error of d over B blocks is
 
@@ -30,9 +32,10 @@ from forcegp.inference.memory import require_memory
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise, StructuredGP, StructuredPosterior
 from forcegp.models.fit_arguments import training_rows
-from forcegp.models.marginal_likelihood import MarginalLikelihood, Mean, TrainingData
 from forcegp.models.noise import ACCELERATION
-from forcegp.models.prior_checks import check_prior
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, Mean
+from forcegp.models.structured.prior_checks import check_prior
+from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior
 
@@ -40,7 +43,7 @@ BLOCKS = 20
 """Stretches of time that the recording is cut into by default."""
 FEWEST_BLOCKS = 3
 STANDARD_ERRORS = 2.0
-"""Differences below this many standard errors tell nothing."""
+"""Differences below this many standard errors are not significant."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called as progress(candidate, restart, iteration, objective)."""
@@ -81,7 +84,7 @@ class PriorScore:
 
 @dataclass(frozen=True, kw_only=True)
 class PriorComparison:
-    """Candidates in the order given, what the data say about them, and the fitted models by name."""
+    """Candidates in the order given, their scores, and the fitted models by name."""
 
     scores: tuple[PriorScore, ...]
     points: int
@@ -97,7 +100,7 @@ class PriorComparison:
 
     @property
     def supported(self) -> tuple[PriorScore, ...]:
-        """The best candidate, and those that the data cannot tell from it, in the order given."""
+        """The best candidate, and those that the data cannot distinguish from it, in the order given."""
         return tuple(score for score in self.scores if score.is_as_good_as_the_best)
 
     @property
@@ -116,13 +119,13 @@ class PriorComparison:
                 f"The data support {preferred.name}: it predicts {stretches} better than {second.name} does, by "
                 f"{-second.difference:.3g} nats per row (standard error {second.standard_error:.2g})."
             )
-        told = f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart in {stretches}"
+        tied = f"{', '.join(names[:-1])} and {names[-1]} cannot be distinguished in {stretches}"
         if len({(score.latents, score.parameters) for score in self.supported}) == 1:
-            return f"{told}, and have equally many parameters; {preferred.name} did best by a little."
+            return f"{tied}, and have equally many parameters; {preferred.name} did best by a little."
         if len({score.latents for score in self.supported}) == 1:
-            return f"{told}, and have equally many latent functions; {preferred.name} has the fewest parameters."
+            return f"{tied}, and have equally many latent functions; {preferred.name} has the fewest parameters."
         noun = "function" if preferred.latents == 1 else "functions"
-        return f"{told}; {preferred.name} is the simplest, with {preferred.latents} latent {noun}."
+        return f"{tied}; {preferred.name} is the simplest, with {preferred.latents} latent {noun}."
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the models, as plain JSON values."""
@@ -214,11 +217,11 @@ def _compared(
     sizes = np.array([len(block) for block in blocks], dtype=np.float64)
     densities = {name: posterior.leave_out(blocks).log_density.numpy() for name, posterior in posteriors.items()}
     best = max(densities.values(), key=lambda density: float(density.sum()))
-    scores, told = [], []
+    scores, notes = [], []
     for name, posterior in posteriors.items():
         difference, error = paired_difference(densities[name], best, sizes)
         evaluation = None if test is None else evaluate(posterior, test)
-        told += [] if evaluation is None else evaluation.warnings
+        notes += [] if evaluation is None else evaluation.warnings
         scores.append(
             PriorScore(
                 name=name,
@@ -239,7 +242,7 @@ def _compared(
         points=int(sizes.sum()),
         blocks=len(blocks),
         block_seconds=float(seconds),
-        warnings=tuple(dict.fromkeys(told)),
+        warnings=tuple(dict.fromkeys(notes)),
         posteriors=dict(posteriors),
     )
 
@@ -285,7 +288,7 @@ def _note(progress: Progress, name: str) -> Callable[[int, int, float], None]:
 
 
 def _named(name: str, make: Callable[[], Any]) -> Any:
-    """What `make` returns; an error tells which candidate it is about."""
+    """What `make` returns; an error names the candidate."""
     try:
         return make()
     except ForceGPError as error:

@@ -100,7 +100,7 @@ def _against_truth(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]
 def _forces(
     name: str, per: str, mean: np.ndarray | None, variance: np.ndarray | None, truth: np.ndarray
 ) -> dict[str, Numbers]:
-    """Scores of a force; none where the model does not speak of it, or of another number of contacts."""
+    """Scores of a force; none where the model lacks it, or of another number of contacts."""
     if mean is None or variance is None or mean.shape != truth.shape:
         return {}
     return {

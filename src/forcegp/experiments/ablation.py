@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments import published
-from forcegp.experiments.ablation_cells import PAPER_STEPS, SCHEDULES
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
+from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.jobs import Job, JobStore
 
 OURS = "ours"
 FILTERED_MODELS = ("s-gp-mean",)
@@ -44,12 +42,12 @@ class Ablation(Experiment):
         return max(self.points)
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         tolerance = self.settings.of(self.largest)["tolerance"]
         shared = {"points": self.largest, "iterations": self.settings.iterations, "tolerance": tolerance}
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             out.append(data)
             base = {**shared, "data": data.name, "seed": seed}
             for model in GAUSSIAN_PROCESSES:
@@ -59,9 +57,9 @@ class Ablation(Experiment):
                     spec = {**base, "model": model, "schedule": schedule, "steps": self.steps}
                     cost = fit_cost(model, self.largest, {"restarts": 4, "iterations": self.settings.iterations})
                     out.append(
-                        Cell(
+                        Job(
                             _schedule_name(model, schedule, seed),
-                            "forcegp.experiments.ablation_cells:search",
+                            "forcegp.experiments.ablation_jobs:search",
                             spec,
                             (data.name,),
                             cost,
@@ -72,9 +70,9 @@ class Ablation(Experiment):
                     spec = {**base, "model": model, "cutoff": cutoff, "train_seconds": self.data.train_seconds}
                     cost = 15.0 + fit_cost(model, self.largest, {"restarts": 1, "iterations": self.settings.iterations})
                     out.append(
-                        Cell(
+                        Job(
                             _filter_name(model, cutoff, seed),
-                            "forcegp.experiments.ablation_cells:filtered",
+                            "forcegp.experiments.ablation_jobs:filtered",
                             spec,
                             (data.name,),
                             cost,
@@ -84,28 +82,28 @@ class Ablation(Experiment):
                 fit = fit_name(model, self.largest, seed)
                 spec = {"fit": fit, "data": data.name, "seed": seed, "train_seconds": self.data.train_seconds}
                 out.append(
-                    Cell(
+                    Job(
                         f"ablation/overlap/{model}/seed{seed}",
-                        "forcegp.experiments.ablation_cells:overlap",
+                        "forcegp.experiments.ablation_jobs:overlap",
                         spec,
                         (fit,),
                         20.0,
                     )
                 )
-        spec = {**shared, "data": self.data.cell(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
+        spec = {**shared, "data": self.data.job(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
         out.append(
-            Cell("ablation/dense", "forcegp.experiments.ablation_cells:dense", spec, (spec["data"],), 0.5 * self.steps)
+            Job("ablation/dense", "forcegp.experiments.ablation_jobs:dense", spec, (spec["data"],), 0.5 * self.steps)
         )
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         schedules: dict[str, Any] = {}
         for model in GAUSSIAN_PROCESSES:
             found = {OURS: [results.result(fit_name(model, self.largest, seed)) for seed in self.seeds]}
             for schedule in SCHEDULES:
                 found[schedule] = [results.result(_schedule_name(model, schedule, seed)) for seed in self.seeds]
-            schedules[model] = {name: self._scores(cells) for name, cells in found.items()}
+            schedules[model] = {name: self._scores(jobs) for name, jobs in found.items()}
         filters = {
             model: {
                 "none" if cutoff is None else f"{cutoff:g}": self._scores(
@@ -117,22 +115,25 @@ class Ablation(Experiment):
         }
         overlap = {}
         for model in OVERLAP_MODELS:
-            cells = [results.result(f"ablation/overlap/{model}/seed{seed}") for seed in self.seeds]
+            jobs = [results.result(f"ablation/overlap/{model}/seed{seed}") for seed in self.seeds]
             other = [results.result(fit_name(model, self.largest, seed))["evaluation"] for seed in self.seeds]
             overlap[model] = {
-                name: spread(cell[name] for cell in cells) for name in ("mae", "mae_noise_free", "shared")
+                name: median_and_range(job[name] for job in jobs) for name in ("mae", "mae_noise_free", "shared")
             }
-            overlap[model]["mae_other"] = spread(cell["mae"] for cell in other)
-            overlap[model]["mae_noise_free_other"] = spread(cell["mae_noise_free"] for cell in other)
+            overlap[model]["mae_other"] = median_and_range(job["mae"] for job in other)
+            overlap[model]["mae_noise_free_other"] = median_and_range(job["mae_noise_free"] for job in other)
         summary = {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
         return summary | {"dense": results.result("ablation/dense")}
 
     @staticmethod
-    def _scores(cells: list[dict[str, Any]]) -> dict[str, Any]:
-        evaluations = [cell["evaluation"] for cell in cells]
-        scores = {name: spread(each[name] for each in evaluations) for name in ("mae", "mae_noise_free", "coverage_95")}
-        scores["nll"] = spread(cell["nll"] for cell in cells) if "nll" in cells[0] else None
-        scores["noise_std"] = spread(each["noise_std"] for each in evaluations)
+    def _scores(jobs: list[dict[str, Any]]) -> dict[str, Any]:
+        evaluations = [job["evaluation"] for job in jobs]
+        scores = {
+            name: median_and_range(each[name] for each in evaluations)
+            for name in ("mae", "mae_noise_free", "coverage_95")
+        }
+        scores["nll"] = median_and_range(job["nll"] for job in jobs) if "nll" in jobs[0] else None
+        scores["noise_std"] = median_and_range(each["noise_std"] for each in evaluations)
         return scores
 
     @override
@@ -148,7 +149,7 @@ class Ablation(Experiment):
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {}
 
     @override
@@ -169,9 +170,9 @@ class Ablation(Experiment):
         rows = []
         for model, variants in summary["schedules"].items():
             paper = "–" if place is None else f"{published.FIG2B_MAE[model][place]:.4f}"
-            rows.append([MODELS[model].label, paper, *(shown(variants[name]["mae"]) for name in columns)])
+            rows.append([MODELS[model].label, paper, *(formatted(variants[name]["mae"]) for name in columns)])
         likelihoods = [
-            [MODELS[model].label, *(shown(variants[name]["nll"], 0) for name in SCHEDULES)]
+            [MODELS[model].label, *(formatted(variants[name]["nll"], 0) for name in SCHEDULES)]
             for model, variants in summary["schedules"].items()
         ]
         return (
@@ -205,15 +206,15 @@ class Ablation(Experiment):
             name: "no filter" if name == "none" else f"{name} Hz" for name in next(iter(summary["filters"].values()))
         }
         rows = [
-            [MODELS[model].label, *(f"{shown(variants[n]['mae_noise_free'])}" for n in names)]
+            [MODELS[model].label, *(f"{formatted(variants[n]['mae_noise_free'])}" for n in names)]
             for model, variants in summary["filters"].items()
         ]
         noise = [
-            [f"{MODELS[model].label}: learned noise std", *(shown(variants[n]["noise_std"], 3) for n in names)]
+            [f"{MODELS[model].label}: learned noise std", *(formatted(variants[n]["noise_std"], 3) for n in names)]
             for model, variants in summary["filters"].items()
         ]
         return (
-            "**Is the acceleration filtered?** The text speaks of a low-pass filter, the reference implementation has "
+            "**Is the acceleration filtered?** The text mentions a low-pass filter, the reference implementation has "
             "none. A zero-phase Butterworth filter (order 4) on the noisy training accelerations before rows are "
             "chosen, noise level learned, one start; MAE against the noise-free accelerations [rad/s²]:\n\n"
             + markdown_table(["model", *names.values()], [*rows, *noise])
@@ -223,8 +224,8 @@ class Ablation(Experiment):
         rows = [
             [
                 MODELS[model].label,
-                shown(scores["shared"], 3),
-                *(shown(scores[name]) for name in ("mae", "mae_other", "mae_noise_free", "mae_noise_free_other")),
+                formatted(scores["shared"], 3),
+                *(formatted(scores[name]) for name in ("mae", "mae_other", "mae_noise_free", "mae_noise_free_other")),
             ]
             for model, scores in summary["overlap"].items()
         ]
@@ -240,7 +241,7 @@ class Ablation(Experiment):
         return (
             f"**What can be reached?** With noise of {published.NOISE_STD} rad/s² a perfect model has an MAE of "
             "0.1 √(2/π) = 0.0798 against noisy accelerations. Close to it, the noise-free error, which is in the "
-            "tables of figure 2b, too, tells more."
+            "tables of figure 2b, too, shows more."
         )
 
 

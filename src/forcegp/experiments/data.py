@@ -1,4 +1,4 @@
-"""The data of the experiments: trajectories of `kuka-surface`, thinned by farthest-point sampling, kept as cells."""
+"""The data of the experiments: trajectories of `kuka-surface`, thinned by farthest-point sampling, kept as jobs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
 SIMULATION_COST = 0.1
@@ -19,11 +19,11 @@ TEST_SEED = 1000
 """The test trajectory of seed k has seed k + 1000: other way-points, another noise."""
 
 
-def data_cell(seed: int, *, train_seconds: float, rows: int, test_seconds: float, every: int) -> Cell:
+def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float, every: int) -> Job:
     """`rows` training rows of one trajectory, in the order of farthest-point sampling, and a test trajectory.
 
     A model that is trained on N points takes the first N rows, as in the paper. The test trajectory is kept whole (for
-    roll-outs); `every` says which of its rows are scored.
+    roll-outs); `every` sets which of its rows are scored.
     """
     spec = {
         "seed": seed,
@@ -33,13 +33,11 @@ def data_cell(seed: int, *, train_seconds: float, rows: int, test_seconds: float
         "every": every,
     }
     cost = SIMULATION_COST * (train_seconds + test_seconds) + 2e-5 * rows * train_seconds
-    return Cell(f"data/seed{seed}", "forcegp.experiments.data:simulate", spec, cost=cost)
+    return Job(f"data/seed{seed}", "forcegp.experiments.data:simulate", spec, cost=cost)
 
 
-def simulate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Simulate both trajectories and keep them. Raises InvalidInput where more rows are wanted than there are."""
-    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-
     everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
     if spec["rows"] > len(everything):
         raise InvalidInput(
@@ -53,9 +51,9 @@ def simulate(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[st
     return {"train_rows_available": len(everything), "train_rows": len(train), "test_rows": len(test)}
 
 
-def training_rows(results: Results, data: str, points: int | None) -> Dataset:
-    """The first `points` rows of a data cell, or all. Raises InvalidInput if there are fewer."""
-    train = Dataset.load(results.cell_folder(data) / TRAIN)
+def training_rows(results: JobStore, data: str, points: int | None) -> Dataset:
+    """The first `points` rows of a data job, or all. Raises InvalidInput if there are fewer."""
+    train = Dataset.load(results.place(data) / TRAIN)
     if points is None:
         return train
     if points > len(train):
@@ -63,11 +61,11 @@ def training_rows(results: Results, data: str, points: int | None) -> Dataset:
     return train.rows(slice(points))
 
 
-def test_trajectory(results: Results, data: str) -> Dataset:
-    """The whole test trajectory of a data cell, in the order of time."""
-    return Dataset.load(results.cell_folder(data) / TEST)
+def test_trajectory(results: JobStore, data: str) -> Dataset:
+    """The whole test trajectory of a data job, in the order of time."""
+    return Dataset.load(results.place(data) / TEST)
 
 
-def scored_rows(results: Results, data: str) -> Dataset:
+def scored_rows(results: JobStore, data: str) -> Dataset:
     """The rows of the test trajectory that scores are computed from."""
     return test_trajectory(results, data).rows(slice(None, None, results.load(data)["spec"]["every"]))

@@ -1,22 +1,21 @@
-"""How few points a prior that knows where the force acts needs, on the paper's own task and beyond its data."""
+"""How few points a prior on the force at its point of action needs, on the paper's own task and beyond its data."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.plots.style import QUIET, SERIES, SMALL, new_figure, quiet
+from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments import published
-from forcegp.experiments.experiment import shown
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_tables import only_test, plain_ticks, score_table
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.jobs import JobStore
 
 PRIORS = {
     "joint forces on (q, v, u), the paper's": "joint",
@@ -41,9 +40,7 @@ class DataEfficiency(ForceExperiment):
         return [*curves, *region]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.evaluation.figure_style import QUIET, SERIES, SMALL, new_figure, quiet
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         figure = new_figure(8.6, 3.8)
         panels = figure.subplots(1, 2)
         for axes, score, heading in zip(
@@ -81,7 +78,7 @@ class DataEfficiency(ForceExperiment):
             [
                 f"The paper's scenario, analytical mean, {len(self.seeds)} seeds. The paper's best model has an MAE of "
                 f"{best} with 1000 points. A perfect one has the mean of the noise: 0.0798 in the long run, on these "
-                f"test rows {shown(only_test(inside[0]).get('mae_of_truth'))}.",
+                f"test rows {formatted(only_test(inside[0]).get('mae_of_truth'))}.",
                 score_table(inside, columns),
                 "**Extrapolation**: trained on rows with the tool at x < 0, tested at x > 0.1 m.",
                 score_table(outside, columns[:4]),

@@ -1,4 +1,4 @@
-"""Where a deep kernel helps and where it does not, and that leaving rows out tells so beforehand."""
+"""Where a deep kernel helps and where it does not, and whether leaving rows out predicts it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.experiments.experiment import shown
+from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_scenarios import LABELS
 from forcegp.experiments.force_tables import score_table
@@ -47,7 +47,7 @@ class DeepKernel(ForceExperiment):
         columns = ("mae_noise_free", "nlpd", "coverage_95")
         for scenario in SCENARIOS:
             trials = [trial for trial in summary["trials"] if trial["scenario"] == scenario]
-            densities = [f"{t['label']}, N={t['points']}: {shown(t['leave_one_out'], 3)}" for t in trials]
+            densities = [f"{t['label']}, N={t['points']}: {formatted(t['leave_one_out'], 3)}" for t in trials]
             heading = LABELS[scenario][0].upper() + LABELS[scenario][1:]
             parts += [f"**{heading}**", score_table(trials, columns), f"Leave-one-out: {'; '.join(densities)}."]
         return "\n\n".join(parts)

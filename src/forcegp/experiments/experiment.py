@@ -1,4 +1,4 @@
-"""What every experiment is: a typed configuration that knows its cells, its summary, its figures and its words."""
+"""What every experiment is: a typed configuration with its jobs, its summary, its figures and its text."""
 
 from __future__ import annotations
 
@@ -6,19 +6,13 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
+
+from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.spreads import markdown_table as markdown_table
-from forcegp.evaluation.spreads import number as number
-from forcegp.evaluation.spreads import shown as shown
-from forcegp.evaluation.spreads import spread as spread
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.data import data_cell
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.data import data_job
+from forcegp.jobs import Job, JobStore
 
 Row = dict[str, str | int | float | None]
 
@@ -32,9 +26,9 @@ class DataSettings:
     test_seconds: float
     every: int
 
-    def cell(self, seed: int) -> Cell:
-        """The cell with the trajectories of this seed."""
-        return data_cell(seed, **dataclasses.asdict(self))
+    def job(self, seed: int) -> Job:
+        """The job with the trajectories of this seed."""
+        return data_job(seed, **dataclasses.asdict(self))
 
 
 @dataclass(frozen=True)
@@ -70,19 +64,19 @@ class Experiment(ABC):
                 )
 
     @abstractmethod
-    def cells(self) -> list[Cell]:
-        """Everything that has to be computed, with the cells that several experiments share."""
+    def jobs(self) -> list[Job]:
+        """Everything that has to be computed, with the jobs that several experiments share."""
 
     @abstractmethod
-    def summary(self, results: Results) -> dict[str, Any]:
-        """What the finished cells say, as plain JSON values."""
+    def summary(self, results: JobStore) -> dict[str, Any]:
+        """The results of the finished jobs, as plain JSON values."""
 
     @abstractmethod
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
         """The summary as a flat table, for CSV."""
 
     @abstractmethod
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         """File name without ending -> figure."""
 
     @abstractmethod

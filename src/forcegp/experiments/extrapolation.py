@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
-from forcegp.experiments.extrapolation_cells import REGIONS, SIDES, TEST_X, TRAIN_X
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.extrapolation import extrapolation_figure
+from forcegp.jobs import Job, JobStore
 
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
 TARGETS = {
@@ -41,15 +40,15 @@ class Extrapolation(Experiment):
     models: tuple[str, ...] = (*NETWORKS, *GAUSSIAN_PROCESSES, *ANALYTICAL)
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             out.append(data)
             out.append(
-                Cell(
+                Job(
                     _scale_name(seed),
-                    "forcegp.experiments.extrapolation_cells:scale",
+                    "forcegp.experiments.extrapolation_jobs:scale",
                     {"data": data.name},
                     (data.name,),
                     3.0,
@@ -61,28 +60,29 @@ class Extrapolation(Experiment):
                     settings = self.settings.of_network() if model in NETWORKS else self.settings.of(self.points)
                     spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
                     cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
-                    cell = Cell(
+                    job = Job(
                         _fit_name(model, region, seed),
-                        "forcegp.experiments.extrapolation_cells:fit",
+                        "forcegp.experiments.extrapolation_jobs:fit",
                         spec | settings,
                         (data.name,),
                         cost,
                     )
-                    out.append(cell)
+                    out.append(job)
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         regions: dict[str, Any] = {}
         for region in REGIONS:
             regions[region] = {}
             for model in self.models:
                 found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
                 regions[region][model] = {
-                    side: {score: spread(cell[side][score] for cell in found) for score in SCORES} for side in SIDES
-                } | {"points": spread(cell["points"] for cell in found)}
+                    side: {score: median_and_range(job[side][score] for job in found) for score in SCORES}
+                    for side in SIDES
+                } | {"points": median_and_range(job["points"] for job in found)}
         scales = [results.result(_scale_name(seed)) for seed in self.seeds]
-        scale = {name: spread(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
+        scale = {name: median_and_range(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
         return {"points": self.points, "regions": regions, "scale": scale}
 
     @override
@@ -100,9 +100,7 @@ class Extrapolation(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.extrapolation_plot import extrapolation_figure
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {"extrapolation": extrapolation_figure(summary)}
 
     @override
@@ -119,18 +117,20 @@ class Extrapolation(Experiment):
             rows = []
             for model, scores in summary["regions"][region].items():
                 outside = scores["outside"]
-                shares = [shown(outside["nlpd"], 1), shown(outside["coverage_95"], 3)]
-                errors = [shown(scores[side]["mae_noise_free"]) for side in SIDES]
+                shares = [formatted(outside["nlpd"], 1), formatted(outside["coverage_95"], 3)]
+                errors = [formatted(scores[side]["mae_noise_free"]) for side in SIDES]
                 points = f"{scores['points']['median']:.0f}"
-                rows.append([MODELS[model].label, points, *errors, *shares, shown(outside["constraint_error"])])
+                rows.append([MODELS[model].label, points, *errors, *shares, formatted(outside["constraint_error"])])
             parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table(header, rows)]
         scale = summary["scale"]
         parts.append(
             "What each model was left to learn, root mean square over training rows. A Gaussian process falls back to "
             "zero away from its data, so this is the size that its errors can reach there; a force error reaches the "
-            f"acceleration through H, whose largest entry on these data is {shown(scale['largest_H'], 0)} /(kg m²)."
+            f"acceleration through H, whose largest entry on these data is {formatted(scale['largest_H'], 0)} /(kg m²)."
         )
-        parts.append(markdown_table(["what", "size"], [[text, shown(scale[key], 2)] for key, text in TARGETS.items()]))
+        parts.append(
+            markdown_table(["what", "size"], [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()])
+        )
         return "\n\n".join(parts)
 
 

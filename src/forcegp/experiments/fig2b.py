@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range
 from forcegp.experiments import published
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, shown, spread
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
 from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.learning_curves import learning_curves_figure
+from forcegp.jobs import Job, JobStore
 
 SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
 HEADINGS = {
@@ -50,13 +49,13 @@ class Fig2b(Experiment):
         return self.seeds if points <= self.few_points else self.seeds_many_points
 
     @override
-    def cells(self) -> list[Cell]:
-        data = {seed: self.data.cell(seed) for seed in sorted({*self.seeds, *self.seeds_many_points})}
+    def jobs(self) -> list[Job]:
+        data = {seed: self.data.job(seed) for seed in sorted({*self.seeds, *self.seeds_many_points})}
         out = list(data.values())
         for model in self.models:
-            for seed, cell in data.items():
+            for seed, job in data.items():
                 points = [count for count in self.points if seed in self.seeds_of(count)]
-                out += fit_series(model, cell.name, seed, points, self.settings)
+                out += fit_series(model, job.name, seed, points, self.settings)
         for model in self.on_all_rows:
             out += [fit_to_all(model, data[seed].name, seed, self.settings) for seed in self.seeds_many_points]
         return out
@@ -70,21 +69,23 @@ class Fig2b(Experiment):
         ]
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         curves: dict[str, Any] = {}
         for model in self.models:
             curves[model] = {}
             for count in self.points:
                 found = [results.result(fit_name(model, count, seed)) for seed in self.seeds_of(count)]
-                scores = [{**cell["evaluation"], "cpu_seconds": cell["search"]["cpu_seconds"]} for cell in found]
-                curves[model][str(count)] = {name: spread(score[name] for score in scores) for name in SCORES} | {
-                    "converged": sum(cell["search"]["converged"] for cell in found),
+                scores = [{**job["evaluation"], "cpu_seconds": job["search"]["cpu_seconds"]} for job in found]
+                curves[model][str(count)] = {
+                    name: median_and_range(score[name] for score in scores) for name in SCORES
+                } | {
+                    "converged": sum(job["search"]["converged"] for job in found),
                     "seeds": len(found),
                 }
         many = {}
         for model in self.on_all_rows:
             found = [results.result(all_name(model, seed))["evaluation"] for seed in self.seeds_many_points]
-            many[model] = {name: spread(score[name] for score in found) for name in SCORES[:-1]}
+            many[model] = {name: median_and_range(score[name] for score in found) for name in SCORES[:-1]}
         floor = results.result(fit_name(self.models[0], self.points[0], self.seeds[0]))["evaluation"]["noise_floor"]
         return {"curves": curves, "all_rows": {"rows": self.data.rows, "models": many}, "noise_floor": floor}
 
@@ -103,9 +104,7 @@ class Fig2b(Experiment):
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.learning_curves import learning_curves_figure
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {"fig2b": learning_curves_figure(summary)}
 
     @override
@@ -126,7 +125,7 @@ class Fig2b(Experiment):
                     rows.append([f"{MODELS[model].label}, paper", *cells])
                 label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
                 digits = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}.get(score, 4)
-                rows.append([label, *(shown(scores[score], digits) for scores in curve.values())])
+                rows.append([label, *(formatted(scores[score], digits) for scores in curve.values())])
             parts += [f"**{HEADINGS[score]}**", markdown_table(["N", *map(str, self.points)], rows)]
         unconverged = [
             f"{MODELS[model].label} N = {count}: {scores['converged']} of {scores['seeds']}"
@@ -143,7 +142,7 @@ class Fig2b(Experiment):
         for model, scores in summary["all_rows"]["models"].items():
             paper = published.MAE_10000.get(model)
             digits = {"nlpd": 2, "coverage_95": 3}
-            cells = [shown(scores[name], digits.get(name, 4)) for name in SCORES[:-1]]
+            cells = [formatted(scores[name], digits.get(name, 4)) for name in SCORES[:-1]]
             rows.append([MODELS[model].label, "–" if paper is None else f"{paper:.2f}", *cells])
         header = ["model", "MAE, paper", "MAE", "noise-free", "\\|A a − b\\|", "NLPD", "coverage"]
         parts.append(markdown_table(header, rows))

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, shown, spread
-from forcegp.experiments.fig2c_cells import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.fits import fit_cost
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.estimation import estimation_figure
+from forcegp.jobs import Job, JobStore
 
 AXES = ("com.x", "com.y", "com.z")
 
@@ -36,8 +35,8 @@ class Fig2c(Experiment):
     tolerance: float
 
     @override
-    def cells(self) -> list[Cell]:
-        data = {seed: self.data.cell(seed) for seed in sorted({self.seed, *self.seeds})}
+    def jobs(self) -> list[Job]:
+        data = {seed: self.data.job(seed) for seed in sorted({self.seed, *self.seeds})}
         out = list(data.values())
         search = {"iterations": self.iterations, "tolerance": self.tolerance}
         for model in MODELS:
@@ -46,16 +45,16 @@ class Fig2c(Experiment):
                 spec = {"model": model, "mean": mean, "data": where, "points": self.points, **search}
                 cost = 10.0 + fit_cost("s-gp", self.points, {"restarts": 1, **search}) * (model == "s-gp")
                 name = _trace_name(model, mean)
-                out.append(Cell(name, "forcegp.experiments.fig2c_cells:trace", spec, (where,), cost))
+                out.append(Job(name, "forcegp.experiments.fig2c_jobs:trace", spec, (where,), cost))
         for seed in self.seeds:
             spec = {"data": data[seed].name, "points": self.points_interval, **search}
             cost = 3.0 * fit_cost("s-gp", self.points_interval, {"restarts": 1, **search})
-            task = "forcegp.experiments.fig2c_cells:estimate"
-            out.append(Cell(_estimate_name(seed), task, spec, (data[seed].name,), cost))
+            task = "forcegp.experiments.fig2c_jobs:estimate"
+            out.append(Job(_estimate_name(seed), task, spec, (data[seed].name,), cost))
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         traces = {model: {mean: results.result(_trace_name(model, mean)) for mean in MEANS} for model in MODELS}
         for model in traces.values():
             for trace in model.values():
@@ -65,8 +64,8 @@ class Fig2c(Experiment):
         intervals = {
             name: {
                 "inside": sum(_inside(each["error"][name], each["std"][name]) for each in estimates),
-                "error": spread(abs(each["error"][name]) for each in estimates),
-                "std": spread(each["std"][name] for each in estimates),
+                "error": median_and_range(abs(each["error"][name]) for each in estimates),
+                "std": median_and_range(each["std"][name] for each in estimates),
             }
             for name in names
         }
@@ -91,9 +90,7 @@ class Fig2c(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.estimation_plot import estimation_figure
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {"fig2c": estimation_figure(summary)}
 
     @override
@@ -103,7 +100,7 @@ class Fig2c(Experiment):
             for mean, trace in means.items():
                 last = [number(trace[name][-1]) for name in ("mass_error", "center_error", "mae")]
                 found = "never" if trace["found_at"] is None else str(trace["found_at"])
-                std = [shown(trace["std"]["mass"]), " ".join(shown(trace["std"][axis]) for axis in AXES)]
+                std = [formatted(trace["std"]["mass"]), " ".join(formatted(trace["std"][axis]) for axis in AXES)]
                 iterations = f"{len(trace['mass_error']) - 1}{'' if trace['converged'] else ' (limit)'}"
                 rows.append([f"{MODELS[model]}, {MEANS[mean]}", iterations, found, *last[:2], *std, last[2]])
         header = [
@@ -117,7 +114,7 @@ class Fig2c(Experiment):
             "MAE [rad/s²]",
         ]
         intervals = [
-            [name, shown(entry["error"]), shown(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
+            [name, formatted(entry["error"]), formatted(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
             for name, entry in summary["intervals"].items()
         ]
         start = summary["traces"]["s-gp"]["analytical"]

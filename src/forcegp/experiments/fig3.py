@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.experiments.cells import Cell
+from forcegp.evaluation.metrics import interval_coverage
+from forcegp.evaluation.summary_statistics import markdown_table, number
 from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import MODEL, FitSettings, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.prediction_window import prediction_window_figure
+from forcegp.jobs import Job, JobStore
+from forcegp.models import load_posterior
 
 ARRAYS = "prediction.npz"
 
@@ -40,20 +41,20 @@ class Fig3(Experiment):
     models: tuple[str, ...] = GAUSSIAN_PROCESSES
 
     @override
-    def cells(self) -> list[Cell]:
-        data = self.data.cell(self.seed)
+    def jobs(self) -> list[Job]:
+        data = self.data.job(self.seed)
         out = [data]
         for model in self.models:
             series = fit_series(model, data.name, self.seed, list(self.points), self.settings)
             spec = {"fit": series[-1].name, "data": data.name, "start": self.start, "seconds": self.seconds}
-            out += [*series, Cell(self._name(model), "forcegp.experiments.fig3:predict", spec, (series[-1].name,), 3.0)]
+            out += [*series, Job(self._name(model), "forcegp.experiments.fig3:predict", spec, (series[-1].name,), 3.0)]
         return out
 
     def _name(self, model: str) -> str:
         return f"fig3/{fit_name(model, max(self.points), self.seed).removeprefix('fits/')}"
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         models = {model: results.result(self._name(model)) for model in self.models}
         return {"points": max(self.points), "seed": self.seed, "models": models}
 
@@ -65,12 +66,10 @@ class Fig3(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.prediction_window_plot import prediction_window_figure
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         arrays = {}
         for model in self.models:
-            with np.load(results.cell_folder(self._name(model)) / ARRAYS) as stored:
+            with np.load(results.place(self._name(model)) / ARRAYS) as stored:
                 arrays[model] = dict(stored)
         return {"fig3": prediction_window_figure(arrays)}
 
@@ -94,12 +93,9 @@ class Fig3(Experiment):
         return f"{text}\n\n{markdown_table(header, rows)}"
 
 
-def predict(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def predict(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Predict every row of the window and keep mean, deviations, truth and measurement."""
-    from forcegp.evaluation.metrics import interval_coverage
-    from forcegp.models import load_posterior
-
-    posterior = load_posterior(results.cell_folder(spec["fit"]) / MODEL)
+    posterior = load_posterior(results.place(spec["fit"]) / MODEL)
     trajectory = test_trajectory(results, spec["data"])
     elapsed = trajectory.time - trajectory.time[0]
     chosen = (elapsed >= spec["start"]) & (elapsed <= spec["start"] + spec["seconds"])

@@ -1,4 +1,4 @@
-"""Figure 4: where the models say that the robot goes, from the same initial states, over seconds."""
+"""Figure 4: motions that the models predict, from the same initial states, over seconds."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, markdown_table, number, spread
-from forcegp.experiments.fig4_cells import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
+from forcegp.evaluation.summary_statistics import markdown_table, median_and_range, number
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.experiments.plots.rollouts import rollouts_figure
+from forcegp.jobs import Job, JobStore
 
 BLACK_BOXES = ("gp", "neural-network")
 WITHOUT_CONSTRAINT = ("none", "projected")
-"""Variants of models that know no constraint, and so cannot be stabilised by it."""
+"""Variants of models without a constraint, and so cannot be stabilised by it."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +41,13 @@ class Fig4(Experiment):
     models: tuple[str, ...] = (*BLACK_BOXES, *GAUSSIAN_PROCESSES[1:])
 
     @override
-    def cells(self) -> list[Cell]:
-        out: list[Cell] = []
+    def jobs(self) -> list[Job]:
+        out: list[Job] = []
         for seed in self.seeds:
-            data = self.data.cell(seed)
+            data = self.data.job(seed)
             rolled = {"data": data.name, "starts": self.starts, "seconds": list(self.seconds)}
-            task = "forcegp.experiments.fig4_cells"
-            out += [data, Cell(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
+            task = "forcegp.experiments.fig4_jobs"
+            out += [data, Job(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
             for model in self.models:
                 if model == "neural-network":
                     series = [fit_to_all(model, data.name, seed, self.settings)]
@@ -59,11 +58,11 @@ class Fig4(Experiment):
                 for control in CONTROLS:
                     for variant in variants_of(model):
                         spec = {**rolled, "fit": fit, "control": control, "variant": variant}
-                        out.append(Cell(_name(control, variant, model, seed), f"{task}:roll", spec, (fit,), 10.0))
+                        out.append(Job(_name(control, variant, model, seed), f"{task}:roll", spec, (fit,), 10.0))
         return out
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         motions: dict[str, Any] = {
             control: {
                 variant: {
@@ -88,12 +87,12 @@ class Fig4(Experiment):
 
     def _together(self, found: list[dict[str, Any]]) -> dict[str, Any]:
         """Scores of all seeds' motions as one."""
-        out: dict[str, Any] = {"diverged": sum(cell["diverged"] for cell in found)}
+        out: dict[str, Any] = {"diverged": sum(job["diverged"] for job in found)}
         for second in self.seconds:
-            parts = [cell["scores"][f"{second:g}"] for cell in found]
+            parts = [job["scores"][f"{second:g}"] for job in found]
             out[f"{second:g}"] = {
                 "joint_error": _spread([error for part in parts for error in part["joint_error"]]),
-                "constraint": spread(value for part in parts for value in part["constraint_median"]),
+                "constraint": median_and_range(value for part in parts for value in part["constraint_median"]),
                 "constraint_largest": max(max(part["constraint_largest"]) for part in parts),
             }
         return out
@@ -117,16 +116,14 @@ class Fig4(Experiment):
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.experiments.rollouts_plot import rollouts_figure
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         figures = {}
         for control in CONTROLS:
             arrays: dict[str, dict[str, dict[str, np.ndarray]]] = {variant: {} for variant in VARIANTS}
             for _, variant, model, _ in _each({"motions": {control: summary["motions"][control]}}):
                 parts = []
                 for seed in self.seeds:
-                    with np.load(results.cell_folder(_name(control, variant, model, seed)) / ARRAYS) as stored:
+                    with np.load(results.place(_name(control, variant, model, seed)) / ARRAYS) as stored:
                         parts.append(dict(stored))
                 arrays[variant][model] = {
                     name: parts[0][name] if name == "time" else np.concatenate([part[name] for part in parts])
@@ -154,7 +151,7 @@ class Fig4(Experiment):
                 ["change [rad]", *(f"joint error after {second} s [rad]" for second in seconds)],
                 [[size, *(_error(errors[second]) for second in seconds)] for size, errors in summary["truth"].items()],
             ),
-            "So the open loop, which the paper shows for 1 s, tells about a model only while its own errors have not "
+            "So the open loop, which the paper shows for 1 s, tests a model only while its own errors have not "
             f"grown so. “With feedback” adds M(q recorded) (ω² (q recorded − q) + 2 ω (v recorded − v)) with ω = "
             f"{FREQUENCY:g} rad/s to the recorded torques, the same for every model.",
         ]

@@ -1,4 +1,7 @@
-"""Cells that fit one model to one training set and score it: what most figures are made of."""
+"""Jobs that fit one model to one training set and score it: what most figures are made of.
+
+Fits to more points begin where the fit to fewer ended, because the training sets are nested.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,15 @@ from typing import Any
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.experiments.cells import Cell
+from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.experiments.model_names import MODELS, NETWORKS
-from forcegp.experiments.results import Results
+from forcegp.inference import OptimizerOptions
+from forcegp.jobs import Job, JobStore
+from forcegp.models import load_posterior, save_posterior
 
 MODEL = "model"
-"""The folder of the fitted model inside its cell."""
+"""The folder of the fitted model inside its job."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +39,11 @@ class FitSettings:
     network_steps: int | None = None
 
     def of_network(self) -> dict[str, Any]:
-        """The settings of a network, as a cell's spec holds them; None leaves it its own number of training steps."""
+        """The settings of a network, as a job's spec holds them; None leaves it its own number of training steps."""
         return {} if self.network_steps is None else {"steps": self.network_steps}
 
     def of(self, points: int) -> dict[str, Any]:
-        """The settings for this many points, as a cell's spec holds them."""
+        """The settings for this many points, as a job's spec holds them."""
         return {
             "restarts": _at(self.restarts, points),
             "iterations": self.iterations,
@@ -61,26 +66,24 @@ def all_name(model: str, seed: int) -> str:
     return f"fits/{model}/seed{seed}/all"
 
 
-def fit_series(model: str, data: str, seed: int, points: list[int], settings: FitSettings) -> list[Cell]:
-    """One cell per number of points, each beginning from the hyper-parameters of the one before."""
-    cells: list[Cell] = []
+def fit_series(model: str, data: str, seed: int, points: list[int], settings: FitSettings) -> list[Job]:
+    """One job per number of points, each beginning from the hyper-parameters of the one before."""
+    jobs: list[Job] = []
     for count in sorted(points):
-        before = cells[-1].name if cells else None
+        before = jobs[-1].name if jobs else None
         spec = {"model": model, "data": data, "points": count, "seed": seed, "start": before, **settings.of(count)}
         after = (data,) if before is None else (data, before)
-        cells.append(
-            Cell(
-                fit_name(model, count, seed), "forcegp.experiments.fits:fit", spec, after, fit_cost(model, count, spec)
-            )
+        jobs.append(
+            Job(fit_name(model, count, seed), "forcegp.experiments.fits:fit", spec, after, fit_cost(model, count, spec))
         )
-    return cells
+    return jobs
 
 
-def fit_to_all(model: str, data: str, seed: int, settings: FitSettings) -> Cell:
-    """A network or an analytical model on all training rows of the data cell."""
+def fit_to_all(model: str, data: str, seed: int, settings: FitSettings) -> Job:
+    """A network or an analytical model on all training rows of the data job."""
     spec = {"model": model, "data": data, "points": None, "seed": seed, "start": None}
     spec |= settings.of_network() if model in NETWORKS else {}
-    return Cell(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
+    return Job(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
 
 
 def fit_cost(model: str, points: int, settings: Mapping[str, Any]) -> float:
@@ -89,15 +92,12 @@ def fit_cost(model: str, points: int, settings: Mapping[str, Any]) -> float:
     return 2.0 + settings["restarts"] * min(settings["iterations"], 120) * per_evaluation
 
 
-def fit(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Fit, keep the model, and score it on the test trajectory of the same data cell."""
-    from forcegp.evaluation import evaluate
-    from forcegp.models import load_posterior, save_posterior
-
+def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Fit, keep the model, and score it on the test trajectory of the same data job."""
     train = training_rows(results, spec["data"], spec["points"])
     start = None
     if spec["start"] is not None:
-        start = load_posterior(results.cell_folder(spec["start"]) / MODEL).parameters
+        start = load_posterior(results.place(spec["start"]) / MODEL).parameters
     posterior = fitted(spec, train, start)
     save_posterior(posterior, folder / MODEL)
     scores = evaluate(posterior, scored_rows(results, spec["data"])).to_dict()
@@ -106,8 +106,6 @@ def fit(results: Results, spec: Mapping[str, Any], folder: Path) -> dict[str, An
 
 def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] | None = None) -> Any:
     """The model of `spec` fitted to these rows; "restarts", "iterations" and "tolerance" where its search has them."""
-    from forcegp.inference import OptimizerOptions
-
     kind = MODELS[spec["model"]]
     assert train.system is not None
     model = kind.make(train.system)

@@ -1,24 +1,22 @@
-"""What the experiments on force priors share: trials (a model on a scenario), their cells, and summaries over seeds."""
+"""What the experiments on force priors share: trials (a model on a scenario), their jobs, and summaries over seeds."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.cells import Cell
-from forcegp.experiments.experiment import DataSettings, Experiment, Row, spread
+from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.force_scenarios import SCENARIOS
-from forcegp.experiments.results import Results
+from forcegp.jobs import Job, JobStore
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-TASKS = "forcegp.experiments.force_cells"
+TASKS = "forcegp.experiments.force_jobs"
 TEST_SEED = 1000
 """The test trajectory of seed k has seed k + 1000."""
 
@@ -27,7 +25,7 @@ TEST_SEED = 1000
 class Trial:
     """One model on one scenario.
 
-    prior: expression of `forcegp.priors.named_prior`, or a model of `force_cells`; tests: label -> scenario that the
+    prior: expression of `forcegp.priors.named_prior`, or a model of `force_jobs`; tests: label -> scenario that the
     model is scored on, under that scenario's contacts; region: train at tool x < 0, test at x > 0.1 m.
     """
 
@@ -50,7 +48,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class ForceExperiment(Experiment):
-    """Trials on seeds; a subclass says which trials, and tells what came out."""
+    """Trials on seeds; a subclass defines the trials and describes the results."""
 
     data: DataSettings
     points: tuple[int, ...]
@@ -62,17 +60,15 @@ class ForceExperiment(Experiment):
         """Every model on every scenario."""
 
     @override
-    def cells(self) -> list[Cell]:
-        out: dict[str, Cell] = {}
+    def jobs(self) -> list[Job]:
+        out: dict[str, Job] = {}
         for seed in self.seeds:
             for trial in self.trials():
-                train = self.data_cell(trial.scenario, seed, training=True)
-                tests = {
-                    label: self.data_cell(name, seed, training=False) for label, name in self._tests(trial).items()
-                }
+                train = self.data_job(trial.scenario, seed, training=True)
+                tests = {label: self.data_job(name, seed, training=False) for label, name in self._tests(trial).items()}
                 spec = {
                     "train": train.name,
-                    "tests": {label: cell.name for label, cell in tests.items()},
+                    "tests": {label: job.name for label, job in tests.items()},
                     "prior": trial.prior,
                     "mean": trial.mean,
                     "points": trial.points,
@@ -80,23 +76,23 @@ class ForceExperiment(Experiment):
                     "seed": seed,
                     **self.settings.of(trial.points),
                 }
-                after = (train.name, *(cell.name for cell in tests.values()))
+                after = (train.name, *(job.name for job in tests.values()))
                 cost = 0.3 * fit_cost("s-gp", trial.points, spec)
-                for cell in (train, *tests.values(), Cell(trial_name(trial, seed), f"{TASKS}:fit", spec, after, cost)):
-                    out[cell.name] = cell
+                for job in (train, *tests.values(), Job(trial_name(trial, seed), f"{TASKS}:fit", spec, after, cost)):
+                    out[job.name] = job
         return list(out.values())
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
+    def summary(self, results: JobStore) -> dict[str, Any]:
         return {"points": list(self.points), "trials": [self._summarized(results, trial) for trial in self.trials()]}
 
-    def _summarized(self, results: Results, trial: Trial) -> dict[str, Any]:
+    def _summarized(self, results: JobStore, trial: Trial) -> dict[str, Any]:
         found = [results.result(trial_name(trial, seed)) for seed in self.seeds]
         tests = {}
         for label in self._tests(trial):
-            names = dict.fromkeys(name for cell in found for name in cell["tests"][label])
-            tests[label] = {name: spread(cell["tests"][label].get(name) for cell in found) for name in names}
-        coverages = [curve["coverage"] for cell in found for curve in cell["curves"].values()]
+            names = dict.fromkeys(name for job in found for name in job["tests"][label])
+            tests[label] = {name: median_and_range(job["tests"][label].get(name) for job in found) for name in names}
+        coverages = [curve["coverage"] for job in found for curve in job["curves"].values()]
         return {
             "label": trial.label,
             "scenario": trial.scenario,
@@ -104,12 +100,12 @@ class ForceExperiment(Experiment):
             "points": trial.points,
             "region": trial.region,
             "tests": tests,
-            "curve_coverage": spread(coverages),
-            "curve_coverage_of_seeds": spread(
-                _mean([curve["coverage"] for curve in cell["curves"].values()]) for cell in found if cell["curves"]
+            "curve_coverage": median_and_range(coverages),
+            "curve_coverage_of_seeds": median_and_range(
+                _mean([curve["coverage"] for curve in job["curves"].values()]) for job in found if job["curves"]
             ),
-            "leave_one_out": spread(cell["leave_one_out"] for cell in found),
-            "search_seconds": spread(cell["search"]["cpu_seconds"] for cell in found),
+            "leave_one_out": median_and_range(job["leave_one_out"] for job in found),
+            "search_seconds": median_and_range(job["search"]["cpu_seconds"] for job in found),
         }
 
     @override
@@ -127,13 +123,13 @@ class ForceExperiment(Experiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         return {}
 
     def _tests(self, trial: Trial) -> Mapping[str, str]:
         return trial.tests or {trial.scenario: trial.scenario}
 
-    def data_cell(self, scenario: str, seed: int, *, training: bool) -> Cell:
+    def data_job(self, scenario: str, seed: int, *, training: bool) -> Job:
         """The trajectory of that scenario and seed."""
         spec = {
             "scenario": dict(SCENARIOS[scenario]),
@@ -143,11 +139,11 @@ class ForceExperiment(Experiment):
             "every": self.data.every,
         }
         kind = "train" if training else "test"
-        return Cell(f"force-data/{scenario}/{kind}/seed{seed}", f"{TASKS}:simulate", spec, cost=0.15 * spec["seconds"])
+        return Job(f"force-data/{scenario}/{kind}/seed{seed}", f"{TASKS}:simulate", spec, cost=0.15 * spec["seconds"])
 
 
 def trial_name(trial: Trial, seed: int) -> str:
-    """Where the cell of a trial lies."""
+    """Where the job of a trial lies."""
     return f"force-fits/{trial.name}/seed{seed}"
 
 

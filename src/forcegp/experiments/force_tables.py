@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from forcegp.experiments.experiment import markdown_table, shown
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-if TYPE_CHECKING:
-    from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
+from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
+from forcegp.evaluation.summary_statistics import formatted, markdown_table
 
 COLUMNS = {
     "mae": ("MAE", 4),
@@ -33,7 +34,7 @@ def score_table(trials: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> 
         [
             trial["label"],
             str(trial["points"]),
-            *(shown(scores.get(name), COLUMNS[name][1]) for name in columns),
+            *(formatted(scores.get(name), COLUMNS[name][1]) for name in columns),
         ]
         for trial in trials
         for scores in trial["tests"].values()
@@ -52,8 +53,6 @@ def dots_figure(groups: Mapping[str, Mapping[str, Mapping[str, Any]]], score: st
 
     The first model of a group is what the others are compared with, and grey.
     """
-    from forcegp.evaluation.figure_style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
-
     figure = new_figure(4.8 * len(groups), 0.32 * max(len(scores) for scores in groups.values()) + 1.3)
     panels = figure.subplots(1, len(groups), squeeze=False)[0]
     for axes, (group, scores) in zip(panels, groups.items(), strict=True):
@@ -77,8 +76,6 @@ def dots_figure(groups: Mapping[str, Mapping[str, Mapping[str, Any]]], score: st
 
 def plain_ticks(axis: Axis) -> None:
     """Numbers such as 0.02 and 50 at 1, 2 and 5 times powers of ten of a logarithmic axis."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
     low, high = axis.get_view_interval()
     steps = (1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)
     axis.set_major_locator(LogLocator(subs=steps))

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.experiments.experiment import shown
-from forcegp.experiments.force_cells import MODEL, load
+from forcegp.evaluation import friction_curves_figure, normal_force_figure
+from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
+from forcegp.experiments.force_jobs import MODEL, load
 from forcegp.experiments.force_scenarios import LABELS
 from forcegp.experiments.force_tables import dots_figure, only_test, score_table
-from forcegp.experiments.results import Results
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from forcegp.jobs import JobStore
+from forcegp.models import load_posterior
 
 TOOL = {
     "joint forces (the paper's)": "joint",
@@ -58,10 +58,7 @@ class Friction(ForceExperiment):
         ]
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: Results) -> dict[str, Figure]:
-        from forcegp.evaluation import friction_curves_figure, normal_force_figure
-        from forcegp.models import load_posterior
-
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         groups = {
             LABELS[scenario]: {
                 trial["label"]: only_test(trial) for trial in summary["trials"] if trial["scenario"] == scenario
@@ -70,8 +67,8 @@ class Friction(ForceExperiment):
         }
         (pictured,) = [t for t in self.trials()[:: len(self.points)] if (t.scenario, t.label) == PICTURED]
         seed = self.seeds[0]
-        posterior = load_posterior(results.cell_folder(trial_name(pictured, seed)) / MODEL)
-        test = load(results, self.data_cell(pictured.scenario, seed, training=False).name)
+        posterior = load_posterior(results.place(trial_name(pictured, seed)) / MODEL)
+        test = load(results, self.data_job(pictured.scenario, seed, training=False).name)
         return {
             "friction-errors": dots_figure(groups, "mae_noise_free", "mean absolute error, noise-free [rad/s²]"),
             "friction-curves": friction_curves_figure(posterior, test),
@@ -93,7 +90,7 @@ class Friction(ForceExperiment):
             trials = [trial for trial in summary["trials"] if trial["scenario"] == scenario]
             parts += [f"**{LABELS[scenario][0].upper()}{LABELS[scenario][1:]}**", score_table(trials, columns)]
             curves = [
-                f"{trial['label']} {shown(trial['curve_coverage_of_seeds'], 3)}"
+                f"{trial['label']} {formatted(trial['curve_coverage_of_seeds'], 3)}"
                 for trial in trials
                 if trial["curve_coverage_of_seeds"] is not None
             ]

@@ -21,7 +21,7 @@ def _nothing(system: MechanicalSystem) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class ModelKind:
-    """How a model is called in the paper's figures, how it is made for a system, and what else its fit is told."""
+    """A model's label in the paper's figures, how it is made for a system, and further arguments of its fit."""
 
     label: str
     make: Callable[[MechanicalSystem], Any]

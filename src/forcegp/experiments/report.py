@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from forcegp.experiments.experiment import Experiment, markdown_table
+from forcegp.evaluation.summary_statistics import markdown_table
+from forcegp.experiments.experiment import Experiment
 from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 
 
@@ -30,15 +31,15 @@ def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[st
     return "\n\n".join(parts) + "\n"
 
 
-def _warnings(by_cell: Mapping[str, Sequence[str]]) -> list[str]:
-    """What the computation warned of, with the number of cells and one of them; numbers in the text are that one's."""
+def _warnings(by_job: Mapping[str, Sequence[str]]) -> list[str]:
+    """What the computation warned of, with the number of jobs and one of them; numbers in the text are that one's."""
     kinds: dict[str, list[tuple[str, str]]] = {}
-    for cell, messages in by_cell.items():
+    for job, messages in by_job.items():
         for message in messages:
-            kinds.setdefault(re.sub(r"\d[\d.e+-]*", "#", message), []).append((cell, message))
+            kinds.setdefault(re.sub(r"\d[\d.e+-]*", "#", message), []).append((job, message))
     if not kinds:
         return []
-    lines = [f"* cells: {len(found)}, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
+    lines = [f"* jobs: {len(found)}, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
     return ["Warnings while this was computed:\n\n" + "\n".join(lines)]
 
 
@@ -50,7 +51,7 @@ def _times(machine: str, times: Mapping[str, float]) -> str:
         groups.setdefault(group, []).append(seconds)
     rows = [[group, str(len(each)), f"{max(each):.0f}", f"{sum(each):.0f}"] for group, each in groups.items()]
     text = (
-        f"{sum(times.values()) / 3600:.2f} CPU-hours for {len(times)} cells, on {machine}. A cell includes loading and "
+        f"{sum(times.values()) / 3600:.2f} CPU-hours for {len(times)} jobs, on {machine}. A job includes loading and "
         "scoring, not only the search."
     )
-    return f"{text}\n\n{markdown_table(['cells', 'number', 'longest [CPU s]', 'all [CPU s]'], rows)}"
+    return f"{text}\n\n{markdown_table(['jobs', 'number', 'longest [CPU s]', 'all [CPU s]'], rows)}"

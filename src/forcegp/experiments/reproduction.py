@@ -5,24 +5,23 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from forcegp import __version__
+from forcegp.atomic_files import write_json, write_text
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.evaluation import save_figure
-from forcegp.experiments.cells import Progress, run_cells
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.pages import page_of
 from forcegp.experiments.report import report
-from forcegp.experiments.results import KIND, Results, write_json, write_text
+from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+KIND = "forcegp reproduce"
 
 
 def reproduce(
@@ -38,23 +37,23 @@ def reproduce(
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
     Writes the page (`page_name`) and, in the folder of its name (`page_of`), `<name>.json`, `<name>.csv` and the
-    figures as PNG and SVG, into `out` and, if given, into `docs`, too. `command` is what the page says that it was
-    written by.
+    figures as PNG, into `out` and, if given, into `docs`, too. `command` is the command that the page
+    names as its source.
     Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and as
-    `Results.open` and `run_cells`.
+    `JobStore.open` and `run_jobs`.
     """
     for experiment in experiments:
         experiment.require_possible()
-    results = Results.open(out, preset)
+    results = JobStore.open(out, KIND, {"preset": preset})
     for root in (out, docs) if docs is not None else (out,):
         _make_folder(root / page_of(preset).name)
-    cells = {cell.name: cell for experiment in experiments for cell in experiment.cells()}
-    run_cells(results, list(cells.values()), backend, progress)
+    jobs = {job.name: job for experiment in experiments for job in experiment.jobs()}
+    run_jobs(results, list(jobs.values()), backend, progress)
     documents, pictures, tables = {}, {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)
         figures = experiment.figures(summary, results)
-        stored = {cell.name: results.load(cell.name) for cell in experiment.cells()}
+        stored = {job.name: results.load(job.name) for job in experiment.jobs()}
         documents[experiment.name] = {
             "kind": KIND,
             "forcegp_version": __version__,
@@ -62,9 +61,9 @@ def reproduce(
             "command": command,
             "config": experiment.config(),
             "figures": list(figures),
-            "machines": sorted({cell["machine"] for cell in stored.values()}),
-            "cpu_seconds": {name: cell["cpu_seconds"] for name, cell in stored.items()},
-            "warnings": {name: cell["warnings"] for name, cell in stored.items() if cell["warnings"]},
+            "machines": sorted({job["machine"] for job in stored.values()}),
+            "cpu_seconds": {name: job["cpu_seconds"] for name, job in stored.items()},
+            "warnings": {name: job["warnings"] for name, job in stored.items() if job["warnings"]},
             "summary": summary,
         }
         pictures |= figures
@@ -85,7 +84,6 @@ def _publish(
     beside = root / page_of(preset).name
     for name, figure in pictures.items():
         save_figure(figure, beside / f"{name}.png")
-        save_vector(figure, beside / f"{name}.svg")
     for name, document in documents.items():
         write_json(beside / f"{name}.json", document)
         write_text(beside / f"{name}.csv", tables[name])
@@ -123,16 +121,3 @@ def as_csv(rows: Sequence[Row]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
-
-
-def save_vector(figure: Figure, path: Path) -> None:
-    """SVG under a temporary name, then renamed; equal figures give equal files."""
-    import matplotlib as mpl
-
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        with mpl.rc_context({"svg.hashsalt": "forcegp"}):
-            figure.savefig(temporary, format="svg", metadata={"Date": None})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.experiments.experiment import markdown_table, shown
+from forcegp.evaluation.summary_statistics import formatted, markdown_table
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 
 TOOL = {"plane": "viscous", "tilted plane": "tilted", "sphere": "sphere"}
@@ -56,10 +56,8 @@ class Transfer(ForceExperiment):
             for trial in summary["trials"]:
                 if trial["scenario"] == scenario:
                     home = trial["tests"]["plane"]["mae_noise_free"]
-                    cells = [
-                        f"{shown(scores['mae_noise_free'])} [{scores['mae_noise_free']['median'] / home['median']:.2f}]"
-                        for scores in (trial["tests"][label] for label in tests)
-                    ]
+                    errors = [trial["tests"][label]["mae_noise_free"] for label in tests]
+                    cells = [f"{formatted(error)} [{error['median'] / home['median']:.2f}]" for error in errors]
                     rows.append([trial["label"], str(trial["points"]), *cells])
             parts += [f"**{heading}**", markdown_table(["model", "points", *tests], rows)]
         return "\n\n".join(parts)

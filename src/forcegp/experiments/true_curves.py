@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.models.components import term_slices
+from forcegp.models.structured.components import term_slices
 from forcegp.priors import ContactFriction, JointFriction
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.friction_laws import DryFriction, ViscousFriction
@@ -19,7 +19,7 @@ Law = Callable[[np.ndarray], np.ndarray]
 def true_curves(posterior: Any) -> dict[str, Law]:
     """Latent -> true resisting force over its velocity; latents without a true law of their own are left out.
 
-    Those are priors that do not say what the simulation did, for example a friction that does not grow with the load.
+    Those are priors that differ from the simulation, for example a friction that does not grow with the load.
     """
     system = getattr(posterior.model, "system", None)
     prior = getattr(posterior.model, "prior", None)

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.experiments.experiment import shown, spread
-from forcegp.experiments.force_cells import BLACK_BOX, KNOWN_PHYSICS
+from forcegp.evaluation.summary_statistics import formatted, median_and_range
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
+from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS
 from forcegp.experiments.force_tables import score_table
-from forcegp.experiments.results import Results
+from forcegp.jobs import JobStore
 
 MODELS = {
     "known physics alone": KNOWN_PHYSICS,
@@ -36,9 +36,11 @@ class UnilateralContact(ForceExperiment):
         return [Trial(label, "bullet", prior, points) for label, prior in MODELS.items() for points in self.points]
 
     @override
-    def summary(self, results: Results) -> dict[str, Any]:
-        found = [results.result(self.data_cell("bullet", seed, training=True).name) for seed in self.seeds]
-        shares = {name: spread(cell[name] for cell in found) for name in ("in_contact_truth", "in_contact_detected")}
+    def summary(self, results: JobStore) -> dict[str, Any]:
+        found = [results.result(self.data_job("bullet", seed, training=True).name) for seed in self.seeds]
+        shares = {
+            name: median_and_range(job[name] for job in found) for name in ("in_contact_truth", "in_contact_detected")
+        }
         return super().summary(results) | shares
 
     @override
@@ -47,8 +49,8 @@ class UnilateralContact(ForceExperiment):
         return "\n\n".join(
             [
                 "PyBullet's unilateral contact with Coulomb friction, from which the tool lifts now and then: "
-                f"{shown(summary['in_contact_truth'], 3)} of the rows are in contact, "
-                f"{shown(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
+                f"{formatted(summary['in_contact_truth'], 3)} of the rows are in contact, "
+                f"{formatted(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
                 f"accelerations alone (`forcegp.data.rows_in_contact`); models are trained on these. "
                 f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
                 "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.",

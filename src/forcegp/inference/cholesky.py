@@ -70,7 +70,7 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
     """Cholesky factor of the matrix that `build` returns; its memory is overwritten.
 
     Only the lower triangle is read. A matrix that is not positive definite in floating point is built again with a
-    larger multiple of its mean diagonal added (`JITTER_LADDER`), and a NumericalWarning says how much.
+    larger multiple of its mean diagonal added (`JITTER_LADDER`), and a NumericalWarning reports how much.
 
     Raises
     ------

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.inference.cpp_library import cpp_library
-
-if TYPE_CHECKING:
-    from forcegp.inference.prepared_kernels import SharedCenters
+from forcegp.codegen.cpp_library import cpp_library
 
 LANES = 8
 """Centres that are worked on at once; their number is filled up to a multiple with weights of zero."""
@@ -101,13 +97,16 @@ extern "C" void sums(long states, long latents, long d, long centers, long valid
 
 
 class CompiledSums:
-    """E f_c = sum_j w_cj k_c(z, z_j) of latents that share their centres, on the CPU."""
+    """E f_c = sum_j w_cj k_c(z, z_j) of latents that share their centres, on the CPU.
 
-    def __init__(self, group: SharedCenters, weights: Float[Tensor, "G N"]) -> None:
-        self._made_of = group, weights
+    `centers`, `own` and the inputs are those of `SharedCenters`.
+    """
+
+    def __init__(self, centers: Float[Tensor, "N d"], own: Float[Tensor, "G N"], weights: Float[Tensor, "G N"]) -> None:
+        self._made_of = centers, own, weights
         valid = weights.shape[1]
         filled = -valid % LANES
-        table, own = group.centers.mT, group.own
+        table = centers.mT
 
         def aligned(values: Tensor) -> Tensor:
             rows = torch.nn.functional.pad(values, (0, filled)).contiguous()
@@ -123,7 +122,7 @@ class CompiledSums:
         self._sums.restype = None
         self._sums.argtypes = [ctypes.c_long] * 5 + [ctypes.c_void_p] * 6
 
-    def __reduce__(self) -> tuple[type[CompiledSums], tuple[SharedCenters, Tensor]]:
+    def __reduce__(self) -> tuple[type[CompiledSums], tuple[Tensor, Tensor, Tensor]]:
         return CompiledSums, self._made_of  # addresses mean nothing in another process
 
     def __call__(

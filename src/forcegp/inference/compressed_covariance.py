@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior
 
 ROUNDING = 1e-7
@@ -93,11 +92,13 @@ def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "
     found = []
     for start in range(0, points, height):
         features, W = [z[start : start + height] for z in sample.features], sample.W[start : start + height]
-        cross = torch.stack([kernel_cross(*of) for of in zip(latent.kernels, features, latent.features, strict=True)])
+        cross = torch.stack(
+            [k.cross(z, at) for k, z, at in zip(latent.kernels.dense, features, latent.features, strict=True)]
+        )
         V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, -1)
         V = latent.system.factor.solve_lower(V).reshape(count * rank, latents, -1)
         y = torch.einsum("acn,nkc->ank", V, W)
-        prior = torch.stack([kernel_diagonal(*of) for of in zip(latent.kernels, features, strict=True)], dim=-1)
+        prior = torch.stack([k.diagonal(z) for k, z in zip(latent.kernels.dense, features, strict=True)], dim=-1)
         variance = torch.einsum("nkc,nc->nk", W.square(), prior)
         left = (variance - y.square().sum(0)).sqrt()
         counts = left > ROUNDING * variance.sqrt()  # False where NaN

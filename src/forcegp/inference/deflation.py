@@ -3,7 +3,7 @@
 The model is y_i = m_i + W_i f(x_i) + noise_i with D outputs, C latent functions and noise covariance R_i = L_i L_i^T.
 In whitened coordinates, y~_i = L_i^-1 (y_i - m_i) and W~_i = L_i^-1 W_i = U_i C_i with orthonormal U_i (D x r). The
 part of y~_i orthogonal to U_i does not depend on the latents and is standard normal; U_i^T y~_i carries everything that
-the data say about them.
+the data hold about them.
 """
 
 from __future__ import annotations

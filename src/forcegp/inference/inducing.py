@@ -124,7 +124,7 @@ def inducing_pivots(
     share = tolerance / max(1, C.shape[-1]) * len(candidates)
     return [
         candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share).indices]
-        for c, (kernel, z) in enumerate(zip(kernels, features, strict=True))
+        for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
     ]
 
 

@@ -21,7 +21,7 @@ from forcegp.errors import InvalidInput
 from forcegp.inference.conjugate_gradients import Iteration, Solved, conjugate_gradients
 from forcegp.inference.deflation import Deflation
 from forcegp.inference.kernel_panels import KernelPanels
-from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
+from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.pivots import Pivots, pivoted_cholesky
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.terms import Terms
@@ -50,7 +50,7 @@ class LowRankPlusDiagonal:
         relevance = C.square().sum(1)
         pivots = tuple(
             pivoted_cholesky(kernel, z, relevance[:, c], points)
-            for c, (kernel, z) in enumerate(zip(kernels, features, strict=True))
+            for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
         )
         left_out = torch.stack([found.remainder for found in pivots], dim=-1)
         identity = torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
@@ -147,7 +147,7 @@ class IterativePosterior(LatentPosterior):
         # k_c(z, z) delta_cd - v_c^T T^-1 v_d with v_c = [k_c(z, z_j) C_jac], all points in one search
         v = torch.stack([self._data_columns(c, z) for c, z in enumerate(features)], dim=1)
         explained = torch.einsum("kcn,kdn->ncd", v, self.solve(v.flatten(1)).view_as(v))
-        prior = [kernel_diagonal(kernel, z) for kernel, z in zip(self.kernels, features, strict=True)]
+        prior = [kernel.diagonal(z) for kernel, z in zip(self.kernels.dense, features, strict=True)]
         return torch.diag_embed(torch.stack(prior, dim=-1)) - explained
 
     @override
@@ -155,11 +155,11 @@ class IterativePosterior(LatentPosterior):
         if not self.solve_covariance:
             return self.preconditioner.weights.variance_of(index, z)
         v = self._data_columns(index, z)
-        return kernel_diagonal(self.kernels[index], z) - (v * self.solve(v)).sum(0)
+        return self.kernels.dense[index].diagonal(z) - (v * self.solve(v)).sum(0)
 
     def _data_columns(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "_ n"]:
         """Covariance of the deflated data with one latent at points."""
-        cross = kernel_cross(self.kernels[index], z, self.features[index])
+        cross = self.kernels.dense[index].cross(z, self.features[index])
         return (cross.mT[:, None, :] * self.deflation.C[:, :, index, None]).flatten(0, 1)
 
     @override

@@ -1,94 +1,39 @@
-"""Dense kernel matrices of GPyTorch kernels, exact and lean: sums and products are taken apart into their leaves.
+"""Formulas of kernels: functions of a distance with hand-written gradients, and what is known of GPyTorch's classes.
 
-GPyTorch's own sums are not used: it adds a low-rank matrix (a linear kernel) to a dense one through a root
-decomposition of the latter, which needs jitter where that is singular and is approximate where it is large. Its lazy
-paths switch silently to conjugate gradients above N D = 800 (measured error of the predictive mean 7.9 rad/s^2 on the
-iiwa).
-
-The leaves: functions of the distance (squared exponential, Matern) have hand-written gradients, one N x N by N x d
-product and no N x N x d tensor; linear and constant kernels, and those with one of the methods below, are matrix
-products; every other kernel is called as it is, and once more in the backward pass. A kernel class may have one of
+Functions of the distance (squared exponential, Matern) need one N x N by N x d product and no N x N x d tensor in the
+backward pass. A kernel class of anybody may have one of
 
     squared_exponential_embedding(z) (n, e): then k(z, z') = exp(-1/2 |e(z) - e(z')|^2)
     matern_embedding(z) (n, e) and nu: then k(z, z') is the Matern of smoothness nu (1/2, 3/2, 5/2) of |e(z) - e(z')|
     weight_features(z) (n, p): then k(z, z') = phi(z) . phi(z')
 
-both differentiable in z and in the kernel's parameters.
+all differentiable in z and in the kernel's parameters.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial, reduce
-from operator import add, mul
+from functools import partial
 from typing import cast
 
 import torch
 from gpytorch.kernels import (
-    AdditiveKernel,
     ConstantKernel,
     Kernel,
     LinearKernel,
-    MaternKernel,
     PeriodicKernel,
-    ProductKernel,
     RBFKernel,
     ScaleKernel,
 )
 from jaxtyping import Float
 from torch import Tensor
-from torch.func import functional_call
-from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 PointMap = Callable[[Tensor], Tensor]
 """Features (n, d) -> something (n, _) of every point."""
 
 NO_DISTANCE = 1e-8
 """Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
-
-KNOWN = (
-    AdditiveKernel,
-    ProductKernel,
-    ScaleKernel,
-    RBFKernel,
-    MaternKernel,
-    PeriodicKernel,
-    LinearKernel,
-    ConstantKernel,
-)
-"""GPyTorch classes whose formulas are evaluated here; subclasses may have other formulas and are called."""
-
-
-def dense_matrix(
-    kernel: Kernel, z: Float[Tensor, "n d"], other: Float[Tensor, "N d"] | None = None
-) -> Float[Tensor, "n _"]:
-    """k(z_i, other_j) (n, N); without `other` k(z_i, z_j) (n, n), of which there are first derivatives only."""
-    if not _is_known(kernel):
-        if other is None and torch.is_grad_enabled():
-            return _recomputed(kernel, z)
-        return kernel(z, z if other is None else other).to_dense()
-    z, other = _selected(kernel, z), None if other is None else _selected(kernel, other)
-    if type(kernel) is AdditiveKernel or type(kernel) is ProductKernel:
-        inner = [dense_matrix(cast(Kernel, part), z, other) for part in kernel.kernels]
-        return reduce(add if type(kernel) is AdditiveKernel else mul, inner)
-    if type(kernel) is ScaleKernel:
-        base, outputscale = kernel.base_kernel, cast(Tensor, kernel.outputscale)
-        if type(base) in (RBFKernel, MaternKernel):
-            return _of_distance(base, z, other, outputscale)
-        return outputscale * dense_matrix(base, z, other)
-    if type(kernel) in (RBFKernel, MaternKernel):
-        return _of_distance(kernel, z, other, torch.ones((), dtype=z.dtype, device=z.device))
-    if type(kernel) is ConstantKernel:
-        return kernel.constant.reshape(1, 1).expand(len(z), len(z if other is None else other)).contiguous()
-    embedded = embedding(kernel)
-    if embedded is not None:
-        embed, smoothness = embedded
-        return _of_embedding(embed(z), None if other is None else embed(other), smoothness)
-    feature = weight_features(kernel)
-    assert feature is not None  # _is_known said so
-    left = feature(z)
-    return left @ (left if other is None else feature(other)).mT
 
 
 def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
@@ -122,7 +67,7 @@ def weight_features(kernel: Kernel) -> PointMap | None:
 def _circles(kernel: PeriodicKernel, z: Tensor) -> Tensor:
     """e(x) = (cos, sin)(2 pi x / p) / sqrt l, for which 1/2 |e(x) - e(y)|^2 = 2 sin^2(pi (x - y) / p) / l."""
     angle = (2.0 * math.pi) * z / kernel.period_length.reshape(-1)
-    return torch.cat([angle.cos(), angle.sin()], dim=-1) / _lengthscale(kernel).sqrt().expand(z.shape[-1]).repeat(2)
+    return torch.cat([angle.cos(), angle.sin()], dim=-1) / lengthscale_of(kernel).sqrt().expand(z.shape[-1]).repeat(2)
 
 
 def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
@@ -132,7 +77,7 @@ def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | No
     base = kernel.base_kernel
     if kernel.active_dims is not None or base.active_dims is not None or kernel.batch_shape or base.batch_shape:
         return None
-    return _lengthscale(base), cast(Tensor, kernel.outputscale)
+    return lengthscale_of(base), cast(Tensor, kernel.outputscale)
 
 
 def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
@@ -142,44 +87,23 @@ def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[
     return (x.square().sum(-1)[:, None] + y.square().sum(-1)[None, :]).addmm(x, y.mT, alpha=-2.0).clamp_min(0.0)
 
 
-def _is_known(kernel: Kernel) -> bool:
-    """Whether `dense_matrix` evaluates the kernel itself."""
-    if kernel.batch_shape:
-        return False
-    if type(kernel) is ScaleKernel:
-        # It takes over the `active_dims` of its base, which then does not select again.
-        base = kernel.base_kernel
-        return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
-    return type(kernel) in KNOWN or embedding(kernel) is not None or weight_features(kernel) is not None
-
-
-def _selected(kernel: Kernel, z: Tensor) -> Tensor:
-    """The features that the kernel looks at, its `active_dims`."""
-    return z if kernel.active_dims is None else z.index_select(-1, cast(Tensor, kernel.active_dims))
-
-
-def _lengthscale(kernel: Kernel) -> Tensor:
+def lengthscale_of(kernel: Kernel) -> Float[Tensor, " d"]:
+    """Its length scales, one or one per feature."""
     return cast(Tensor, kernel.lengthscale).reshape(-1)
 
 
-def _of_distance(kernel: Kernel, z: Tensor, other: Tensor | None, outputscale: Tensor) -> Tensor:
-    smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
-    lengthscale = _lengthscale(kernel)
-    if other is None:
-        return cast(Tensor, _Stationary.apply(z, lengthscale, outputscale, smoothness))
-    z, other = z / lengthscale, other / lengthscale
+def stationary_matrix(
+    z: Float[Tensor, "n d"], lengthscale: Float[Tensor, " d"], outputscale: Tensor, smoothness: float
+) -> Float[Tensor, "n n"]:
+    """s k(|(z_i - z_j) / l|), the squared exponential or a Matern, of which there are first derivatives only."""
+    return cast(Tensor, _StationaryMatrix.apply(z, lengthscale, outputscale, smoothness))
+
+
+def of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:
+    """The squared exponential (smoothness inf) or a Matern of the distances between points that are scaled already."""
     if smoothness == math.inf:
-        return outputscale * torch.exp(-0.5 * squared_distance(z, other))
-    return outputscale * _matern(distance(z, other), smoothness)
-
-
-def _of_embedding(left: Tensor, right: Tensor | None, smoothness: float) -> Tensor:
-    if right is not None and smoothness == math.inf:
         return torch.exp(-0.5 * squared_distance(left, right))
-    if right is not None:
-        return _matern(distance(left, right), smoothness)
-    one = torch.ones(1, dtype=left.dtype, device=left.device)
-    return cast(Tensor, _Stationary.apply(left, one, one[0], smoothness))
+    return _matern(distance(left, right), smoothness)
 
 
 def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
@@ -203,7 +127,7 @@ def _matern_slope(r: Tensor, smoothness: float) -> Tensor:
     return 3.0 * decay if smoothness == 1.5 else 5.0 / 3.0 * (1.0 + a) * decay
 
 
-class _Stationary(torch.autograd.Function):
+class _StationaryMatrix(torch.autograd.Function):
     """s k(r) with r_ij = |(z_i - z_j) / l|: the squared exponential (smoothness inf) or a Matern.
 
     Saves nothing of size N x N but its own result and, for a Matern, the derivative of it.
@@ -248,31 +172,3 @@ class _Stationary(torch.autograd.Function):
             transposed = weighted.mT @ scaled
             z_gradient = (product + transposed - (rows + columns)[:, None] * scaled) / lengthscale
         return z_gradient, lengthscale_gradient, outputscale_gradient, None
-
-
-def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
-    """A kernel of any kind, called now and again in the backward pass, so that nothing of size N x N is kept."""
-    dense = _DenseKernel(kernel)
-    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own
-    # ones back.
-    names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
-    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims`
-    # back.
-    with set_checkpoint_early_stop(False):
-        return checkpoint(
-            lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
-            z,
-            *values,
-            use_reentrant=False,
-        )
-
-
-class _DenseKernel(torch.nn.Module):
-    """A kernel whose call returns the dense matrix at once, so that `functional_call` covers the whole evaluation."""
-
-    def __init__(self, kernel: Kernel) -> None:
-        super().__init__()
-        self.kernel = kernel
-
-    def forward(self, z: Tensor) -> Tensor:
-        return self.kernel(z, z).to_dense()

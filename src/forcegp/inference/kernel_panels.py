@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.inference.kernels import LatentKernels, kernel_cross
+from forcegp.inference.kernels import LatentKernels
 
 PANEL_BYTES = 8 * 2**20
 """Largest size of one panel of one latent: it is read twice, and the second time it should still be in the cache."""
@@ -22,7 +22,7 @@ class KernelPanels:
     """
 
     def __init__(self, kernels: LatentKernels, features: Sequence[Float[Tensor, "N _"]], memory: int) -> None:
-        self.kernels = list(kernels)
+        self.kernels = kernels.dense
         self.features = features
         self.count = len(features[0])
         self.memory = memory
@@ -52,7 +52,7 @@ class KernelPanels:
         if found is not None:
             return found
         z = self.features[c]
-        panel = kernel_cross(self.kernels[c], z[start:stop], z[:stop])
+        panel = self.kernels[c].cross(z[start:stop], z[:stop])
         size = panel.numel() * panel.element_size()
         if self.bytes_kept + size <= self.memory:
             self.kept[c, start] = panel

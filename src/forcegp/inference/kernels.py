@@ -13,22 +13,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import dense_matrix
-
-
-def kernel_matrix(kernel: Kernel, z: Float[Tensor, "N d"]) -> Float[Tensor, "N N"]:
-    """k(z_i, z_j), dense and differentiable in the kernel's parameters and in z."""
-    return dense_matrix(kernel, z)
-
-
-def kernel_cross(kernel: Kernel, z: Float[Tensor, "n d"], z_train: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
-    """k(z_i, z_train_j), dense."""
-    return dense_matrix(kernel, z, z_train)
-
-
-def kernel_diagonal(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
-    """k(z_i, z_i)."""
-    return cast(Tensor, kernel(z, z, diag=True))
+from forcegp.inference.dense_kernels import DenseKernel, taken_apart
 
 
 class LatentKernels(torch.nn.Module):
@@ -40,6 +25,8 @@ class LatentKernels(torch.nn.Module):
     def __init__(self, kernels: Iterable[Kernel]) -> None:
         super().__init__()
         self.kernels = torch.nn.ModuleList(kernels)
+        self.dense: list[DenseKernel] = [taken_apart(kernel) for kernel in self]
+        """The same kernels, taken apart: their matrices."""
         for name, value in self.named_parameters():
             if value.dtype != torch.float64:
                 raise InvalidInput(f"{name} is {value.dtype}; inference needs float64, call .double() on the kernel.")
@@ -52,7 +39,7 @@ class LatentKernels(torch.nn.Module):
 
     def forward(self, features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
         """One dense matrix per latent."""
-        return [kernel_matrix(kernel, z) for kernel, z in zip(self, features, strict=True)]
+        return [kernel.matrix(z) for kernel, z in zip(self.dense, features, strict=True)]
 
     def matrices(
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
@@ -99,23 +86,19 @@ class LatentKernels(torch.nn.Module):
 class _Crosses(torch.nn.Module):
     def __init__(self, latent: LatentKernels) -> None:
         super().__init__()
-        self.kernels = latent.kernels
+        self.kernels, self.dense = latent.kernels, latent.dense
 
     def forward(self, left: Sequence[Tensor], right: Sequence[Tensor]) -> list[Tensor]:
-        kernels = cast("list[Kernel]", list(self.kernels))
-        return [kernel_cross(kernel, x, y) for kernel, x, y in zip(kernels, left, right, strict=True)]
+        return [kernel.cross(x, y) for kernel, x, y in zip(self.dense, left, right, strict=True)]
 
 
 class _Diagonals(torch.nn.Module):
     def __init__(self, latent: LatentKernels) -> None:
         super().__init__()
-        self.kernels = latent.kernels
+        self.kernels, self.dense = latent.kernels, latent.dense
 
     def forward(self, features: Sequence[Tensor]) -> list[Tensor]:
-        return [
-            kernel_diagonal(kernel, z)
-            for kernel, z in zip(cast("list[Kernel]", list(self.kernels)), features, strict=True)
-        ]
+        return [kernel.diagonal(z) for kernel, z in zip(self.dense, features, strict=True)]
 
 
 class _LogPrior(torch.nn.Module):

@@ -1,4 +1,4 @@
-"""How much memory there is, and the error that says what a computation would need."""
+"""How much memory there is, and the error that names what a computation would need."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from forcegp.errors import NotEnoughMemory
 
 CGROUP = Path("/sys/fs/cgroup")
-"""Where Linux tells what a container may use (control groups, version 2)."""
+"""Where Linux states what a container may use (control groups, version 2)."""
 
 USABLE = 0.9
 """Fraction of the free memory that a computation may plan with; the rest is for what else happens meanwhile."""

@@ -110,7 +110,7 @@ class _Search:
         parameters = {name: value.requires_grad_() for name, value in self.unflatten(point).items()}
         gradients: Sequence[Tensor | None] = [None] * len(parameters)
         try:
-            # Trial points far out may need jitter; whether the result does, the factorisation at the end says.
+            # Trial points far out may need jitter; whether the result does, shows in the factorisation at the end.
             with torch.enable_grad(), warnings.catch_warnings():
                 warnings.simplefilter("ignore", NumericalWarning)
                 value = self.objective(parameters)
@@ -158,7 +158,7 @@ def minimize_objective(
 
     L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). Where the objective cannot be evaluated, the line search
     shortens its step. If it finds none that helps, the search rolls back to the best point seen and starts again from
-    there with an empty memory, twice at most; then it ends there and says why.
+    there with an empty memory, twice at most; then it ends there, with the reason.
     `progress(iteration, value)` is called after every iteration.
 
     Raises
@@ -242,7 +242,7 @@ def minimize_objective(
 
 
 def _sentence(status: int, message: str, options: OptimizerOptions) -> str:
-    """What scipy's L-BFGS-B says, in words that tell what to do."""
+    """The message of scipy's L-BFGS-B, in words that name what to do."""
     if status == 0 and "GRADIENT" in message:
         return f"converged: the largest gradient entry is below {options.gradient_tolerance:g}"
     if status == 0:
@@ -271,6 +271,6 @@ def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float, n
 
 
 def best_of(results: list[OptimizationResult]) -> OptimizationResult:
-    """The result with the lowest final value; its status says how many searches it was chosen from."""
+    """The result with the lowest final value; its status holds how many searches it was chosen from."""
     chosen = min(results, key=lambda result: result.value)
     return replace(chosen, status=f"{chosen.status} (best of {len(results)} starts)") if len(results) > 1 else chosen

@@ -24,7 +24,6 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
 from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
-from forcegp.inference.kernels import kernel_cross
 from forcegp.inference.posterior import LatentPosterior
 
 FREQUENCIES = 256
@@ -146,6 +145,7 @@ class FunctionSamples:
 class ComposedSamples:
     """S functions drawn from the posterior of the latents, whose kernels are sums and products."""
 
+    # whole functions: independent noise in every step would average out along a motion
     latent: LatentPosterior
     terms: tuple[tuple[DrawnTerm, ...], ...]
     beta: tuple[Float[Tensor, "S _"], ...]
@@ -174,10 +174,10 @@ class ComposedSamples:
         """Every function at points of its own: f_s,c(z_s,i)."""
         columns = []
         for c, (kernel, z, training) in enumerate(
-            zip(self.latent.kernels, features, self.latent.features, strict=True)
+            zip(self.latent.kernels.dense, features, self.latent.features, strict=True)
         ):
             flat = z.flatten(0, 1)
-            cross = kernel_cross(kernel, flat, training).unflatten(0, z.shape[:2])
+            cross = kernel.cross(flat, training).unflatten(0, z.shape[:2])
             update = (cross @ self.beta[c][..., None])[..., 0]
             columns.append(_sum(self.terms[c], flat, slice(None)) + update)
         return torch.stack(columns, dim=-1)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal
+from forcegp.inference.dense_kernels import DenseKernel
 
 ROUNDING = 1e-13
 """Remainders below this fraction of the largest k(z, z) are rounding."""
@@ -33,7 +32,7 @@ class Pivots:
 
 
 def pivoted_cholesky(
-    kernel: Kernel, z: Float[Tensor, "N d"], relevance: Float[Tensor, " N"], most: int, tolerance: float = 0.0
+    kernel: DenseKernel, z: Float[Tensor, "N d"], relevance: Float[Tensor, " N"], most: int, tolerance: float = 0.0
 ) -> Pivots:
     """Greedy pivots, each where the relevance times what is left of k(z, z) is largest.
 
@@ -43,7 +42,7 @@ def pivoted_cholesky(
     & Schneider (2012), "On the low-rank approximation by the pivoted Cholesky decomposition".
     """
     with torch.no_grad():
-        remainder = kernel_diagonal(kernel, z).clone()
+        remainder = kernel.diagonal(z).clone()
         count = len(z)
         rows = z.new_empty(min(most, count), count)
         indices: list[int] = []
@@ -54,7 +53,7 @@ def pivoted_cholesky(
             if float(score.sum()) <= tolerance or float(remainder[pivot]) <= floor:
                 break
             done = len(indices)
-            column = kernel_cross(kernel, z[pivot : pivot + 1], z)[0]
+            column = kernel.cross(z[pivot : pivot + 1], z)[0]
             column = column - rows[:done].mT @ rows[:done, pivot]
             rows[done] = column / column[pivot].clamp_min(floor).sqrt()
             rows[done, indices] = 0.0  # exactly, so that `lower` is triangular

@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.deflation import deflate, whiten
-from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
+from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
 
 BLOCK_BYTES = 64 * 2**20
@@ -65,9 +65,9 @@ class LatentPosterior(ABC):
         return self._mean_of(index, z), self.variance_of(index, z)
 
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
-        kernel, centers, weights = self.kernels[index], self.features[index], self.weights[index]
+        kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
         height = max(1, BLOCK_BYTES // max(1, 8 * len(centers)))
-        blocks = [kernel_cross(kernel, z[i : i + height], centers) @ weights for i in range(0, len(z), height)]
+        blocks = [kernel.cross(z[i : i + height], centers) @ weights for i in range(0, len(z), height)]
         return torch.cat(blocks) if blocks else z.new_zeros(0)
 
 
@@ -113,10 +113,10 @@ class ExactPosterior(LatentPosterior):
 
     @override
     def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        kernel, C = self.kernels[index], self.system.deflation.C
-        cross = kernel_cross(kernel, z, self.features[index])
+        kernel, C = self.kernels.dense[index], self.system.deflation.C
+        cross = kernel.cross(z, self.features[index])
         V = (cross.mT[:, None, :] * C[:, :, index, None]).flatten(0, 1)
-        return kernel_diagonal(kernel, z) - self.system.factor.solve_lower(V).square().sum(0)
+        return kernel.diagonal(z) - self.system.factor.solve_lower(V).square().sum(0)
 
     @override
     def function_weights(
@@ -134,12 +134,12 @@ class ExactPosterior(LatentPosterior):
         C = self.system.deflation.C
         count, rank, latents = C.shape
         cross = torch.stack(
-            [kernel_cross(k, z, z_train) for k, z, z_train in zip(self.kernels, features, self.features, strict=True)]
+            [k.cross(z, at) for k, z, at in zip(self.kernels.dense, features, self.features, strict=True)]
         )
         points = cross.shape[1]
         V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, latents * points)
         V = self.system.factor.solve_lower(V).reshape(count * rank, latents, points).permute(2, 1, 0)
-        prior = torch.stack([kernel_diagonal(k, z) for k, z in zip(self.kernels, features, strict=True)], dim=-1)
+        prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
         return torch.diag_embed(prior) - V @ V.mT
 
 

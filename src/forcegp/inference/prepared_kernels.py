@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.inference.compiled_kernels import CompiledSums
+from forcegp.inference.dense_kernels import DenseKernel
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
-from forcegp.inference.kernels import kernel_cross, kernel_diagonal
 from forcegp.inference.posterior import LatentPosterior
 
 
@@ -74,7 +73,7 @@ class AnyKernel:
     """One latent with a kernel of any kind."""
 
     latents: tuple[int]
-    kernel: Kernel
+    kernel: DenseKernel
     centers: Float[Tensor, "N d"]
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n d"]:
@@ -83,11 +82,11 @@ class AnyKernel:
 
     def cross(self, inputs: Float[Tensor, "n d"]) -> Float[Tensor, "n 1 N"]:
         """k(z_i, z_j)."""
-        return kernel_cross(self.kernel, inputs, self.centers)[:, None]
+        return self.kernel.cross(inputs, self.centers)[:, None]
 
     def diagonal(self, inputs: Float[Tensor, "n d"]) -> Float[Tensor, "n 1"]:
         """k(z_i, z_i)."""
-        return kernel_diagonal(self.kernel, inputs)[:, None]
+        return self.kernel.diagonal(inputs)[:, None]
 
 
 KernelGroup = SharedCenters | AnyKernel
@@ -110,7 +109,7 @@ class PreparedKernels:
         order = [c for group in groups for c in group.latents]
         back = None if order == sorted(order) else torch.tensor(order).argsort().to(weights[0].device)
         compiled = tuple(
-            CompiledSums(group, w) if compile and isinstance(group, SharedCenters) else None
+            CompiledSums(group.centers, group.own, w) if compile and isinstance(group, SharedCenters) else None
             for group, w in zip(groups, weights, strict=True)
         )
         return cls(groups, weights, back, compiled)
@@ -176,7 +175,7 @@ def kernel_groups(latent: LatentPosterior) -> tuple[KernelGroup, ...]:
     for index, (kernel, centers) in enumerate(zip(latent.kernels, latent.features, strict=True)):
         found = squared_exponential_parameters(kernel)
         if found is None:
-            groups.append(AnyKernel((index,), kernel, centers))
+            groups.append(AnyKernel((index,), latent.kernels.dense[index], centers))
             continue
         scales[index] = found
         same = next((members for other, members in shared if torch.equal(other, centers)), None)

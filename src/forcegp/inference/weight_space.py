@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.kernels import LatentKernels, kernel_cross, kernel_diagonal
+from forcegp.inference.kernels import LatentKernels
 
 BLOCK_BYTES = 64 * 2**20
 """Working memory of one block of points."""
@@ -61,8 +61,7 @@ class WeightSpace:
         """
         points = tuple(z.detach() for z in points)
         lowers = tuple(
-            factorize(partial(kernel_cross, kernel, z, z)).lower.tril()
-            for kernel, z in zip(kernels, points, strict=True)
+            factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
         )
         prior = cls(kernels, points, lowers, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0), 0.0)
         white, slices = C if noise_precision is None else noise_precision @ C, prior.slices
@@ -77,7 +76,7 @@ class WeightSpace:
             block = [z[rows] for z in features]
             phi = prior.columns(block)
             for c, left in enumerate(phi):
-                remainder = kernel_diagonal(kernels[c], block[c]) - left.square().sum(0)
+                remainder = kernels.dense[c].diagonal(block[c]) - left.square().sum(0)
                 left_out += relevance[rows, c] @ remainder.clamp_min(0.0)
                 right[slices[c]] += left @ target[rows, c]
                 for d, other in enumerate(phi[: c + 1]):
@@ -102,7 +101,7 @@ class WeightSpace:
 
     def column(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "m n"]:
         """phi_c of one latent at points of its own features."""
-        cross = kernel_cross(self.kernels[index], self.points[index], z)
+        cross = self.kernels.dense[index].cross(self.points[index], z)
         return torch.linalg.solve_triangular(self.lowers[index], cross, upper=False)
 
     def center_weights(self, weights: Float[Tensor, "P S"]) -> list[Float[Tensor, "_ S"]]:
@@ -126,7 +125,7 @@ class WeightSpace:
         remainders = []
         for c, (part, phi) in enumerate(zip(self.slices, self.columns(features), strict=True)):
             wide[part, c] = phi
-            diagonal = kernel_diagonal(self.kernels[c], features[c])
+            diagonal = self.kernels.dense[c].diagonal(features[c])
             remainders.append((diagonal - phi.square().sum(0)).clamp_min(0.0))
         V = self.precision.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
         return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
@@ -136,7 +135,7 @@ class WeightSpace:
         phi = self.column(index, z)
         wide = phi.new_zeros(self.count, len(z))
         wide[self.slices[index]] = phi
-        remainder = (kernel_diagonal(self.kernels[index], z) - phi.square().sum(0)).clamp_min(0.0)
+        remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
         return remainder + self.precision.solve_lower(wide).square().sum(0)
 
 

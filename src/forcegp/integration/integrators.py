@@ -1,6 +1,6 @@
 """One step of time: symplectic Euler, classical Runge-Kutta, and a projected scheme that stays on the constraint.
 
-An integrator asks for accelerations a(q, v) and knows nothing of where they come from; actuator forces are constant
+An integrator asks for accelerations a(q, v) wherever they come from; actuator forces are constant
 over the step. All states are batched, (n, nv).
 """
 

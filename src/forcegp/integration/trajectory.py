@@ -1,4 +1,8 @@
-"""`integrate`: many motions at once, each until its end or until it diverges."""
+"""`integrate`: many motions at once, each until its end or until it diverges.
+
+A motion that diverges is a result, not an error that would take the others along: models without physics do diverge,
+and figures compare them.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +58,7 @@ def integrate(
     on the way: so it is asked once per step, of finite states only.
 
     A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that cannot be kept on its
-    constraint, ends there: the rest of it is NaN, `diverged_at` tells the row, and a NumericalWarning says so. The
+    constraint, ends there: the rest of it is NaN, `diverged_at` holds the row, and a NumericalWarning is given. The
     others go on. `acceleration` is called with finite states only. `what` names the motions in the warning,
     `progress(step, steps)` is called after every step.
     Raises InvalidInput where `dt` is no positive number or a start is faster than the limit.
@@ -129,7 +133,7 @@ def _warn_of_divergence(diverged_at: Tensor, off_constraint: Tensor, dt: float, 
         )
     warnings.warn(
         f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
-        f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model that knows more physics "
+        f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model with more physics "
         "avoids this.",
         NumericalWarning,
         stacklevel=3,

@@ -1,45 +1,5 @@
 """What is known about the mechanics: surfaces, contacts, known forces, and Gauss' principle that joins them."""
 
-from forcegp.mechanics.contacts import Baumgarte, Contact
-from forcegp.mechanics.gauss_principle import AffineMap, ConstrainedDynamics
-from forcegp.mechanics.known_forces import (
-    Actuation,
-    Armature,
-    ConstantJointForce,
-    CoulombJointFriction,
-    KnownForce,
-    LoadJointFriction,
-    RigidBodyBias,
-    RotorInertia,
-    StribeckJointFriction,
-    ViscousJointFriction,
-)
-from forcegp.mechanics.state import State
-from forcegp.mechanics.surface_axes import surface_axes
-from forcegp.mechanics.surfaces import Cylinder, ImplicitSurface, Plane, Sphere, Surface
-from forcegp.mechanics.system import MechanicalSystem
+import lazy_loader as lazy
 
-__all__ = [
-    "Actuation",
-    "AffineMap",
-    "Armature",
-    "Baumgarte",
-    "ConstrainedDynamics",
-    "ConstantJointForce",
-    "Contact",
-    "CoulombJointFriction",
-    "Cylinder",
-    "ImplicitSurface",
-    "KnownForce",
-    "LoadJointFriction",
-    "MechanicalSystem",
-    "Plane",
-    "RigidBodyBias",
-    "RotorInertia",
-    "Sphere",
-    "State",
-    "StribeckJointFriction",
-    "Surface",
-    "ViscousJointFriction",
-    "surface_axes",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

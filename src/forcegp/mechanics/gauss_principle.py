@@ -5,7 +5,7 @@
 
 (Udwadia & Kalaba 1992; Rath et al. 2021, eqs. 2-4.) With the Cholesky factor M = L L^T and A~ = A L^-T everything is
 read from the one small pseudo-inverse A~^+, which also covers redundant constraints: (A M^-1 A^T)^+ = (A~^+)^T A~^+ and
-H = L^-T (I - A~^+ A~) L^-1.
+H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
 """
 
 from __future__ import annotations

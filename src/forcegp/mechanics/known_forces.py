@@ -201,7 +201,7 @@ class RotorInertia(KnownForce):
 
     `inertia` I holds one rotor per joint (kg m^2), `transmission` T (nv, nv) how fast each rotor turns about its axis,
     in a frame that does not, per joint velocity. One motor per joint, in the joint: T is diagonal and holds the gear
-    ratios, which `Armature` says shorter. A motor that sits on a moving link also turns with that link, and a
+    ratios, for which `Armature` is shorter. A motor that sits on a moving link also turns with that link, and a
     differential couples two joints. With transmission None, T is the identity. Gyroscopic forces of the rotors are
     left out. Source: Murphy, Wen & Saridis, "Recursive calculation of geared robot manipulator dynamics", ICRA 1990.
     """
@@ -250,7 +250,7 @@ KNOWN_FORCES: dict[str, type[KnownForce]] = {
 
 
 def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
-    """Plain numbers that `known_force_from_dict` turns back. Raises InvalidInput for a force that files do not know."""
+    """Plain numbers for `known_force_from_dict`. Raises InvalidInput for a force that has no name in files."""
     name = next((name for name, kind in KNOWN_FORCES.items() if type(force) is kind), None)
     if name is None:
         raise InvalidInput(f"a {type(force).__name__} cannot be stored; files carry {', '.join(KNOWN_FORCES)}")

@@ -23,6 +23,7 @@ class State:
     q: Float[Tensor, "*batch nv"]
     v: Float[Tensor, "*batch nv"]
     u: Float[Tensor, "*batch nv"]
+    robot: Robot
     kinematics: Kinematics
     inertials: Mapping[str, Tensor] | None = None
 
@@ -43,4 +44,4 @@ class State:
         except RuntimeError:
             shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
             raise InvalidInput(f"batch shapes do not broadcast: {shapes}; make them equal, or 1.") from None
-        return cls(q, v, u, robot.kinematics(q, v), inertials)
+        return cls(q, v, u, robot, robot.kinematics(q, v), inertials)

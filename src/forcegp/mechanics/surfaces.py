@@ -2,7 +2,7 @@
 
 A surface returns its value, gradient and Hessian at points p (..., 3) in m, world axes. The built-in surfaces are
 signed distances, so their gradient is a unit normal and the multiplier of a contact is the normal force in N. A new
-surface is one subclass of `Surface` that defines `value`; the derivatives follow by autograd unless it knows better. To
+surface is one subclass of `Surface` that defines `value`; the derivatives follow by autograd unless it defines them. To
 be stored with a dataset or a model it also needs an entry in `SURFACES` and plain numbers as its fields.
 """
 

@@ -52,11 +52,11 @@ def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:
     """The noise given; for None, learned from where the sensors put it.
 
     That of the sensors is the least that windows can have: states at nodes are not exact either. Raises InvalidInput
-    for a torque sensor whose noise predictions shall know: what windows tell is the noise of a mean torque.
+    for a torque sensor whose noise predictions shall count: windows give the noise of a mean torque.
     """
     if noise is not None and noise.measured_torque:
         raise InvalidInput(
-            "Noise(measured_torque=True) needs the noise of single torques, but windows (observe=...) tell that of "
+            "Noise(measured_torque=True) needs the noise of single torques, but windows give that of "
             "their mean; leave measured_torque out, or fit to accelerations"
         )
     if noise is not None or windows.noise_level is None:
@@ -71,11 +71,12 @@ def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
     level = rows.noise_level
     if level is None:
         raise InvalidInput(
-            "the dataset does not know its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
+            "the dataset does not state its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
             "noise=Noise(0.1, learn=True) "
             "to learn it from there"
         )
-    return replace(noise or Noise(), acceleration=tuple(float(std) for std in level))
+    noise = noise or Noise()
+    return replace(noise, acceleration=tuple(float(std) for std in level), from_data=not noise.learn)
 
 
 def check_search_numbers(restarts: int, seed: int) -> None:
@@ -105,7 +106,7 @@ def first_start(
 
 
 def described_rows(rows: Dataset | Windows, dataset: Dataset) -> dict[str, Any]:
-    """What the settings of a fit tell about its training rows and where they come from, as plain JSON values."""
+    """What the settings of a fit hold about its training rows and where they come from, as plain JSON values."""
     return {
         "points": len(rows),
         "rows_available": len(dataset),

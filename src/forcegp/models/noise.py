@@ -29,9 +29,12 @@ class Noise:
     where the factor is 1, or, for data that state the noise of every row, that noise over its root mean square: then
     `acceleration` is the level, and which rows are noisier is as stated.
 
-    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions know that their u
+    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions count that their u
     is as noisy, and shrink accelerations that only its noise explains (`models/measured_torque.py`). Leave it False
     where u is a command, as in model-predictive control.
+
+    `from_data` is set by a fit whose level of noise the dataset stated: rows that state another one are then warned of
+    (`Posterior.update`).
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -41,6 +44,7 @@ class Noise:
     force: float | tuple[float, ...] | None = None
     learn: bool = False
     measured_torque: bool = False
+    from_data: bool = False
 
     def __post_init__(self) -> None:
         if self.acceleration is not None:
@@ -55,7 +59,7 @@ class Noise:
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint.
 
-        Raises InvalidInput for a wrong number of values, and where only a dataset can tell the level.
+        Raises InvalidInput for a wrong number of values, and where only a dataset states the level.
         """
         if self.acceleration is None:
             raise InvalidInput(
@@ -107,6 +111,7 @@ class Noise:
             "force": list(self.force) if isinstance(self.force, tuple) else self.force,
             "learn": self.learn,
             "measured_torque": self.measured_torque,
+            "from_data": self.from_data,
         }
 
     @classmethod
@@ -118,6 +123,7 @@ class Noise:
             tuple(force) if isinstance(force, list) else force,
             bool(stored["learn"]),
             bool(stored.get("measured_torque", False)),
+            bool(stored.get("from_data", False)),
         )
 
 

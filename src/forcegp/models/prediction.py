@@ -38,7 +38,7 @@ class Prediction(Gaussian):
     N; `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean
     includes Q_K. Accelerations show nothing of a force along the contact normals: that part of `unknown_force`, and
     through it `multiplier` and `contact_force`, rests on the prior alone, and is no surer than the prior is right.
-    The three are None where a model does not speak of forces.
+    The three are None where a model predicts no forces.
     `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with noisy data. Where
     the noise differed between training rows, it is that of their root-mean-square level.
     """

@@ -1,45 +1,35 @@
-"""`Predictor`: a structured posterior prepared for control rates, where a prediction is due every millisecond.
+"""`Predictor`: a posterior prepared for control rates, where a prediction is due every millisecond.
 
-Rigid-body terms, constraints, prior and features become one tape (`tape_tracing`), kernel functions are evaluated for
-all processes at once, weights are kept, and the covariance uses few combinations of the data
-(`inference.compressed_covariance`).
+Rigid-body terms, constraints, prior and features become one tape (`codegen.tape_tracing`), kernel functions are
+evaluated for all processes at once, weights are kept, and the covariance uses few combinations of the data
+(`inference.compressed_covariance`). `structured.predictor_preparation` makes one.
 """
 
 from __future__ import annotations
 
 import math
-import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
-from forcegp.inference.compressed_covariance import CompressedCovariance, Sample, compress
-from forcegp.inference.posterior import ExactPosterior, LatentPosterior
+from forcegp.codegen.native_code import require_plain
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.inference.compressed_covariance import CompressedCovariance
+from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.models.predictor_terms import EagerTerms, TapedTerms, Terms, terms_function
-from forcegp.models.sample_states import sample_states
-from forcegp.native_code import require_plain
+from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
 
-if TYPE_CHECKING:
-    from forcegp.models.structured_posterior import StructuredPosterior
-
-COVARIANCES = ("auto", "compressed", "exact", "none")
 INSTEAD_OF_TRANSFORMS = (
     "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
     "compile=False"
 )
 BLOCK_NUMBERS = 2**18
 """Kernel values that are worked on at once: 2 MiB, so that they stay in the processor's cache."""
-
-SAMPLES, CHECKS = 300, 150
-"""States that choose the compressed covariance, and others that tell how good it is."""
 
 
 class Linearization(NamedTuple):
@@ -60,7 +50,7 @@ class Predictor:
     `kind` says. Differentiable once in q, v and u where these are tensors that require gradients; with `compile=False`
     any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
-    `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` tell how it was
+    `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
     compressed; `prepare_seconds` is what preparing took, the C++ compiler included, which runs once per process.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
@@ -117,13 +107,13 @@ class Predictor:
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
         return Linearization(a, *jacobian.split(self.nv, dim=-1))
 
-    def _mean(self, terms: Terms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
+    def _mean(self, terms: PredictorTerms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
         if not terms.W.shape[-1]:
             return terms.offset, []
         f, cross = self.prepared.mean(terms.inputs, keep)
         return terms.offset + (terms.W @ f[..., None])[..., 0], cross
 
-    def _covariance(self, terms: Terms, cross: list[Tensor]) -> Tensor:
+    def _covariance(self, terms: PredictorTerms, cross: list[Tensor]) -> Tensor:
         """Of the latents, (n, C, C)."""
         if not terms.W.shape[-1]:
             return terms.W.new_zeros(len(terms.W), 0, 0)
@@ -177,65 +167,3 @@ def _finished(blocks: list[Tensor], single: bool) -> Tensor:
             "MechanicalSystem.check_states names the row and the contact."
         )
     return values[0] if single else values
-
-
-def make_predictor(
-    posterior: StructuredPosterior, covariance: str, tolerance: float, largest_rank: int, compile: bool
-) -> Predictor:
-    """What `StructuredPosterior.predictor` documents."""
-    if covariance not in COVARIANCES:
-        raise InvalidInput(f"covariance is {covariance!r}; give one of {', '.join(map(repr, COVARIANCES))}.")
-    if not (0.0 < tolerance < math.inf and isinstance(largest_rank, int) and largest_rank >= 1):
-        raise InvalidInput(
-            f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
-            "0.01, and an integer from 1."
-        )
-    if posterior.model.noise is not None and posterior.model.noise.measured_torque:
-        raise InvalidInput(
-            "a predictor is for commanded torques, and this model was told that u comes from a noisy sensor; call "
-            "predict, or fit with Noise(..., measured_torque=False)."
-        )
-    begin = time.perf_counter()
-    latent, nv = posterior.latent, posterior.system.robot.nv
-    if covariance == "auto":
-        covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
-    prepared = PreparedKernels.of(latent, compile)
-    function, groups = terms_function(posterior, prepared, covariance == "exact"), len(prepared.groups)
-    example = [x[:1] for x in (posterior.training.q, posterior.training.v, posterior.training.u)]
-    terms = TapedTerms(function, example, groups) if compile else EagerTerms(function, nv, groups)
-    compressed = None
-    if covariance == "compressed" and groups:
-        compressed = _compressed(posterior, prepared, tolerance, largest_rank)
-    seconds = time.perf_counter() - begin
-    return Predictor(nv, posterior.system.robot.device, latent, prepared, terms, covariance, compressed, seconds)
-
-
-def _compressed(
-    posterior: StructuredPosterior, prepared: PreparedKernels, tolerance: float, largest_rank: int
-) -> CompressedCovariance:
-    latent = posterior.latent
-    if not isinstance(latent, ExactPosterior):
-        raise InvalidInput(
-            "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
-            f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, or 'none', "
-            f"or {latent.remedy}."
-        )
-    terms = EagerTerms(terms_function(posterior, prepared, True), posterior.system.robot.nv, len(prepared.groups))
-
-    def sample(count: int, seed: int) -> Sample:
-        with torch.no_grad():
-            at = terms(torch.cat(sample_states(posterior.training, count, seed), dim=-1))
-        usable = torch.isfinite(at.W).flatten(1).all(1)  # no state of its own has a surface without a normal
-        return Sample([z[usable] for z in at.features], at.W[usable])
-
-    latents = [group.latents for group in prepared.groups]
-    found = compress(latent, latents, sample(SAMPLES, 0), sample(CHECKS, 1), tolerance=tolerance, largest=largest_rank)
-    reached = float(found.inflation.max()) if len(found.inflation) else 0.0
-    if reached > tolerance:
-        warnings.warn(
-            f"rank {found.rank} makes standard deviations up to {reached:.2g} (relative) too large, more than the "
-            f"tolerance {tolerance:.2g}; give a larger largest_rank or tolerance, or covariance='exact'.",
-            NumericalWarning,
-            stacklevel=4,
-        )
-    return found

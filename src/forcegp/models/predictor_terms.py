@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from forcegp.codegen.tape_machine import TapeMachine
+from forcegp.codegen.tape_tracing import trace
 from forcegp.errors import InvalidInput
-from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.models.marginal_likelihood import inertials_of
-from forcegp.models.tape_machine import TapeMachine
-from forcegp.models.tape_tracing import trace
-
-if TYPE_CHECKING:
-    from forcegp.models.structured_posterior import StructuredPosterior
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
-"""States (n, nv) -> the entries of `Terms` as one list."""
+"""States (n, nv) -> the entries of `PredictorTerms` as one list."""
 
 
-class Terms(NamedTuple):
+class PredictorTerms(NamedTuple):
     """At n states: a = offset + W f, (n, nv) and (n, nv, C); what the kernels need; the prepared features if asked for.
 
     Their derivatives in [q, v, u] have one dimension (3 nv) more.
@@ -33,27 +28,9 @@ class Terms(NamedTuple):
     features: list[Tensor]
 
     @classmethod
-    def of(cls, parts: Sequence[Tensor], groups: int) -> Terms:
+    def of(cls, parts: Sequence[Tensor], groups: int) -> PredictorTerms:
         """From one list."""
         return cls(parts[0], parts[1], list(parts[2 : 2 + groups]), list(parts[2 + groups :]))
-
-
-def terms_function(posterior: StructuredPosterior, prepared: PreparedKernels, features: bool) -> TermsFunction:
-    """The terms as a function of the state, differentiable, by the same code as `posterior.predict`.
-
-    Without `features` that list of them stays empty.
-    """
-    system, prior, known = posterior.system, posterior.model.prior, posterior.model.mean == "analytical"
-    inertials = {name: value.detach() for name, value in inertials_of(posterior.parameters).items()} or None
-    standardize = posterior.likelihood.standardization
-
-    def terms(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-        dynamics = system.dynamics(q, v, u, inertials)
-        affine, given = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
-        joined = [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(given)]
-        return [*joined, *given] if features else joined
-
-    return terms
 
 
 class EagerTerms:
@@ -62,18 +39,18 @@ class EagerTerms:
     def __init__(self, function: TermsFunction, nv: int, groups: int) -> None:
         self.function, self.nv, self.groups = function, nv, groups
 
-    def __call__(self, x: Tensor) -> Terms:
+    def __call__(self, x: Tensor) -> PredictorTerms:
         """At rows [q, v, u]."""
-        return Terms.of(self.function(*x.split(self.nv, dim=-1)), self.groups)
+        return PredictorTerms.of(self.function(*x.split(self.nv, dim=-1)), self.groups)
 
-    def with_jacobians(self, x: Tensor) -> tuple[Terms, Terms]:
+    def with_jacobians(self, x: Tensor) -> tuple[PredictorTerms, PredictorTerms]:
         """The terms and their derivatives."""
 
         def one(row: Tensor) -> list[Tensor]:
             return [part[0] for part in self.function(*row[None].split(self.nv, dim=-1))]
 
         slopes = torch.func.vmap(torch.func.jacrev(one))(x)
-        return self(x), Terms.of(slopes, self.groups)
+        return self(x), PredictorTerms.of(slopes, self.groups)
 
 
 class TapedTerms:
@@ -95,18 +72,18 @@ class TapedTerms:
         self.shapes = [shape[1:] for shape in shapes]
         self.sizes = [shape.numel() for shape in self.shapes]
 
-    def __call__(self, x: Tensor) -> Terms:
+    def __call__(self, x: Tensor) -> PredictorTerms:
         """At rows [q, v, u]."""
         return self._split(self.machine(x), ())
 
-    def with_jacobians(self, x: Tensor) -> tuple[Terms, Terms]:
+    def with_jacobians(self, x: Tensor) -> tuple[PredictorTerms, PredictorTerms]:
         """The terms and their derivatives."""
         values, slopes = self.machine.with_jacobian(x)
         return self._split(values, ()), self._split(slopes, x.shape[1:])
 
-    def _split(self, joined: Tensor, trailing: Sequence[int]) -> Terms:
+    def _split(self, joined: Tensor, trailing: Sequence[int]) -> PredictorTerms:
         parts = torch.split_with_sizes(joined, self.sizes, 1)
-        return Terms.of(
+        return PredictorTerms.of(
             [
                 part if len(shape) == 1 else part.reshape(len(joined), *shape, *trailing)
                 for part, shape in zip(parts, self.shapes, strict=True)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import copy
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -15,16 +16,14 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.inference import LeaveOut, OptimizationResult
+from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
-from forcegp.models.accelerations import AccelerationModel, PredictedAccelerations
-from forcegp.models.marginal_likelihood import TrainingData
-from forcegp.models.moving import moved
 from forcegp.models.prediction import Prediction, join_predictions
 from forcegp.models.predictor import Predictor
-from forcegp.models.rollout import Rollout, roll_out
+from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
+from forcegp.models.training_data import TrainingData
 
 ROWS_PER_BLOCK = 4096
 """States that are predicted at once; bounds the memory of long recordings."""
@@ -35,7 +34,7 @@ Array = Tensor | np.ndarray | Sequence[Any]
 
 
 class Posterior(ABC):
-    """What a fitted model knows, as a frozen value.
+    """What a fitted model has learned, as a frozen value.
 
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
     (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
@@ -49,6 +48,8 @@ class Posterior(ABC):
     result: OptimizationResult
     target: MechanicalSystem | None = None
     """The system that predictions are for, where it is not that of the model (`with_system`)."""
+    engine: Any = None
+    """The Engine that computed the posterior, stored with the model; None where there is no choice."""
 
     @property
     def system(self) -> MechanicalSystem:
@@ -92,9 +93,15 @@ class Posterior(ABC):
         return "negative log likelihood with hyperpriors [nats]"
 
     @property
-    def speaks_of_forces(self) -> bool:
+    def predicts_forces(self) -> bool:
         """Whether predictions hold the forces behind the acceleration."""
         return True
+
+    @property
+    def speaks_of_forces(self) -> bool:
+        """`predicts_forces` under its name of version 0.1."""
+        warnings.warn("speaks_of_forces is deprecated; use predicts_forces", DeprecationWarning, stacklevel=2)
+        return self.predicts_forces
 
     @property
     def carries_known_forces(self) -> bool:
@@ -108,7 +115,7 @@ class Posterior(ABC):
         return self.system.dynamics(q, v, u)
 
     def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Prediction:
-        """Distribution of the acceleration and, where the model speaks of them, of the forces behind it.
+        """Distribution of the acceleration and, where the model predicts them, of the forces behind it.
 
         States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
         taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
@@ -141,7 +148,7 @@ class Posterior(ABC):
             covariance of `predict`; "none" leaves it out and prepares faster. "auto" is "compressed" after exact
             inference, and "exact" after another engine, which lacks what compression needs.
         tolerance, largest_rank: the rank is the smallest that keeps the tolerance, and at most `largest_rank`; a
-            NumericalWarning says where that does not suffice.
+            NumericalWarning is given where that does not suffice.
         compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device.
 
         Raises
@@ -165,8 +172,26 @@ class Posterior(ABC):
         return [x.reshape(-1, nv) for x in states], states[0].shape[:-1]
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
-        """What `rollout` integrates, under this stabilisation; for models that know no constraint it must be None."""
-        return PredictedAccelerations(self, baumgarte)
+        """What `rollout` integrates, under this stabilisation.
+
+        By default the mean of `predict`, from which no functions can be drawn. Raises InvalidInput for a stabilisation
+        where the model has no constraint.
+        """
+        if baumgarte is not None:
+            raise InvalidInput(
+                f"baumgarte was given, but a {type(self).__name__} has no constraint, so there is "
+                "nothing to stabilise; give baumgarte=None, and integrator='projected' to stay on the surface."
+            )
+
+        def mean() -> AccelerationFunction:
+            return lambda q, v, u: self.predict(q, v, u, covariance=False).mean
+
+        def sampled(samples: int, seed: int) -> AccelerationFunction:
+            raise InvalidInput(
+                f"no functions can be drawn from a {type(self).__name__}; give samples=0, or use a StructuredGP."
+            )
+
+        return AccelerationModel(self.system, None, mean, sampled)
 
     def rollout(
         self,
@@ -200,8 +225,9 @@ class Posterior(ABC):
             them.
         progress: called as progress(step, steps).
 
-        A motion that diverges is NaN from then on, `Rollout.diverged_at` tells where, and a NumericalWarning says so.
-        Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be projected.
+        A motion that diverges is NaN from then on, `Rollout.diverged_at` holds the row, and a NumericalWarning is
+        given. Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be
+        projected.
         """
         model = self.accelerations(baumgarte)
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed}
@@ -211,8 +237,8 @@ class Posterior(ABC):
         """How well training rows are predicted from those outside their block: in closed form, without another fit.
 
         `blocks` holds numbers of training rows; None leaves one row out at a time. Rows that follow each other in time
-        tell nearly the same, so leave them out together: `forcegp.data.time_blocks`. The parameters stay those that
-        were fitted to all rows, so the scores flatter a model with many of them a little.
+        hold nearly the same information, so leave them out together: `forcegp.data.time_blocks`. The parameters stay
+        those that were fitted to all rows, so the scores flatter a model with many of them a little.
         Raises InvalidInput for blocks that overlap, and for models that would have to be trained again.
         """
         raise InvalidInput(
@@ -260,13 +286,26 @@ class Posterior(ABC):
 
         Raises InvalidInput for a device that is not there. An `identification` stays where it was.
         """
-        return moved(self, device)  # type: ignore[return-value]  # of the same class, for its model made it
+        model = replace(self.model, system=self.model.system.to(device))
+        at: torch.device = model.system.robot.device
+        result = replace(
+            self.result,
+            parameters=_all_on(self.result.parameters, at),
+            iterates=tuple(_all_on(point, at) for point in self.result.iterates),
+        )
+        there = model.condition(
+            self.training.to(at),
+            _all_on(self.parameters, at),
+            result,
+            self.settings,
+            engine=self.engine,
+            solution=None if self.solution is None else self.solution.to(at),
+        )
+        return there if self.target is None else there.with_system(self.target.to(device))
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""
-        changed = copy.copy(self)
-        object.__setattr__(changed, "settings", {**self.settings, **settings})
-        return changed
+        return replace(self, settings={**self.settings, **settings})  # type: ignore[type-var]  # see the class
 
 
 class Model(ABC):
@@ -296,16 +335,22 @@ class Model(ABC):
         parameters: Mapping[str, Tensor],
         result: OptimizationResult,
         settings: Mapping[str, Any],
+        engine: Engine | None = None,
         solution: Tensor | None = None,
     ) -> Posterior:
         """The posterior at given parameters, without a search: what a stored model is loaded with.
 
-        `solution` is what its engine had found (`Posterior.solution`), which saves the engine most of its work.
+        `engine` computes it, where there is a choice; `solution` is what that engine had found (`Posterior.solution`),
+        which saves it most of its work.
         """
 
     @abstractmethod
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the parameters that a posterior on these points needs."""
+
+
+def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in tensors.items()}
 
 
 def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:

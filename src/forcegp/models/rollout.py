@@ -1,4 +1,4 @@
-"""`Rollout`: where a fitted model says that a robot goes, as a frozen value."""
+"""`Rollout`: where a robot goes according to a fitted model, as a frozen value."""
 
 from __future__ import annotations
 
@@ -13,14 +13,31 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.integration import ConstraintManifold, Feedback, Trajectory, integrate, integrator_named
-from forcegp.mechanics import Baumgarte
-from forcegp.models.accelerations import AccelerationFunction, AccelerationModel
+from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.search import blas_threads
 
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
 Quantity = Literal["q", "v", "a", "constraint", "velocity_constraint"]
+
+AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""(q, v, u) -> a, all of one shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class AccelerationModel:
+    """What a rollout integrates: accelerations of a fitted model in `system`, under the stabilisation of that rollout.
+
+    `mean()` is the mean acceleration at states (n, nv). `sampled(samples, seed)` are the accelerations of so many
+    functions drawn from the model, each at states of its own (samples, n, nv); it raises InvalidInput for models from
+    which none can be drawn.
+    """
+
+    system: MechanicalSystem
+    baumgarte: Baumgarte | None
+    mean: Callable[[], AccelerationFunction]
+    sampled: Callable[[int, int], AccelerationFunction]
 
 
 @dataclass(frozen=True, eq=False)

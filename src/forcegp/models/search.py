@@ -17,8 +17,6 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult, OptimizerOptions
-from forcegp.models.noise import ACCELERATION, FORCE
-from forcegp.models.physical_parameters import PHYSICAL
 from forcegp.parallel import Backend, Joblib, Serial
 
 RESTART_SPREAD = 0.7
@@ -27,10 +25,15 @@ none.
 """
 
 SMOOTHER = 4.0
-"""Factor on the length scales of odd restarts: measured, these escape the local optima of the start from moments."""
+"""Factor on the length scales of odd restarts. On one seed of the benchmark, without a mean, one start and three
+restarts around the moments all ended at an error of .1266, the smoother start at .109.
+"""
 
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
+
+KERNELS = "kernels."
+"""How the names of kernel parameters begin (`LatentKernels.initial_parameters`)."""
 
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
@@ -71,7 +74,7 @@ def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, T
     shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
     shifted = {}
     for name, value in start.items():
-        if name in (ACCELERATION, FORCE, PHYSICAL):
+        if not name.startswith(KERNELS):
             shifted[name] = value
             continue
         shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)
@@ -90,7 +93,7 @@ def run_restarts(
 ) -> Sequence[Outcome]:
     """`search(0, progress)`, `search(1, progress)`, ... on a backend, on which the outcomes do not depend.
 
-    Only this process can tell the progress. A single search needs no other process of this machine.
+    Only this process can report progress. A single search needs no other process of this machine.
     """
     if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
         return [search(index, progress) for index in range(restarts)]

@@ -8,38 +8,37 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from forcegp import __version__
+from forcegp.atomic_files import atomic_folder
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
-from forcegp.inference import OptimizationResult
+from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
-from forcegp.models.marginal_likelihood import TrainingData
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.stored_models import KINDS, kind_of
+from forcegp.models.training_data import TrainingData
 
-FORMAT_VERSION = 1
-TRANSFERRED = 2
-"""Format of a model that was carried to another system: programs that only know 1 would predict for the old system."""
-UPDATED = 3
-"""Format of a model whose rows are standardised by others than those that it is conditioned on: programs that only know
-1 and 2 would standardise by the wrong ones.
+FORMAT_VERSION = 6
+FEATURES = {
+    "target": "it was carried to another system, for which it predicts",
+    "reference": "its rows are standardised by others than those that it is conditioned on",
+    "windows": "it learned from windows, whose nodes are no rows",
+    "measured-torque": "its torques are noisy measurements",
+}
+"""What a stored model may hold beyond rows and parameters: a program that ignored one of these would predict wrongly,
+so each is declared in `model.json`, and a program refuses those that it cannot read.
 """
-WINDOWED = 4
-"""Format of a model that learned from windows: programs that only know 1 to 3 would take their nodes for rows."""
-MEASURED = 5
-"""Format of a model of measured torques: programs that only know 1 to 4 would predict as if torques were exact."""
+FEATURES_BEFORE = {1: set(), 2: {"target"}, 3: {"reference"}, 4: {"windows"}, 5: {"measured-torque"}}
+"""Formats 1 to 5 declared one feature by their number; other features could be there as well."""
 STATES = ("q", "v", "u", "a")
 NOISE, WEIGHTS = "noise_std", "weights"
 SOLUTION = "latent.solution"
@@ -48,7 +47,7 @@ ROBOT, TARGET = "robot.urdf", "target.urdf"
 
 
 def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write `posterior` as the folder `path`, under a temporary name that is renamed at the end.
+    """Write `posterior` as the folder `path`, whole or not at all; with `overwrite` an old model stays until then.
 
     Raises
     ------
@@ -68,7 +67,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     result = posterior.result
     document = {
         "kind": kind,
-        "format_version": _version(posterior),
+        "format_version": FORMAT_VERSION,
+        "features": _features(posterior),
         "forcegp_version": __version__,
         "torch_version": torch.__version__,
         "joint_names": list(posterior.joint_names),
@@ -85,6 +85,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
             "evaluations": result.evaluations,
             "cpu_seconds": result.cpu_seconds,
         },
+        "engine": None if posterior.engine is None else posterior.engine.to_dict(),
         "settings": dict(posterior.settings),
     }
     training = posterior.training
@@ -97,20 +98,13 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     if solution is not None:
         tensors[SOLUTION] = solution.detach().cpu().contiguous()
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
-    try:
-        save_file(tensors, temporary / "tensors.safetensors")
+    with atomic_folder(path, overwrite=overwrite) as folder:
+        folder.mkdir()
+        # safetensors' own `save_file` ignores the umask: only the user could read its files
+        (folder / "tensors.safetensors").write_bytes(save(tensors))
         for name, urdf in robots.items():
-            (temporary / name).write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
-        (temporary / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        _share(temporary)
-        if path.exists():
-            shutil.rmtree(path)
-        temporary.rename(path)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+            (folder / name).write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
+        (folder / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
@@ -124,22 +118,28 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     """
     path = Path(path)
     document = _document(path)
+    declared = _declared(path / "model.json", document)
     try:
         urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
         moved_to = None
-        if document["format_version"] == TRANSFERRED or "target" in document:
+        if "target" in declared or "target" in document:
             moved_to = _robot(path, TARGET, document.get("target_urdf_sha256"))
         tensors = load_file(path / "tensors.safetensors")
     except (OSError, SafetensorError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
+        settings = dict(document["settings"])
+        if settings.get("noise_from_data"):  # where formats 1 to 5 kept it
+            document["model"]["noise"]["from_data"] = True
         model = KINDS[document["kind"]].from_dict(system, document["model"])
+        stored_engine = document.get("engine", settings.get("engine"))  # formats 1 to 5 kept it among the settings
+        engine = None if stored_engine is None else engine_from_dict(stored_engine)
         target = None
         if moved_to is not None:
             target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
         training = _rows(TRAINING, tensors)
-        if document["format_version"] == UPDATED or any(name.startswith(REFERENCE) for name in tensors):
+        if "reference" in declared or any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
@@ -154,7 +154,6 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             float(result["cpu_seconds"]),
         )
         names = document["joint_names"]
-        settings = dict(document["settings"])
     except (KeyError, TypeError, ValueError, RuntimeError, ForceGPError) as error:
         raise FileFormatError(f"{path / 'model.json'} is incomplete or damaged: {error}") from None
     if document.get("units") != _plain(units_for(system.robot)):
@@ -168,25 +167,51 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     if solution is not None:
         _check_numbers(path / "tensors.safetensors", SOLUTION, solution)
     try:
-        posterior = model.condition(training, parameters, optimization, settings, solution)
+        posterior = model.condition(training, parameters, optimization, settings, engine, solution)
     except (InvalidInput, RuntimeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
-    if target is None:
-        return posterior
-    try:
-        return posterior.with_system(target)
-    except ForceGPError as error:
-        raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
+    if target is not None:
+        try:
+            posterior = posterior.with_system(target)
+        except ForceGPError as error:
+            raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
+    held = set(_features(posterior))
+    if not declared <= held or ("features" in document and declared != held):
+        raise FileFormatError(
+            f"{path} is damaged: it declares {_listed(declared)} and holds {_listed(held)}; fit the model again"
+        )
+    return posterior
 
 
-def _version(posterior: Posterior) -> int:
-    if getattr(posterior.model.noise, "measured_torque", False):
-        return MEASURED
-    if posterior.training.weights is not None:
-        return WINDOWED
-    if posterior.training.reference is not None:
-        return UPDATED
-    return FORMAT_VERSION if posterior.target is None else TRANSFERRED
+def _features(posterior: Posterior) -> list[str]:
+    """The names in `FEATURES` of what the posterior has."""
+    has = {
+        "target": posterior.target is not None,
+        "reference": posterior.training.reference is not None,
+        "windows": posterior.training.weights is not None,
+        "measured-torque": getattr(posterior.model.noise, "measured_torque", False),
+    }
+    return [name for name in FEATURES if has[name]]
+
+
+def _declared(file: Path, document: Mapping[str, Any]) -> set[str]:
+    """The features that `model.json` declares. Raises FileFormatError for those that this version cannot read."""
+    if document["format_version"] in FEATURES_BEFORE:
+        return FEATURES_BEFORE[document["format_version"]]
+    features = document.get("features")
+    if not isinstance(features, list) or not all(isinstance(name, str) for name in features):
+        raise FileFormatError(f"{file} is damaged: its features are {features!r}, not a list of names")
+    unknown = set(features) - set(FEATURES)
+    if unknown:
+        raise FileFormatError(
+            f"{file} has the features {_listed(unknown)}, which this forcegp {__version__} does not have (it has "
+            f"{_listed(FEATURES)}); use the version that wrote it ({document.get('forcegp_version')}) or fit again"
+        )
+    return set(features)
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(map(repr, sorted(names))) or "no features"
 
 
 def _row_tensors(prefix: str, rows: TrainingData) -> dict[str, torch.Tensor]:
@@ -247,10 +272,10 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in KINDS:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in range(FORMAT_VERSION, MEASURED + 1):
+    if version not in range(1, FORMAT_VERSION + 1):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION} to {MEASURED}; "
-            f"use the version that wrote it ({document.get('forcegp_version')}) or fit again"
+            f"{file} has format version {version!r}, this forcegp {__version__} reads 1 to {FORMAT_VERSION}; use "
+            f"the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document
 
@@ -262,15 +287,6 @@ def _robot(path: Path, name: str, sha256: str | None) -> str:
         what = "that the model was trained with" if name == ROBOT else "that the model was carried to"
         raise FileFormatError(f"{path / name} is not the robot {what} (its hash differs)")
     return urdf
-
-
-def _share(folder: Path) -> None:
-    """Give the folder and its files the permissions that the umask allows; temporary ones are private."""
-    mask = os.umask(0)
-    os.umask(mask)
-    folder.chmod(0o777 & ~mask)
-    for file in folder.iterdir():
-        file.chmod(0o666 & ~mask)
 
 
 def _is_model_folder(path: Path) -> bool:

@@ -8,12 +8,12 @@ from typing import Any, cast
 
 from forcegp.errors import FileFormatError
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.independent_gp import IndependentGP
-from forcegp.models.network_ensemble import NetworkEnsemble
-from forcegp.models.neural_network import NeuralNetwork
+from forcegp.models.baselines.independent_gp import IndependentGP
+from forcegp.models.baselines.network_ensemble import NetworkEnsemble
+from forcegp.models.baselines.neural_network import NeuralNetwork
 from forcegp.models.noise import Noise
 from forcegp.models.protocol import Model
-from forcegp.models.structured_gp import StructuredGP
+from forcegp.models.structured.gp import StructuredGP
 from forcegp.priors import prior_from_dict, prior_to_dict
 
 

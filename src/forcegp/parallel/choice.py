@@ -36,7 +36,7 @@ def backend_of(name: str, jobs: int | None = None, address: str | None = None) -
 def backend_for(given: Backend | str | None, jobs: int | None = None) -> Backend:
     """What a function means that takes both: a backend, its name, or None for processes as soon as jobs is above 1.
 
-    Raises InvalidInput as `backend_of`, and for a backend that says its jobs itself together with others.
+    Raises InvalidInput as `backend_of`, and for a backend with jobs of its own together with others.
     """
     if given is None:
         if jobs is not None:

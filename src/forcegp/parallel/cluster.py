@@ -98,7 +98,7 @@ class _Cluster(Workers):
         errors = self._ray.exceptions
         future: Future[Any] = Future()
         try:
-            complaint, outcome, told = self._ray.get(task)
+            complaint, outcome, warned = self._ray.get(task)
         except errors.RayTaskError as error:
             future.set_exception(error.cause if isinstance(error.cause, Exception) else error)
             return future
@@ -110,7 +110,7 @@ class _Cluster(Workers):
             ) from None
         if complaint is not None:
             raise BackendError(complaint)
-        return replayed(outcome, told)
+        return replayed(outcome, warned)
 
 
 def versions() -> dict[str, str]:
@@ -120,7 +120,7 @@ def versions() -> dict[str, str]:
 
 
 def _portable_work() -> Callable[..., Any]:
-    """What runs on a machine of the cluster. A function in a function travels whole, so it can say what is missing."""
+    """What runs on a machine of the cluster. A function in a function travels whole, so it can name what is missing."""
 
     def work(
         expected: dict[str, str], function: bytes, own: bytes, shared: list[int], *sent: bytes
@@ -144,7 +144,7 @@ def _portable_work() -> Callable[..., Any]:
         arguments = pickle.loads(own)
         for place, value in zip(shared, sent, strict=True):
             arguments.insert(place, pickle.loads(value))
-        outcome, told = recorded(pickle.loads(function), arguments)
-        return None, outcome, told
+        outcome, warned = recorded(pickle.loads(function), arguments)
+        return None, outcome, warned
 
     return inspect.unwrap(work)  # what checks annotations at run time, as the tests do, cannot travel

@@ -73,7 +73,7 @@ def connected(address: str | None, jobs: int | None) -> Any:
 
 @contextmanager
 def _without_notices() -> Iterator[None]:
-    """Ray tells at every start of a cluster how others are kept out of it; errors are told as ever."""
+    """Without the note that Ray prints at every start of a cluster; errors are printed as ever."""
     logger = logging.getLogger("ray")
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -88,7 +88,7 @@ def host_and_port(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
     if "/" in address or not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InvalidInput(
-            f"the address of the Ray cluster is {address!r}; give HOST:PORT of its head as `ray start --head` tells "
+            f"the address of the Ray cluster is {address!r}; give HOST:PORT of its head as `ray start --head` prints "
             "it, for example 10.0.0.1:6379"
         )
     return host.strip("[]"), int(port)
@@ -130,7 +130,7 @@ def _require_alive(address: str) -> None:
     host, port = host_and_port(address)
     remedy = (
         f"start it with `ray start --head --port={port}` on {host}, or give the address of one that runs (`ray status` "
-        "there tells)"
+        "there prints)"
     )
     try:
         socket.create_connection((host, port), timeout=ANSWER_SECONDS).close()
@@ -142,5 +142,5 @@ def _require_alive(address: str) -> None:
     except subprocess.TimeoutExpired:
         raise BackendError(f"what answers at {address} is no Ray cluster, or one too busy; {remedy}") from None
     if found.returncode != 0:
-        told = found.stdout.strip().splitlines() or ["the connection was lost"]
-        raise BackendError(f"the Ray cluster at {address} cannot be used ({told[-1]}); {SAME}")
+        lines = found.stdout.strip().splitlines() or ["the connection was lost"]
+        raise BackendError(f"the Ray cluster at {address} cannot be used ({lines[-1]}); {SAME}")

@@ -60,7 +60,7 @@ class _Processes(Workers):
         while True:
             ended, _ = wait(self._at_work, return_when=FIRST_COMPLETED)
             tasks = [(future, self._at_work.pop(future)) for future in ended]
-            # Other breaks of the pool are exceptions of the task: what a worker cannot unpickle, say.
+            # Other breaks of the pool are exceptions of the task: for example what a worker cannot unpickle.
             died = [task for future, task in tasks if isinstance(future.exception(), TerminatedWorkerError)]
             if died:
                 self._begin_again(died)

@@ -25,7 +25,7 @@ ONE_THREAD = {
 }
 """Environment of a worker; the libraries read it when they are loaded."""
 
-Told = tuple[str, type[Warning], str, int]
+RecordedWarning = tuple[str, type[Warning], str, int]
 """A warning: its text, category, file and line."""
 
 _SHOWN: dict[Any, Any] = {}
@@ -58,7 +58,7 @@ def begin_process(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def recorded(function: Callable[..., Any], arguments: Sequence[Any]) -> tuple[Any, list[Told]]:
+def recorded(function: Callable[..., Any], arguments: Sequence[Any]) -> tuple[Any, list[RecordedWarning]]:
     """The outcome, and every warning on the way."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -66,11 +66,11 @@ def recorded(function: Callable[..., Any], arguments: Sequence[Any]) -> tuple[An
     return outcome, [(str(each.message), each.category, each.filename, each.lineno) for each in caught]
 
 
-def replayed(outcome: Any, told: Sequence[Told]) -> Future[Any]:
+def replayed(outcome: Any, warned: Sequence[RecordedWarning]) -> Future[Any]:
     """The outcome after its warnings have been given here; where these are errors, the first is the exception."""
     future: Future[Any] = Future()
     try:
-        for text, category, file, line in told:
+        for text, category, file, line in warned:
             warnings.warn_explicit(text, category, file, line, registry=_SHOWN)
     except Warning as error:
         future.set_exception(error)

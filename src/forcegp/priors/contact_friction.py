@@ -122,7 +122,7 @@ class ContactFriction(ExpressedKernels):
         if self.axes == "isotropic":
             directions = tangents @ motion
         elif "velocity" in self.inputs and not self.viscous:
-            directions = tangents  # the latents are functions of the velocity, and know its sign
+            directions = tangents  # the latents are functions of the velocity, sign included
         else:
             directions = tangents * motion.mT
         if self.load:

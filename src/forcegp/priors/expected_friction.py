@@ -61,7 +61,7 @@ class ExpectedFriction:
     """What is expected of the friction that changes a normal force.
 
     sliding: friction coefficient over the sliding speed (m/s); joints: joint name -> resisting force (Nm or N) over the
-    joint's velocity. Curves may be negative, as those that a fit has found can be where the data say little.
+    joint's velocity. Curves may be negative, as those that a fit has found can be where the data are few.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -102,10 +102,10 @@ class ExpectedFriction:
         With the multiplier lambda_0 under known forces and joint friction, and sliding along the unit vector d with the
         coefficient mu, lambda = lambda_0 - mu |s_p lambda| g, where g = (d lambda / d Q_U) J_p^T d, so that
         |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g). Where that divisor is below `SMALLEST_SHARE`, it is set
-        to it, and a NumericalWarning says so.
+        to it, with a NumericalWarning.
         """
         state, multiplier = dynamics.state, dynamics.multiplier_map()
-        robot = state.kinematics.robot
+        robot = state.robot
         rows = multiplier.matrix[..., contact, :]
         free = multiplier.offset[..., contact]
         for index, (_, curve) in zip(joint_indices([name for name, _ in self.joints], robot), self.joints, strict=True):
@@ -119,7 +119,7 @@ class ExpectedFriction:
 
 
 def _warn_of_jamming(growth: Tensor, contact: int) -> None:
-    """Nothing is said while torch transforms or records the function, where no value may decide anything."""
+    """No warning while torch transforms or records the function, where no value may decide anything."""
     if torch._C._are_functorch_transforms_active() or _get_current_dispatch_mode() is not None:
         return
     jammed = growth.detach() < SMALLEST_SHARE

@@ -23,7 +23,7 @@ class ExpressedKernels(ForcePrior):
     @property
     def kernel_expression(self) -> str:
         """An expression of `forcegp.priors.kernel_of`."""
-        assert isinstance(self.kernel, str), "a prior whose kernel may be None says which one that is"
+        assert isinstance(self.kernel, str), "a prior whose kernel may be None overrides this"
         return self.kernel
 
     @override

@@ -1,4 +1,4 @@
-"""What every prior on the unknown force says: Q_U(x) = B(x) f(z(x)) with independent scalar Gaussian processes f_c."""
+"""What every prior on the unknown force defines: Q_U(x) = B(x) f(z(x)) with independent Gaussian processes f_c."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ForcePrior(ABC):
     """A prior on the joint force that nobody modelled.
 
     A new prior is one subclass with the five abstract methods, and an entry in `forcegp.priors.PRIORS` so that models
-    with it can be stored. All methods are pure: the same states give the same answer. Priors add up: `a + b` says that
+    with it can be stored. All methods are pure: the same states give the same answer. Priors add up: `a + b` means that
     the unknown force is the sum of what the two describe.
     """
 
@@ -68,7 +68,7 @@ class ForcePrior(ABC):
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"] | None:
         """Force in N along the axes of the world that one unit of each latent exerts on a point of the robot.
 
-        None for priors that speak of joint forces only.
+        None for priors of joint forces only.
         """
         return None
 
@@ -92,13 +92,15 @@ class ForcePrior(ABC):
         return SumPrior((*self.summands(), *other.summands()))
 
 
+# Here because `ForcePrior.__add__` makes sums. Columns of B, features and kernels stand side by side, so one fit learns
+# all terms, and `posterior.components` finds each by its slice of the latents.
 @dataclass(frozen=True)
 class SumPrior(ForcePrior):
     """Q_U = sum of what the `terms` describe, independent of each other: `JointFriction() + ContactFriction()`.
 
     Columns of B, features and kernels stand side by side, so that one fit learns them all and every term can be asked
     for afterwards. Sums among the terms are taken apart. Raises InvalidInput for fewer than two terms and for two
-    equal ones, which no data could tell apart.
+    equal ones, which no data could separate.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -118,7 +120,7 @@ class SumPrior(ForcePrior):
             raise InvalidInput(f"a SumPrior has {len(terms)} terms; give two or more, or use the prior itself")
         for index, term in enumerate(terms):
             if term in terms[:index]:
-                raise InvalidInput(f"the sum has {term.title!r} twice, which no data can tell apart; give it once")
+                raise InvalidInput(f"the sum has {term.title!r} twice, which no data can separate; give it once")
         object.__setattr__(self, "terms", terms)
 
     @override

@@ -58,7 +58,7 @@ class JointForces(ExpressedKernels):
         state = dynamics.state
         columns = {"q": state.q, "v": state.v, "u": state.u}
         if self.angles == "sin-cos":
-            turns = _turns(state.kinematics.robot)
+            turns = _turns(state.robot)
             q = state.q
             columns["q"] = torch.cat([q[..., ~turns], q[..., turns].sin(), q[..., turns].cos()], dim=-1)
         z = torch.cat([columns[name] for name in self.inputs], dim=-1)

@@ -23,7 +23,7 @@ class JointFriction(PerJointPrior, ExpressedKernels):
 
     The kernel "friction" gives f_j(v) = tanh(v / w) g(v) + d v with a learned velocity scale w and an unknown level g
     (`priors/friction_kernel.py`): Coulomb, Stribeck and viscous friction, zero at rest, and different in the two
-    directions if the data say so (Armstrong-Helouvry, Dupont & Canudas de Wit 1994 list these parts). Velocities are
+    directions if the data show it (Armstrong-Helouvry, Dupont & Canudas de Wit 1994 list these parts). Velocities are
     only scaled, never shifted, so that zero stays zero. `joints` restricts the prior to some joints, by name.
     """
 

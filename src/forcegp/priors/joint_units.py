@@ -1,4 +1,4 @@
-"""Units of what belongs to joints, and names that say them: some joints turn, some slide."""
+"""Units of what belongs to joints, and names with units: some joints turn, some slide."""
 
 from __future__ import annotations
 

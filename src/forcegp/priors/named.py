@@ -26,7 +26,7 @@ from forcegp.priors.tool_forces import ToolForces
 class NamedPrior:
     """A prior under a short name: what it is for, its class, and what differs from the defaults of that class.
 
-    The class, or any other callable, is asked for its parameters; their defaults tell how options are read.
+    The class, or any other callable, is asked for its parameters; their defaults decide how options are read.
     """
 
     summary: str
@@ -55,7 +55,7 @@ NAMED_PRIORS: dict[str, NamedPrior] = {
     "joint-accelerations": NamedPrior("accelerations without the contacts, on (q, v, u)", JointAccelerations),
     "none": NamedPrior("no unknown force at all", NoForces),
 }
-"""What `named_prior` and `forcegp fit --prior` know. Add your own: NAMED_PRIORS["mine"] = NamedPrior(..., MyPrior)."""
+"""The names that `named_prior` and `--prior` take. Add your own: NAMED_PRIORS["mine"] = NamedPrior(..., MyPrior)."""
 
 
 def named_prior(expression: str, system: MechanicalSystem | None = None) -> ForcePrior:

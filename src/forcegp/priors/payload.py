@@ -1,4 +1,4 @@
-"""`Payload`: the weight of something that the robot carries and nobody told the model about."""
+"""`Payload`: the weight of something that the robot carries and the model does not contain."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Payload(ForcePrior):
     """Q_U = J_p^T m g + J_w^T sum_k (m c_k) R e_k x g: weight of an unknown mass m at c in the axes of link `frame`.
 
     J_p and J_w are the linear and angular Jacobians at the origin of `frame`, R its orientation. The four latents are
-    constants: m (kg) and the first moments m c (kg m), normal about zero, so the posterior tells mass and place with
+    constants: m (kg) and the first moments m c (kg m), normal about zero, so the posterior has mass and place with
     their covariance. It is the gravity of the load alone, which is what slow motions show; for its inertia, learn the
-    parameters of the link (`fit(..., learn=robot.link(frame).inertial("mass", "com"))`). With `moments=False` the load
+    parameters of the link (`StructuredGP.identify`). With `moments=False` the load
     is a point mass at the origin of the frame.
     """
 
@@ -77,7 +77,7 @@ class Payload(ForcePrior):
 
     @override
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
-        gravity = dynamics.state.kinematics.robot.gravity
+        gravity = dynamics.state.robot.gravity
         columns = torch.stack([gravity, *[torch.zeros_like(gravity)] * (3 if self.moments else 0)], dim=-1)
         return columns.expand(*dynamics.state.q.shape[:-1], *columns.shape)
 

@@ -21,7 +21,7 @@ from forcegp.robots import Robot
 class PerJointPrior(ForcePrior):
     """Q_U,j = f_j(x_j), or minus that, in Nm or N: an independent function per joint, of its own position or velocity.
 
-    A subclass is a dataclass with the field `joints` (names as `chosen_joints` gives them, None: all), and says by
+    A subclass is a dataclass with the field `joints` (names as `chosen_joints` gives them, None: all), and defines by
     `depends_on` what x_j is: "q" or "v".
     """
 
@@ -40,14 +40,14 @@ class PerJointPrior(ForcePrior):
     def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
         H = dynamics.H
         columns = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
-        columns = columns[:, joint_indices(self.joints, dynamics.state.kinematics.robot)]
+        columns = columns[:, joint_indices(self.joints, dynamics.state.robot)]
         return columns.expand(*H.shape[:-2], *columns.shape)
 
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state = dynamics.state
         x = {"q": state.q, "v": state.v}[self.depends_on]
-        return tuple(x[..., index, None] for index in joint_indices(self.joints, state.kinematics.robot))
+        return tuple(x[..., index, None] for index in joint_indices(self.joints, state.robot))
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:

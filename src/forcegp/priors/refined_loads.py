@@ -19,7 +19,7 @@ def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior |
     """The same prior, where isotropic `ContactFriction` with a load and no `expected` expects the friction in `table`.
 
     A first fit takes the normal force under the known forces alone; its posterior mean of the sliding friction, and of
-    the `JointFriction` beside it in the sum, tells a better one, with which a second fit finds better curves, and so
+    the `JointFriction` beside it in the sum, gives a better one, with which a second fit finds better curves, and so
     on. An `expected` that is there was given on purpose and stays. None for priors without such a term.
     """
     terms = prior.summands()

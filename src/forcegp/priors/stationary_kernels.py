@@ -10,6 +10,10 @@ from torch import Tensor
 
 from forcegp.priors.kernel_parameters import float64, log_scale, register_log_normal_prior
 
+# Chosen among six priors on `kuka-surface`, training seeds 1-5, tested on the next seed: without an analytical mean the
+# coverage of the 95 % interval rose from .895-.937 to .934-.954 at the same error, with the mean nothing changed much.
+# The prior of Hvarfner et al. itself (shift sqrt 2, spread sqrt 3) was as calibrated but less accurate (.1125 against
+# .1061). These seeds chose it, so no reported figure uses them.
 LOG_LENGTHSCALE_SHIFT = 3.0
 LOG_LENGTHSCALE_SPREAD = 2.0
 
@@ -26,8 +30,7 @@ def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outp
     `lengthscale` (scalar or (dimension,)) and `outputscale` (variance) are the start values. The length scales carry a
     wide normal prior on their logarithm, N(log sqrt(dimension) + 3, 2^2), for standardised inputs: most inputs matter
     little to most forces, and with fewer points than parameters plain maximum likelihood finds relevance by chance. It
-    is the dimension-scaled prior of Hvarfner et al. (2024), shifted to longer and made wider; measured in
-    docs/architecture.md.
+    is the dimension-scaled prior of Hvarfner et al. (2024), shifted to longer and made wider.
     """
     return _scaled(RBFKernel(ard_num_dims=dimension, lengthscale_constraint=log_scale()), lengthscale, outputscale)
 
@@ -52,7 +55,7 @@ def rational_quadratic(dimension: int, variance: float | Tensor) -> ScaleKernel:
     """k = variance (1 + r^2 / (2 alpha))^-alpha: a mixture of squared exponentials of many length scales.
 
     Source: Rasmussen & Williams (2006), eq. 4.19. It starts at alpha = 1 with log alpha ~ N(0, 2^2), because nothing
-    tells a large alpha from a larger one.
+    separates a large alpha from a larger one.
     """
     base = RQKernel(ard_num_dims=dimension, lengthscale_constraint=log_scale(), alpha_constraint=log_scale())
     kernel = _scaled(base, math.sqrt(dimension), variance)

@@ -1,17 +1,5 @@
 """Logs of real robots: files of many formats as tables of columns, and what the columns mean."""
 
-from forcegp.recordings.formats import open_source
-from forcegp.recordings.importing import ImportOptions, import_recordings
-from forcegp.recordings.mapping import ColumnMapping
-from forcegp.recordings.mapping_file import mapping_text, read_mapping
-from forcegp.recordings.source import Source
+import lazy_loader as lazy
 
-__all__ = [
-    "ColumnMapping",
-    "ImportOptions",
-    "Source",
-    "import_recordings",
-    "mapping_text",
-    "open_source",
-    "read_mapping",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

@@ -23,7 +23,7 @@ class ArrayFile(Source):
 
     With `within`, only what is under that name counts, and names begin after it: a file with one array or one group per
     episode is read as one table per episode. An array by itself is then `[0] ... [k-1]`.
-    Subclasses say which arrays there are (`shapes`) and give them in pieces (`blocks`).
+    Subclasses list the arrays (`shapes`) and give them in pieces (`blocks`).
     """
 
     __no_type_check__: ClassVar[bool] = True
@@ -90,8 +90,10 @@ class ArrayFile(Source):
         shapes = self.shapes()
         lengths = {shapes[array][0] for array in arrays}
         if len(lengths) > 1:
-            told = ", ".join(f"{array} {shapes[array][0]}" for array in arrays)
-            raise FileFormatError(f"{self.path}: its arrays have different numbers of rows ({told}); map those of one.")
+            listed = ", ".join(f"{array} {shapes[array][0]}" for array in arrays)
+            raise FileFormatError(
+                f"{self.path}: its arrays have different numbers of rows ({listed}); map those of one."
+            )
         for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
             tables = dict(zip(arrays, pieces, strict=True))
             columns: Columns = {}

@@ -15,11 +15,11 @@ WORDS = {
     "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
     "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
 }
-"""What the rest of a column's name, beside that of the joint, must say."""
+"""What the rest of a column's name, beside that of the joint, must mean."""
 
 
 def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple[str, ...] | None:
-    """One column per joint whose names are the joint's name in a text that says `signal`; None if there is none.
+    """One column per joint whose names are the joint's name in a text that means `signal`; None if there is none.
 
     Raises InvalidInput if several sets of columns could be meant.
     """
@@ -35,8 +35,8 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
         if len(found) == len(joints) and _says(signal, around)
     ]
     if len(fitting) > 1:
-        told = " or ".join(", ".join(columns) for columns in fitting)
-        raise InvalidInput(f"{source.path}: {signal} could be {told}; say which with --{signal}.")
+        candidates = " or ".join(", ".join(columns) for columns in fitting)
+        raise InvalidInput(f"{source.path}: {signal} could be {candidates}; choose with --{signal}.")
     return fitting[0] if fitting else None
 
 
@@ -47,7 +47,7 @@ def guessed_time(source: Source, used: Sequence[str]) -> str | None:
         return by_format
     named = [column for column in source.columns() if column.lower() in WORDS["time"]]
     if len(named) > 1:
-        raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; say which with --time.")
+        raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; choose with --time.")
     return named[0] if named else None
 
 
@@ -55,5 +55,5 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     """Do the last word before the joint's name or the first after it name the signal?"""
     before = re.split(r"[^A-Za-z_]+", around[0].rstrip("_.:/ -["))[-1]
     after = re.split(r"[^A-Za-z_]+", around[1].lstrip("_.:/ -]"))[0]
-    told = {word.strip("_").lower() for word in (before, after)} - {""}
-    return bool(told & WORDS[signal])
+    words = {word.strip("_").lower() for word in (before, after)} - {""}
+    return bool(words & WORDS[signal])

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
@@ -31,14 +33,14 @@ _RAGGED = re.compile(r"(?:Row #(\d+): )?Expected (\d+) columns, got (\d+)")
 
 
 class DelimitedText(Source):
-    """A table as text. The first line that is not a comment (#) names the columns, unless `headerless` says how many.
+    """A table as text. The first line that is not a comment (#) names the columns, unless `headerless` counts them.
 
     Parameters
     ----------
     path: .csv, .tsv, .txt or .dat, also with .gz.
     headerless: number of columns of a file without a header; they are called c1, c2, ... Where every line holds one
         number, so many lines make a row.
-    delimiter: ",", ";", tab, another single letter, or "blanks" for any run of them. Default: told from the
+    delimiter: ",", ";", tab, another single letter, or "blanks" for any run of them. Default: detected from the
         first lines.
     """
 
@@ -71,7 +73,7 @@ class DelimitedText(Source):
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
-        self._delimiter = delimiter or _told(lines, self.path)
+        self._delimiter = delimiter or _detected_delimiter(lines, self.path)
         self._lines_before = skipped
         fields = self._fields(lines[0])
         self._lines_per_row = 1
@@ -98,7 +100,7 @@ class DelimitedText(Source):
             raise FileFormatError(f"{self.path} begins with {fields[0]!r}, which is no number; leave --headerless out.")
         if len(fields) not in (1, width):
             raise FileFormatError(
-                f"{self.path} has {len(fields)} numbers on its first line; --headerless says {width} in a row. "
+                f"{self.path} has {len(fields)} numbers on its first line; --headerless is {width}. "
                 "Either so many stand on every line, or one."
             )
         self._columns = [f"c{index + 1}" for index in range(width)]
@@ -133,8 +135,6 @@ class DelimitedText(Source):
             raise
 
     def _read(self, names: Sequence[str], rows: int, *, threads: bool) -> Iterator[Columns]:
-        import pyarrow as pa
-        from pyarrow import csv as arrow_csv
 
         stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns
@@ -207,7 +207,7 @@ def _remedy(value: str) -> str:
 
 
 def _numbers(column) -> np.ndarray:
-    if column.null_count:  # an empty field is a missing value; where and what is said by who uses it
+    if column.null_count:  # an empty field is a missing value; the caller reports where
         return column.to_numpy(zero_copy_only=False).astype(np.float64)
     return column.to_numpy(zero_copy_only=True)
 
@@ -219,7 +219,7 @@ def _pieces(batches: Iterator[Columns], rows: int) -> Iterator[Columns]:
             yield {name: values[start : start + rows] for name, values in batch.items()}
 
 
-def _told(lines: Sequence[str], path: Path) -> str:
+def _detected_delimiter(lines: Sequence[str], path: Path) -> str:
     """The delimiter that stands equally often in the header and in the first row."""
     for letter in ("\t", ",", ";"):
         counts = {line.count(letter) for line in lines}
@@ -228,5 +228,5 @@ def _told(lines: Sequence[str], path: Path) -> str:
     if all(len(line.split()) == len(lines[0].split()) for line in lines) and len(lines[0].split()) > 1:
         return BLANKS
     if any(letter in lines[0] for letter in ";|") or len(lines[0].split()) > 1:
-        raise FileFormatError(f"{path}: cannot tell what separates its columns; add --delimiter.")
+        raise FileFormatError(f"{path}: its delimiter cannot be detected; add --delimiter.")
     return ","

@@ -7,10 +7,11 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+import forcegp.mechanics
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings.array_file import ArrayFile
@@ -25,13 +26,10 @@ from forcegp.recordings.source import Source
 from forcegp.recordings.spool import Spool
 from forcegp.recordings.time_stamps import Stamps, read_stamps
 
-if TYPE_CHECKING:
-    from forcegp.mechanics import MechanicalSystem
-
 ROUND_RATE = 1e-3
 """A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
 
-Report = Callable[[int, int, str], None]
+Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +78,9 @@ def import_recordings(
     out: str | Path,
     mapping: ColumnMapping,
     *,
-    system: MechanicalSystem | None = None,
+    system: forcegp.mechanics.MechanicalSystem | None = None,
     options: ImportOptions | None = None,
-    report: Report = lambda done, total, note: None,
+    report: Progress = lambda done, total, note: None,
 ) -> dict[str, Any]:
     """Write the dataset that these logs hold and return what was done, which is also `metadata["import"]`.
 
@@ -161,7 +159,7 @@ def _read(
     spool: Spool,
     label: str,
     mapping: ColumnMapping,
-    system: MechanicalSystem | None,
+    system: forcegp.mechanics.MechanicalSystem | None,
     options: ImportOptions,
 ) -> RawRecording:
     robot = None if system is None else system.robot

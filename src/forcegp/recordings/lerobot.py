@@ -24,7 +24,7 @@ class LeRobotFolder(Source):
 
     Columns are those of the Parquet files; where `info.json` names the elements of a list, they are
     `observation.state.<name>`. `timestamp` is the time and `episode_index` the episode. Videos are not looked at.
-    Raises FileFormatError if the files do not hold what `info.json` says.
+    Raises FileFormatError if the files do not hold what `info.json` states.
     """
 
     __no_type_check__: ClassVar[bool] = True
@@ -67,10 +67,10 @@ class LeRobotFolder(Source):
         return found
 
     def _check(self, info: Mapping[str, Any], features: Mapping[str, Any]) -> None:
-        rows, said = sum(part.rows for part in self._parts), info.get("total_frames")
-        if rows != said:
+        rows, stated = sum(part.rows for part in self._parts), info.get("total_frames")
+        if rows != stated:
             raise FileFormatError(
-                f"{self.path}: meta/info.json says {said} frames, the data files hold {rows}; copy the dataset again."
+                f"{self.path}: meta/info.json has {stated} frames, the data files hold {rows}; copy the dataset again."
             )
         first = self._parts[0].columns()
         for part in self._parts[1:]:
@@ -81,7 +81,7 @@ class LeRobotFolder(Source):
             width = len(self._parts[0].vectors.get(name, ()))
             if width and shape and list(shape) != [width]:
                 raise FileFormatError(
-                    f"{self.path}: meta/info.json says that {name!r} has the shape {list(shape)}; "
+                    f"{self.path}: meta/info.json states that {name!r} has the shape {list(shape)}; "
                     f"the data files have {width} elements."
                 )
 

@@ -28,7 +28,7 @@ class ColumnMapping:
     episode: a column that numbers the episodes.
     episodes: a pattern (`piece*`) for arrays or groups of the file, each of which is an episode.
     headerless: for text without header, the columns of each file in their order.
-    delimiter: for text, if it cannot be told.
+    delimiter: for text, if it cannot be detected.
     side_by_side: the files given are one recording, not one each.
 
     Raises InvalidInput for units that do not exist and numbers that make no sense.

@@ -17,7 +17,6 @@ from forcegp.recordings.source import reading
 
 LARGEST = 2**20  # bytes
 OF_FOLDER = "forcegp.yaml"
-TEXTS = ("time", "episode", "episodes", "delimiter")
 
 
 class _OnceLoader(yaml.SafeLoader):
@@ -138,13 +137,13 @@ def _by_signal(key: str, value: Any) -> Mapping[str, Any]:
     if isinstance(value, dict):
         return {str(name): entry for name, entry in value.items()}
     if key != "sign":
-        raise InvalidInput(f"{key} is {value!r}; say of which signal, for example {_EXAMPLES[key]}.")
+        raise InvalidInput(f"{key} is {value!r}; name its signal, for example {_EXAMPLES[key]}.")
     return dict.fromkeys(SIGNALS, value)
 
 
 def _dict(key: str, value: Any) -> Mapping[Any, Any]:
     if not isinstance(value, dict):
-        raise InvalidInput(f"{key} is {value!r}; say of what, for example {_EXAMPLES[key]} ({', '.join(UNITS)}).")
+        raise InvalidInput(f"{key} is {value!r}; name the quantity, for example {_EXAMPLES[key]} ({', '.join(UNITS)}).")
     return value
 
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow
+import pyarrow as pa
+import pyarrow.compute as pc
+from pyarrow import parquet, types
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError
@@ -20,9 +24,6 @@ from forcegp.recordings.source import (
     require_distinct,
 )
 
-if TYPE_CHECKING:
-    import pyarrow
-
 
 class ParquetFile(Source):
     """A Parquet file: its numeric columns, and the elements of its columns of lists of equal length.
@@ -35,8 +36,6 @@ class ParquetFile(Source):
 
     def __init__(self, path: Path, *, names: Mapping[str, Sequence[str]] | None = None) -> None:
         super().__init__(path)
-        import pyarrow as pa
-        from pyarrow import parquet
 
         self._scalars: dict[str, str] = {}
         self._elements: dict[str, tuple[str, int]] = {}
@@ -79,8 +78,6 @@ class ParquetFile(Source):
 
     @override
     def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        import pyarrow as pa
-        from pyarrow import parquet
 
         self.require(names)
         stored = list(dict.fromkeys(self._elements[name][0] if name in self._elements else name for name in names))
@@ -104,7 +101,6 @@ class ParquetFile(Source):
                 yield columns
 
     def _table(self, column: pyarrow.Array, name: str, row: int) -> np.ndarray:
-        import pyarrow.compute as pc
 
         width = self._widths[name]
         lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
@@ -123,12 +119,10 @@ def _plain(column: pyarrow.Array) -> np.ndarray:
 
 
 def _is_number(kind: pyarrow.DataType) -> bool:
-    from pyarrow import types
 
     return types.is_floating(kind) or types.is_integer(kind)
 
 
 def _is_list(kind: pyarrow.DataType) -> bool:
-    from pyarrow import types
 
     return types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)

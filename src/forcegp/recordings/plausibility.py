@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+import forcegp.robots
 from forcegp.errors import DatasetError, DataWarning
 from forcegp.recordings.reading import RawRecording
 from forcegp.recordings.signal_plan import SignalPlan
-
-if TYPE_CHECKING:
-    from forcegp.robots import Robot
 
 BEYOND = 0.1
 """Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
 
 TURNS = 4.0 * np.pi
-"""rad: positions of a joint beyond this that are not said to be in rad are taken for degrees."""
+"""rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees."""
 
 STRONGER = 3.0
 """Times the limit of the URDF that a force may be before it is warned of."""
 
 
-def require_plausible_positions(recording: RawRecording, plan: SignalPlan, robot: Robot | None, stated: bool) -> None:
+def require_plausible_positions(
+    recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None, stated: bool
+) -> None:
     """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees.
 
-    `stated` says that the unit of q was given, which is then believed where no URDF contradicts it.
+    `stated`: the unit of q was given, which is then believed where no URDF contradicts it.
     Raises DatasetError naming the joint, its range and what to do.
     """
     limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
@@ -51,7 +50,7 @@ def require_plausible_positions(recording: RawRecording, plan: SignalPlan, robot
             )
 
 
-def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot: Robot | None) -> None:
+def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None) -> None:
     """Warn (DataWarning) of forces far beyond the limits of the URDF."""
     limits = {} if robot is None else {joint.name: joint.effort_limit for joint in robot.joints}
     for index, item in enumerate(plan.signals):

@@ -6,7 +6,6 @@ chunk by chunk instead, which takes a fraction of the time; every other bag goes
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
@@ -15,12 +14,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from forcegp.errors import FileFormatError
+from forcegp.recordings.mcap_chunks import RECORD, Chunk, mcap_chunks
 
 MESSAGE = 0x05
 """Opcode of a message in MCAP: channel u16, sequence u32, log time u64, publish time u64, then its bytes."""
 
 BEFORE_MESSAGE = 22
-RECORD = struct.Struct("<BQ")  # opcode, length
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,8 @@ class RawMessages:
 
 def topic_messages(reader: Any, connections: Sequence[Any], rows: int) -> Iterator[RawMessages]:
     """The messages of these connections of a `rosbags` reader, at most `rows` at a time."""
-    stores = _ordered_mcap(reader)
-    if stores is None:
+    chunks = _ordered_chunks(reader)
+    if chunks is None:
         messages = reader.messages(connections)
         while batch := list(islice(messages, rows)):
             raw = [bytes(data) for _, _, data in batch]
@@ -50,40 +49,19 @@ def topic_messages(reader: Any, connections: Sequence[Any], rows: int) -> Iterat
             stamps = np.fromiter((stamp for _, stamp, _ in batch), np.int64, len(batch))
             yield RawMessages(np.frombuffer(b"".join(raw), np.uint8), np.cumsum(lengths) - lengths, lengths, stamps)
         return
-    topics = {connection.topic for connection in connections}
-    for store in stores:
-        channels = [connection.id for connection in store.connections if connection.topic in topics]
-        for chunk in store.chunks:
-            if any(chunk.channel_count.get(channel, 0) for channel in channels):
-                yield from _of_chunk(_expanded(store, chunk), channels, rows)
+    wanted = {connection.topic for connection in connections}
+    for chunk in chunks:
+        channels = [channel for channel, topic in chunk.topics.items() if topic in wanted]
+        if any(chunk.counts.get(channel, 0) for channel in channels):
+            yield from _of_chunk(chunk.records(), channels, rows)
 
 
-def _ordered_mcap(reader: Any) -> list[Any] | None:
-    """The MCAP files of a bag if their chunks do not overlap in time and nothing but chunks is compressed."""
-    if len(reader.readers) != 1 or not hasattr(reader.readers[0], "storage"):
+def _ordered_chunks(reader: Any) -> list[Chunk] | None:
+    """The chunks of a bag if they do not overlap in time."""
+    chunks = mcap_chunks(reader)
+    if chunks is None or any(one.end > other.begin for one, other in pairwise(chunks)):
         return None
-    storage = reader.readers[0].storage
-    if getattr(storage.metadata, "compression_mode", None) == "message":
-        return None
-    stores = list(getattr(storage, "storages", [storage]))
-    if not all(getattr(store, "chunks", None) for store in stores):
-        return None
-    chunks = [chunk for store in stores for chunk in store.chunks]
-    ordered = all(one.message_end_time <= other.message_start_time for one, other in pairwise(chunks))
-    return stores if ordered else None
-
-
-def _expanded(store: Any, chunk: Any) -> bytes:
-    """The records in a chunk; `rosbags` compares size and checksum."""
-    from rosbags.rosbag2.storage_mcap import decompress
-
-    store.bio.seek(chunk.chunk_start_offset + 9 + 24)
-    (checksum,) = struct.unpack("<I", store.bio.read(4))
-    store.bio.seek(chunk.chunk_start_offset + 9 + 40 + len(chunk.compression))
-    stored = store.bio.read(chunk.compressed_size)
-    if len(stored) < chunk.compressed_size:
-        raise FileFormatError(f"{store.path} ends within a chunk; copy it again.")
-    return decompress(stored, chunk.compression, chunk.uncompressed_size, checksum)
+    return chunks
 
 
 def _of_chunk(records: bytes, channels: Sequence[int], rows: int) -> Iterator[RawMessages]:

@@ -28,7 +28,7 @@ class RawRecording:
     label: what people call it, a file or an array in it.
     first: its first row in the spool.
     time: (rows,) [s] from its first row on.
-    begin: what the log says at the first row, in s.
+    begin: the stamp of the log at the first row, in s.
     episodes: (n, 2) episode number of the log and row at which it begins; one row if the log numbers none.
     lowest, highest: (signals,) of each signal of the plan, in SI.
     jumps: rows before which a turning joint moves by more than half a turn, with the signal.
@@ -110,7 +110,7 @@ class _Clock:
         if not whole and not np.isfinite(raw).all():
             row = int(np.argmin(np.isfinite(raw)))
             raise DatasetError(
-                f"{self.source.path}: column {name!r}, the time, is {_told(raw[row])} at "
+                f"{self.source.path}: column {name!r}, the time, is {_shown(raw[row])} at "
                 f"{self.source.place(rows + row)}. Repair or remove that row."
             )
         if self.origin is None:
@@ -157,13 +157,13 @@ def _require_finite(
     wrong = [name for name in item.expression.weights if not np.isfinite(columns[name][row])]
     name = wrong[0] if wrong else next(iter(item.expression.weights), "")
     raise DatasetError(
-        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_told(columns[name][row])} at "
+        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(columns[name][row])} at "
         f"{source.place(rows + row)}, {times[row]:.6g} s from the start; {int((~np.isfinite(table)).sum())} such "
         "values in this part. Repair or remove these rows, or map another column."
     )
 
 
-def _told(value: float) -> str:
+def _shown(value: float) -> str:
     return "missing (empty or NaN)" if np.isnan(value) else f"{value}"
 
 

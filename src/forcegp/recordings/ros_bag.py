@@ -13,6 +13,7 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput, MissingExtra
+from forcegp.recordings.mcap_chunks import mcap_chunks
 from forcegp.recordings.message_layout import MessageLayout, message_layout
 from forcegp.recordings.raw_messages import RawMessages, topic_messages
 from forcegp.recordings.size_limits import require_plausible_size
@@ -66,11 +67,8 @@ class RosBag(Source):
 
     def _check_chunks(self, reader: Any) -> None:
         """Compare what compressed chunks of .mcap files claim to hold with their size."""
-        for one in reader.readers:
-            storage = getattr(one, "storage", None)
-            for store in getattr(storage, "storages", [storage]):
-                for chunk in getattr(store, "chunks", ()):
-                    require_plausible_size(self.path, "a chunk", chunk.uncompressed_size, chunk.compressed_size)
+        for chunk in mcap_chunks(reader) or ():
+            require_plausible_size(self.path, "a chunk", chunk.expanded, chunk.stored)
 
     @cached_property
     def _topics(self) -> Mapping[str, tuple[str, ...]]:

@@ -72,8 +72,8 @@ class SideBySide(Source):
             if len(set(lengths)) > 1:
                 for source, stream in zip(used, streams, strict=True):
                     counts[source] += sum(len(next(iter(piece.values()))) for piece in stream)
-                told = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
-                raise FileFormatError(f"files side by side must have equally many rows; these have: {told}.")
+                listed = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
+                raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
             found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
             if not found:
                 return

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+import forcegp.robots
 from forcegp.data import FrozenDict
 from forcegp.data.units import ROTATION, TRANSLATION, validated_units
 from forcegp.errors import InvalidInput
@@ -17,9 +18,6 @@ from forcegp.recordings.linear_expressions import LinearExpression, parse_expres
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.signal_units import LogUnit, log_unit
 from forcegp.recordings.source import Columns, Source
-
-if TYPE_CHECKING:
-    from forcegp.robots import Robot
 
 
 @dataclass(frozen=True)
@@ -77,10 +75,10 @@ class SignalPlan:
             yield self.episode
 
 
-def signal_plan(mapping: ColumnMapping, source: Source, robot: Robot | None) -> SignalPlan:
+def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Robot | None) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot if there is one.
 
-    Signals that the mapping does not name are looked for by the names of the joints (`guessed` says what was found).
+    Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
     Raises InvalidInput for columns, joints and numbers of them that do not fit.
     """
     joints = _joints(mapping, robot)
@@ -98,7 +96,7 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: Robot | None) -> 
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
         if signal not in found:
             raise InvalidInput(
-                f"no columns for {signal} ({why}); say which with --{signal}. "
+                f"no columns for {signal} ({why}); name them with --{signal}. "
                 f"{source.path} has {_some(source.columns())}"
             )
     if not joints:
@@ -109,7 +107,7 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: Robot | None) -> 
         name = guessed_time(source, used)
         if name is None:
             raise InvalidInput(
-                "no column for the time; say which with --time, or --step for the time between rows. "
+                "no column for the time; name it with --time, or --step for the time between rows. "
                 f"{source.path} has {_some(source.columns())}"
             )
         guessed.append(f"time = {name}")
@@ -131,7 +129,7 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: Robot | None) -> 
     return SignalPlan(names, units, signals, time, time_unit, mapping.step, episode, tuple(guessed))
 
 
-def _joints(mapping: ColumnMapping, robot: Robot | None) -> tuple[str, ...]:
+def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple[str, ...]:
     if robot is None:
         return mapping.joints
     own = tuple(robot.joint_names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 from pathlib import Path
 from typing import ClassVar
@@ -58,8 +59,6 @@ class CountedStream(io.RawIOBase):
 
 def gzip_stream(path: Path) -> CountedStream:
     """The content of a .gz file. The size that it declares is checked first, what comes out is counted."""
-    import gzip
-
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(2) != b"\x1f\x8b":

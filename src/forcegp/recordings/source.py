@@ -65,7 +65,7 @@ class Source(ABC):
         return {name: tuple(elements) for name, elements in found.items()}
 
     def time_beside(self, names: Sequence[str]) -> str | None:
-        """The column that is the time of these columns, if the format itself says so."""
+        """The column that is the time of these columns, if the format itself names it."""
         return self.suggested_time
 
     def files(self) -> tuple[Path, ...]:
@@ -73,7 +73,7 @@ class Source(ABC):
         return (self.path,)
 
     def notes(self) -> tuple[str, ...]:
-        """What people should know about how the file was read; complete after the last piece."""
+        """Remarks on how the file was read; complete after the last piece."""
         return ()
 
     def place(self, row: int) -> str:
@@ -115,15 +115,15 @@ def as_column(values: np.ndarray) -> np.ndarray:
 def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
     """Turn what a library meets in a damaged file into a FileFormatError that names the path.
 
-    `what` says what the file should be ("a Parquet file"); `errors` are those of the library beyond the usual ones.
+    `what` names the expected format ("a Parquet file"); `errors` are those of the library beyond the usual ones.
     """
     try:
         yield
     except ForceGPError:
         raise
     except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zlib.error, *errors) as error:
-        told = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise FileFormatError(
-            f"{path} cannot be read as {what}: {told.rstrip('.')}. It may be truncated or of another format; "
+            f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format; "
             "copy or write it again."
         ) from error

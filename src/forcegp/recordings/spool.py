@@ -1,4 +1,9 @@
-"""Rows set aside on the disk: read once from a log of any format, then again in any order."""
+"""Rows set aside on the disk: read once from a log of any format, then again in any order.
+
+Rates and gaps are known only after the last row, and reading most formats costs more than everything after it. Episodes
+are cut, interpolated and differentiated from here, in pieces with halos, so that the result depends neither on the
+format nor on the size of the pieces that a reader gives.
+"""
 
 from __future__ import annotations
 

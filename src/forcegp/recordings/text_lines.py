@@ -13,7 +13,7 @@ from forcegp.errors import FileFormatError
 from forcegp.recordings.size_limits import gzip_stream
 
 FIRST_BYTES = 2**16
-"""What is looked at to tell the header, the delimiter and whether there are comments."""
+"""What is looked at to detect the header, the delimiter and whether there are comments."""
 
 COMMENT = b"#"
 _COMMENT_LINE = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)

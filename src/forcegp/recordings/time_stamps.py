@@ -1,4 +1,4 @@
-"""What the stamps of a recording say: order, repeated stamps, gaps, rate, and the stretches that become episodes."""
+"""Analysis of the stamps of a recording: order, repeated stamps, gaps, rate, and the stretches that become episodes."""
 
 from __future__ import annotations
 

@@ -1,21 +1,5 @@
 """URDF text -> `Robot`: joints, links, frames, inertial parameters and differentiable rigid-body algorithms."""
 
-from forcegp.robots.inertia import (
-    parameters_from_physical,
-    physical_from_parameters,
-    pseudo_inertia_from_parameters,
-)
-from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.parts import Joint, Link, LinkInertia
-from forcegp.robots.robot import Robot
+import lazy_loader as lazy
 
-__all__ = [
-    "Joint",
-    "Kinematics",
-    "Link",
-    "LinkInertia",
-    "Robot",
-    "parameters_from_physical",
-    "physical_from_parameters",
-    "pseudo_inertia_from_parameters",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.codegen.native_code import require_plain
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.native_code import require_plain
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
 from forcegp.robots.arguments import Inertials, broadcast_batch
 from forcegp.robots.compiled_programs import CompiledProgram, compiled_program, default_folder
 from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, INERTIA_ENTRIES, Request
+from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
-
-if TYPE_CHECKING:
-    from forcegp.robots.robot import Robot
 
 INSTEAD_OF_TRANSFORMS = (
     "use batch dimensions and backward passes, or the robot itself (compiled.robot), whose results are the same"
@@ -31,7 +29,7 @@ class CompiledRobot:
 
     The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, and backward passes give the
     derivatives with respect to all arguments and inertial parameters. Results agree to rounding. Not supported, with
-    an :class:`~forcegp.errors.InvalidInput` that says so: second derivatives, transforms of ``torch.func``,
+    an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of ``torch.func``,
     forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
 
     A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
@@ -44,7 +42,7 @@ class CompiledRobot:
 
     __no_type_check__: ClassVar[bool] = True
 
-    def __init__(self, robot: Robot, folder: str | Path | None = None) -> None:
+    def __init__(self, robot: RobotStructure, folder: str | Path | None = None) -> None:
         if robot.device.type != "cpu":
             raise InvalidInput(
                 f"compiled dynamics runs on the CPU, and the robot is on {robot.device}; compile robot.to('cpu'), or "
@@ -55,7 +53,7 @@ class CompiledRobot:
         self._unrolled = UnrolledRobot(robot)
         self._programs: dict[Request, CompiledProgram] = {}
 
-    def __reduce__(self) -> tuple[type[CompiledRobot], tuple[Robot, Path]]:
+    def __reduce__(self) -> tuple[type[CompiledRobot], tuple[RobotStructure, Path]]:
         return CompiledRobot, (self.robot, self.folder)
 
     def __repr__(self) -> str:

@@ -37,4 +37,4 @@ def _why() -> str:
         return ""
     if torch.version.cuda is None and torch.version.hip is None:
         return f" (torch {torch.__version__} is built for the CPU alone; docs/gpu.md names the build for GPUs)"
-    return " (torch finds no GPU: see what nvidia-smi says)"
+    return " (torch finds no GPU: see the output of nvidia-smi)"

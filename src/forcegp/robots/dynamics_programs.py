@@ -38,7 +38,7 @@ INERTIA_ENTRIES = tuple((row, column) for row in range(4) for column in range(ro
 class Request:
     """Which program: a function of the robot, with the inertias as inputs or as constants, its value or derivatives.
 
-    ``states`` and ``inertias`` say which derivatives: those in all arguments, those in the inertias, both; the value
+    ``states`` and ``inertias`` choose the derivatives: those in all arguments, those in the inertias, both; the value
     if neither.
     """
 
@@ -75,7 +75,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Program:
+class DynamicsProgram:
     """Straight-line arithmetic: ``outputs`` by name; all ``positive`` must be > 0."""
 
     graph: Graph
@@ -94,7 +94,7 @@ class Program:
         return sum(nodes[index].operation in ("+", "-", "*", "/", "negate", "sqrt") for index in self.needed)
 
 
-def trace(unrolled: UnrolledRobot, request: Request) -> Program:
+def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> DynamicsProgram:
     """Write a program down."""
     graph, n = Graph(), unrolled.nv
     arguments = {name: graph.inputs(name, n) for name in ARGUMENTS[request.function]}
@@ -102,7 +102,7 @@ def trace(unrolled: UnrolledRobot, request: Request) -> Program:
     if request.free_inertias:
         arguments["inertias"] = graph.inputs("inertias", len(INERTIA_ENTRIES) * n)
         inertias = [_symmetric(arguments["inertias"][10 * body : 10 * body + 10]) for body in range(n)]
-    at = unrolled.states(arguments["q"], arguments.get("v"))
+    at = UnrolledKinematics(unrolled, arguments["q"], arguments.get("v"))
     positive: Vector = []
     if request.function == "forward_dynamics":
         results, held, differentiated = _forward_dynamics(at, arguments["tau"], inertias, graph, request, positive)
@@ -110,7 +110,7 @@ def trace(unrolled: UnrolledRobot, request: Request) -> Program:
         results = _results(at, arguments, inertias, request.function)
         held, differentiated = [], results
     if request.is_value:
-        return Program(graph, dict(zip(request.results, results, strict=True)), positive)
+        return DynamicsProgram(graph, dict(zip(request.results, results, strict=True)), positive)
     if request.function == "forward_dynamics":
         cotangents = [[negate(x) for x in held[0]]]
     else:
@@ -125,7 +125,7 @@ def trace(unrolled: UnrolledRobot, request: Request) -> Program:
     outputs = {name: [next(found) for _ in arguments[name]] for name in request.wanted if name != "tau"}
     if "tau" in request.wanted:
         outputs["tau"] = held[0]
-    return Program(graph, {name: outputs[name] for name in request.wanted}, [])
+    return DynamicsProgram(graph, {name: outputs[name] for name in request.wanted}, [])
 
 
 def _forward_dynamics(

@@ -20,7 +20,7 @@ from forcegp.errors import InvalidInput, NonPhysicalInertia
 
 # relative to the trace of the inertia: what turning an ideal rod or plate in float64 costs, with a wide margin
 ROUNDING = 1e-10
-# relative thickness squared below which log-Cholesky parameters (logarithms) say nothing any more
+# relative thickness squared below which log-Cholesky parameters (logarithms) lose all digits
 SINGULAR = 1e-12
 
 # e^(d1, d2, d3), s12, s23, s13, t1, t2, t3, 1 -> row-major 4x4 upper triangle
@@ -123,7 +123,7 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
     """What makes these inertial parameters physically impossible, or ``None`` if a body can have them.
 
     Ideal rods, plates and points (singular pseudo-inertia) are possible; a violation within float64 rounding is
-    forgiven. Whether a joint can move such a body is for :func:`axis_inertia_vanishes` to say.
+    forgiven. Whether a joint can move such a body: :func:`axis_inertia_vanishes`.
     """
     if not (np.isfinite(mass) and np.isfinite(center_of_mass).all() and np.isfinite(inertia).all()):
         return "it holds values that are not finite"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -14,9 +13,7 @@ from forcegp.robots import algorithms
 from forcegp.robots.arguments import Inertials, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
-
-if TYPE_CHECKING:
-    from forcegp.robots.robot import Robot
+from forcegp.robots.structure import RobotStructure
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +27,7 @@ class Kinematics:
     The fields are internal: the batch is flattened and trails (see :mod:`forcegp.robots.algorithms`).
     """
 
-    robot: Robot
+    robot: RobotStructure
     batch_shape: torch.Size
     poses: Tensor  # (nv, 4, 4, batch)
     vectors: Tensor  # (nv, 6, batch)
@@ -39,7 +36,7 @@ class Kinematics:
     accelerations: Tensor | None  # (nv, 3, 4, batch), at zero joint acceleration and without gravity
 
     @classmethod
-    def of(cls, robot: Robot, q: Tensor, v: Tensor | None) -> Kinematics:
+    def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> Kinematics:
         """Kinematics at checked q and v (*batch, nv) of equal shape."""
         batch = q.shape[:-1]
         poses = algorithms.body_poses(robot.tree, _columns(q, batch))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from forcegp.robots.dynamics_programs import Program
+from forcegp.robots.dynamics_programs import DynamicsProgram
 
 STATEMENTS = 500  # per part
 
@@ -59,7 +59,7 @@ def input_arrays(inputs: tuple[str, ...]) -> tuple[str, ...]:
     return (*inputs, "sin q", "cos q")
 
 
-def write_c(program: Program, inputs: tuple[str, ...], lanes: int, statements: int = STATEMENTS) -> str:
+def write_c(program: DynamicsProgram, inputs: tuple[str, ...], lanes: int, statements: int = STATEMENTS) -> str:
     """Source of ``evaluate``, which returns whether all that must be positive was."""
     graph, arrays = program.graph, input_arrays(inputs)
     stores = _stores(program)
@@ -121,7 +121,7 @@ def write_c(program: Program, inputs: tuple[str, ...], lanes: int, statements: i
     return "\n".join(text)
 
 
-def _stores(program: Program) -> dict[int, list[str]]:
+def _stores(program: DynamicsProgram) -> dict[int, list[str]]:
     """What to do with the value of a node once it is there."""
     stores: dict[int, list[str]] = {}
     for array, vector in enumerate(program.outputs.values()):
@@ -132,7 +132,7 @@ def _stores(program: Program) -> dict[int, list[str]]:
     return stores
 
 
-def _order(program: Program, stores: dict[int, list[str]]) -> list[int]:
+def _order(program: DynamicsProgram, stores: dict[int, list[str]]) -> list[int]:
     """Nodes in the order of their statements: inputs right before their first use, to hold few registers at a time."""
     nodes = program.graph.nodes
     order: dict[int, None] = {}
@@ -146,7 +146,7 @@ def _order(program: Program, stores: dict[int, list[str]]) -> list[int]:
     return list(order)
 
 
-def _places(program: Program, parts: Sequence[Sequence[int]]) -> tuple[dict[int, tuple[int, int]], int]:
+def _places(program: DynamicsProgram, parts: Sequence[Sequence[int]]) -> tuple[dict[int, tuple[int, int]], int]:
     """Last part that uses a node and its place in the waiting array, for nodes of earlier parts; size of that array."""
     made = {index: part for part, indices in enumerate(parts) for index in indices}
     last: dict[int, int] = {}

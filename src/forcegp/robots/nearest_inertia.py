@@ -1,4 +1,4 @@
-"""The physically possible inertia nearest to one that no body has: a repair that is asked for and told.
+"""The physically possible inertia nearest to one that no body has: a repair on request, with a warning.
 
 Published URDFs break the triangle inequality at times (rounded numbers, unconstrained identification). With the second
 moments ``Sigma = tr(I)/2 1 - I`` about the centre of mass a body has the inertia I if and only if Sigma is positive

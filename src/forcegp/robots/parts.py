@@ -34,7 +34,7 @@ class Joint:
 
     @classmethod
     def of(cls, joint: JointDescription) -> Joint:
-        """What a description says about a movable joint, without its place in the tree."""
+        """A movable joint as a description has it, without its place in the tree."""
         return cls(**{field.name: getattr(joint, field.name) for field in fields(cls)})
 
 
@@ -86,7 +86,7 @@ class Link:
         return log_cholesky_of_link(self.mass, center, inertia, f"{self.name!r} of {owner}")
 
     def inertial(self, *parts: str) -> LinkInertia:
-        """Parts to learn, for ``StructuredGP.fit(learn=...)``: 'mass', 'com', 'inertia'; all three if none is named.
+        """Parts to learn, for ``StructuredGP.identify``: 'mass', 'com', 'inertia'; all three if none is named.
 
         'center_of_mass' means 'com'. Raises :class:`~forcegp.errors.InvalidInput` for other parts.
         """

@@ -5,41 +5,36 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
+from forcegp.errors import InvalidInput
 from forcegp.robots.arguments import (
     Inertials,
     Vector,
     armature_values,
     broadcast_batch,
-    check_mapping,
-    check_tensor,
     finite_vector,
     locked_positions,
 )
+from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import WORLD, Layout, check_inertias, lay_out
+from forcegp.robots.layout import check_inertias, lay_out
 from forcegp.robots.nearest_inertia import InertiaChoice, with_chosen_inertias
-from forcegp.robots.parts import Joint, Link
-from forcegp.robots.tree import Tree, compile_tree, merged_inertias
-from forcegp.robots.urdf import RobotDescription, parse_urdf
+from forcegp.robots.structure import RobotStructure
+from forcegp.robots.tree import compile_tree
+from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import read_text, write_text
 from forcegp.robots.urdf_writer import replace_inertial
-
-if TYPE_CHECKING:
-    from forcegp.robots.compiled import CompiledRobot
 
 GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot:
+class Robot(RobotStructure):
     """A fixed-base tree of revolute, continuous, prismatic and fixed joints. Make one with :meth:`from_urdf`.
 
     Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any
@@ -51,13 +46,6 @@ class Robot:
     Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
     :class:`~forcegp.errors.UnknownName`.
     """
-
-    description: RobotDescription
-    layout: Layout
-    tree: Tree
-    urdf_text: str
-    _locked: tuple[tuple[str, float], ...]
-    _frames: dict[str, tuple[int, Tensor]]
 
     # ------------------------------------------------------------------ making one
 
@@ -118,7 +106,7 @@ class Robot:
         text = self.urdf_text
         for name, parameters in inertials.items():
             self.layout.require_moving(name, self.name)
-            self._check_parameters(name, parameters)
+            self.check_parameters(name, parameters)
             if parameters.dim() != 1:
                 raise InvalidInput(
                     f"inertials[{name!r}] has shape {tuple(parameters.shape)}; a robot holds one set, give shape (10,)."
@@ -141,8 +129,6 @@ class Robot:
 
     def compile(self, folder: str | Path | None = None) -> CompiledRobot:
         """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""
-        from forcegp.robots.compiled import CompiledRobot
-
         return CompiledRobot(self, folder)
 
     def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> Robot:
@@ -151,97 +137,11 @@ class Robot:
         )
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
-    # ------------------------------------------------------------------ what it is
-
-    @property
-    def name(self) -> str:
-        """Name of the robot in the URDF."""
-        return self.description.name
-
-    @property
-    def source(self) -> str:
-        """Where the URDF came from, as error messages name it."""
-        return self.description.source
-
-    @property
-    def nv(self) -> int:
-        """Number of movable joints."""
-        return len(self.layout.joints)
-
-    @property
-    def joints(self) -> tuple[Joint, ...]:
-        """Movable joints in the order of q."""
-        return tuple(map(Joint.of, self.layout.joints))
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the movable joints in the order of q."""
-        return tuple(joint.name for joint in self.layout.joints)
-
-    @property
-    def link_names(self) -> tuple[str, ...]:
-        """Names of all links in file order."""
-        return tuple(self.description.links)
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of all frames: those of the links."""
-        return self.link_names
-
-    @property
-    def gravity(self) -> Float[Tensor, "3"]:
-        """Gravitational acceleration in m/s^2."""
-        return self.tree.gravity.clone()
-
-    @property
-    def armature(self) -> Float[Tensor, "nv"]:
-        """Rotor inertia per joint in kg m^2 or kg."""
-        return self.tree.armature.clone()
-
-    @property
-    def locked(self) -> dict[str, float]:
-        """Movable joints of the URDF that are fixed here, and their positions in rad or m."""
-        return dict(self._locked)
-
-    @property
-    def device(self) -> torch.device:
-        """Device that inputs must be on."""
-        return self.tree.rest.device
-
-    def link(self, name: str) -> Link:
-        """One link by name."""
-        placement = self.layout.links.get(name)
-        if placement is None:
-            raise UnknownLink(unknown_name_message("link", name, self.name, self.layout.links))
-        joint = None if placement.body == WORLD else self.joint_names[placement.body]
-        return Link.of(name, joint, self.description.links[name])
-
-    def joint(self, name: str) -> Joint:
-        """One movable joint by name."""
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
-        raise UnknownJoint(unknown_name_message("joint", name, self.name, self.joint_names))
-
-    def inertial_parameters(self, *links: str) -> dict[str, Float[Tensor, "10"]]:
-        """Log-Cholesky parameters (10,) of the named links, to start an identification from.
-
-        Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
-        :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
-        """
-        for name in links:
-            self.layout.require_moving(name, self.name)
-        return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
-
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given."""
         if path is not None:
             write_text(self.urdf_text, Path(path))
         return self.urdf_text
-
-    def __repr__(self) -> str:
-        kinds = ", ".join(f"{joint.name} ({joint.type})" for joint in self.layout.joints)
-        return f"Robot({self.name!r}, nv={self.nv}, links={len(self.layout.links)}, joints=[{kinds}])"
 
     # ------------------------------------------------------------------ dynamics
 
@@ -323,28 +223,3 @@ class Robot:
         Rows [linear; angular], world axes, in m/s^2 and rad/s^2: what the point does at zero joint acceleration.
         """
         return self.kinematics(q, v).frame_bias_acceleration(frame, point)
-
-    # ------------------------------------------------------------------ checks shared with Kinematics
-
-    def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
-        """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
-        found = self._frames.get(name)
-        if found is None:
-            raise UnknownFrame(unknown_name_message("frame", name, self.name, self._frames))
-        body, offset = found
-        return body, offset.clone()
-
-    def check_input(self, name: str, value: object) -> None:
-        """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""
-        check_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
-
-    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
-        """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
-        check_mapping(inertials)
-        for name, parameters in inertials.items():
-            self.layout.require_moving(name, self.name)
-            self._check_parameters(name, parameters)
-        return merged_inertias(self.tree, self.layout, inertials)
-
-    def _check_parameters(self, link: str, parameters: object) -> None:
-        check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

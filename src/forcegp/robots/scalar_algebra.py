@@ -65,11 +65,6 @@ def divide(x: Scalar, y: Scalar) -> Scalar:
     return multiply(x, 1.0 / y) if isinstance(y, float) else x / y
 
 
-def square_root(x: Scalar) -> Scalar:
-    """``sqrt(x)``."""
-    return math.sqrt(x) if isinstance(x, float) else x.sqrt()
-
-
 def sine(x: Scalar) -> Scalar:
     """``sin(x)``."""
     return math.sin(x) if isinstance(x, float) else x.sin()
@@ -135,40 +130,6 @@ def symmetric(lower: Sequence[Sequence[Scalar]]) -> Matrix:
 
 
 # ---------------------------------------------------------------------- factorisations
-
-
-def cholesky(matrix: Sequence[Sequence[Scalar]]) -> Matrix:
-    """Lower-triangular L with ``matrix = L L^T``; reads the lower triangle of a positive definite matrix."""
-    n = len(matrix)
-    L: Matrix = [[0.0] * n for _ in range(n)]
-    for j in range(n):
-        L[j][j] = square_root(subtract(matrix[j][j], dot(L[j][:j], L[j][:j])))
-        for i in range(j + 1, n):
-            L[i][j] = divide(subtract(matrix[i][j], dot(L[i][:j], L[j][:j])), L[j][j])
-    return L
-
-
-def solve_lower(L: Sequence[Sequence[Scalar]], b: Sequence[Scalar]) -> Vector:
-    """``L^-1 b`` for a lower-triangular L."""
-    x: Vector = []
-    for i, row in enumerate(L):
-        x.append(divide(subtract(b[i], dot(row[:i], x)), row[i]))
-    return x
-
-
-def solve_lower_transposed(L: Sequence[Sequence[Scalar]], b: Sequence[Scalar]) -> Vector:
-    """``L^-T b`` for a lower-triangular L."""
-    n = len(L)
-    x: Vector = list(b)
-    for i in reversed(range(n)):
-        below = dot([L[k][i] for k in range(i + 1, n)], x[i + 1 :])
-        x[i] = divide(subtract(x[i], below), L[i][i])
-    return x
-
-
-def solve_cholesky(L: Sequence[Sequence[Scalar]], b: Sequence[Scalar]) -> Vector:
-    """``(L L^T)^-1 b``."""
-    return solve_lower_transposed(L, solve_lower(L, b))
 
 
 def factorize(matrix: Sequence[Sequence[Scalar]]) -> tuple[Matrix, Vector]:

@@ -8,20 +8,15 @@ computation is written down. The algorithms are in :mod:`forcegp.robots.unrolled
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 
-from forcegp.errors import InvalidInput
-from forcegp.robots.scalar_algebra import Matrix, Scalar
-from forcegp.robots.unrolled_kinematics import UnrolledKinematics
+from forcegp.robots.scalar_algebra import Matrix
+from forcegp.robots.structure import RobotStructure
 
-if TYPE_CHECKING:
-    from forcegp.robots.robot import Robot
-
-# What is smaller in a rotation matrix or an inertia is rounding, of the turn onto the joint axis, say: sin(pi) = 1e-16.
+# What is smaller in a rotation matrix or an inertia is rounding, for example of the turn onto the joint axis: sin(pi) =
+# 1e-16.
 ROUNDING = 1e-15
 
 
@@ -36,14 +31,14 @@ class UnrolledJoint:
 
 
 class UnrolledRobot:
-    """The constants of a robot as floats, ready to be unrolled; :meth:`states` gives the algorithms.
+    """The constants of a robot as floats, from which `UnrolledKinematics` unrolls its algorithms.
 
     Parameters: ``robot``; ``rounding``, below which entries of rotation matrices, of origins in m and of the merged
-    inertias (relative to the largest entry) count as zero. The constants are those of the robot on the CPU; tensors
-    given to :meth:`states` may be on any device.
+    inertias (relative to the largest entry) count as zero. The constants are those of the robot on the CPU; states
+    may be tensors on any device.
     """
 
-    def __init__(self, robot: Robot, *, rounding: float = ROUNDING) -> None:
+    def __init__(self, robot: RobotStructure, *, rounding: float = ROUNDING) -> None:
         layout, tree = robot.layout, robot.tree
         self.robot, self.rounding = robot, rounding
         self.joints: tuple[UnrolledJoint, ...] = tuple(
@@ -64,19 +59,6 @@ class UnrolledRobot:
     def nv(self) -> int:
         """Number of movable joints."""
         return len(self.joints)
-
-    def states(self, q: Sequence[Scalar], v: Sequence[Scalar] | None = None) -> UnrolledKinematics:
-        """The algorithms at joint positions and velocities, one scalar per joint; ``v`` only if they need it.
-
-        A joint position or velocity given as a float is a constant: 0.0 drops out.
-        """
-        for name, values in (("q", q), ("v", v)):
-            if values is not None and len(values) != self.nv:
-                raise InvalidInput(
-                    f"{name} holds {len(values)} scalars; {self.robot.name} has {self.nv} joints, give one each, such "
-                    f"as {name}.unbind(-1)."
-                )
-        return UnrolledKinematics(self, q, v)
 
     def frame(self, name: str) -> tuple[int, list[list[float]], list[float]]:
         """Body that carries a frame (``WORLD`` = -1), and the frame's rotation and origin in that body's frame."""

@@ -14,7 +14,6 @@ ch. 5 and 6), carried to the joints above. Being linear in P, both are polynomia
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from forcegp.errors import InvalidInput
 from forcegp.robots.layout import WORLD
@@ -40,22 +39,28 @@ from forcegp.robots.scalar_algebra import (
     symmetric_product,
     transpose,
 )
-
-if TYPE_CHECKING:
-    from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.unrolled import UnrolledRobot
 
 Inertias = Sequence[Sequence[Sequence[Scalar]]]
 
 
 class UnrolledKinematics:
-    """The rigid-body algorithms at given states; made by :meth:`UnrolledRobot.states`.
+    """The rigid-body algorithms at given states; one scalar per joint; ``v`` only if they are needed.
+
+    A joint position or velocity given as a float is a constant: 0.0 drops out.
 
     All results are scalars or nested lists of scalars, in the units of :class:`~forcegp.robots.Robot`. ``inertias`` is
     one symmetric 4x4 pseudo-inertia (nested list; kg m^2, kg m, kg) per body in body axes, in place of the robot's. An
     entry that is structurally zero is the float 0.0, not a tensor.
     """
 
-    def __init__(self, unrolled: UnrolledRobot, q: Sequence[Scalar], v: Sequence[Scalar] | None) -> None:
+    def __init__(self, unrolled: UnrolledRobot, q: Sequence[Scalar], v: Sequence[Scalar] | None = None) -> None:
+        for name, values in (("q", q), ("v", v)):
+            if values is not None and len(values) != unrolled.nv:
+                raise InvalidInput(
+                    f"{name} holds {len(values)} scalars; {unrolled.robot.name} has {unrolled.nv} joints, give one "
+                    f"each, such as {name}.unbind(-1)."
+                )
         self.unrolled = unrolled
         self.v = None if v is None else list(v)
         self.rotations: list[Matrix] = []  # body axes -> parent's axes
@@ -156,7 +161,7 @@ class UnrolledKinematics:
 
     def _velocities(self, what: str) -> Vector:
         if self.v is None:
-            raise InvalidInput(f"{what} needs velocities; make the kinematics with unrolled.states(q, v).")
+            raise InvalidInput(f"{what} needs velocities; make the kinematics with UnrolledKinematics(unrolled, q, v).")
         return self.v
 
     def _inertias(self, inertias: Inertias | None) -> Inertias:

@@ -65,7 +65,7 @@ class JointDescription:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """What a URDF says about the mechanics, in file order, before any check that it is a tree."""
+    """The mechanics in a URDF, in file order, before any check that it is a tree."""
 
     name: str
     source: str
@@ -74,7 +74,7 @@ class RobotDescription:
 
 
 def parse_urdf(text: str, *, source: str) -> RobotDescription:
-    """Parse URDF text. ``source`` (a path, say) is what the error messages call the file."""
+    """Parse URDF text. ``source``, for example a path, is what the error messages call the file."""
     root = _parse_xml(text, source)
     if root.tag != "robot":
         raise MalformedUrdf(f"{source}: the root element is <{root.tag}>, not <robot>; give a URDF file.")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from forcegp.errors import InvalidInput, UnreadableRobotFile
+from forcegp.atomic_files import write_bytes
+from forcegp.errors import UnreadableRobotFile
 
 
 def read_text(path: str | Path) -> str:
@@ -45,13 +45,5 @@ def declared_encoding(data: bytes) -> str:
 
 
 def write_text(text: str, path: Path) -> None:
-    """Write URDF text in the encoding that it declares, to a temporary file that is then renamed."""
-    if not path.parent.is_dir():
-        raise InvalidInput(f"{path}: the folder {path.parent} does not exist; create it first.")
-    data = text.encode(declared_encoding(text[:200].encode("utf-8")))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write URDF text in the encoding that it declares. Raises as `atomic_file`."""
+    write_bytes(path, text.encode(declared_encoding(text[:200].encode("utf-8"))))

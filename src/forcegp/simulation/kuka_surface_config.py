@@ -31,8 +31,8 @@ class KukaSurfaceConfig:
     """A KUKA LBR iiwa 14 slides its tool on a surface; friction is the force nobody models.
 
     By default a plane and viscous friction at the tool point, as in Rath, Geist, Trimpe 2021, section 5, with the
-    constants of their reference implementation. SI units and radians unless a name says otherwise. Raises InvalidInput
-    naming the field and its allowed range.
+    constants of their reference implementation. SI units and radians unless a name has another unit. Raises
+    InvalidInput naming the field and its allowed range.
     """
 
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
@@ -85,8 +85,8 @@ class KukaSurfaceConfig:
     friction, without restitution, which the tool leaves now and then."""
 
     friction: Friction | None = None
-    """Friction of the tool on the surface, the force that no model knows: viscous; or coulomb or stribeck, which grow
-    with the normal force. None is viscous for an ideal contact and coulomb, its only law, for PyBullet's."""
+    """Friction of the tool on the surface, the force that no model contains: viscous; or coulomb or stribeck, which
+    grow with the normal force. None is viscous for an ideal contact and coulomb, its only law, for PyBullet's."""
     viscous_coefficient: float = 1.0
     """Viscous friction of the tool point on the surface [N/(m/s)]."""
     coulomb_coefficient: float = 0.3

@@ -6,13 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import forcegp.data
 from forcegp.errors import InvalidInput
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
-
-if TYPE_CHECKING:
-    from forcegp.data import Dataset
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Scenario:
     config: type
     function: str
 
-    def simulate(self, config: Any, progress: Callable[[int, int], None] | None = None) -> Dataset:
+    def simulate(self, config: Any, progress: Callable[[int, int], None] | None = None) -> forcegp.data.Dataset:
         """Run it. `progress(steps done, steps in total)` is called now and then."""
         if not isinstance(config, self.config):
             raise InvalidInput(f"config is {type(config).__name__}; this scenario takes {self.config.__name__}.")

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from typing_extensions import override
 
+import forcegp.mechanics
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
-
-if TYPE_CHECKING:
-    from forcegp.mechanics import Surface
 
 
 class Table(ABC):
@@ -38,7 +35,7 @@ class Table(ABC):
         """Height [m] above the surface's middle, its gradient and its Hessian [1/m] in x and y."""
 
     @abstractmethod
-    def surface(self) -> Surface:
+    def surface(self) -> forcegp.mechanics.Surface:
         """The same for a `Contact`."""
 
 
@@ -74,11 +71,10 @@ class FlatTable(Table):
         return (xy - self.middle[:2]) @ slope, np.broadcast_to(slope, xy.shape), np.zeros((len(xy), 2, 2))
 
     @override
-    def surface(self) -> Surface:
-        from forcegp.mechanics import Plane
+    def surface(self) -> forcegp.mechanics.Surface:
 
         x, y, z = self.upward.tolist()
-        return Plane((x, y, z), self.offset)
+        return forcegp.mechanics.Plane((x, y, z), self.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +110,10 @@ class SphericalTable(Table):
         return rise - self.radius, gradient, hessian
 
     @override
-    def surface(self) -> Surface:
-        from forcegp.mechanics import Sphere
+    def surface(self) -> forcegp.mechanics.Surface:
 
         x, y, z = self.center.tolist()
-        return Sphere((x, y, z), self.radius)
+        return forcegp.mechanics.Sphere((x, y, z), self.radius)
 
 
 def table_of(config: KukaSurfaceConfig) -> Table:

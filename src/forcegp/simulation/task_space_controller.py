@@ -15,7 +15,7 @@ class TaskSpaceController:
 
     With `e` the error of the tool (translation; rotation vector), the commanded joint acceleration is
     `J^+ (x_ref'' + 2 zeta omega e' + omega^2 e - Jdot v) + (I - J^+ J) S (K (q_0 - q) - D v)`; `S` selects joints.
-    It knows inertia, gravity and joint damping, but neither the surface nor its friction.
+    It compensates inertia, gravity and joint damping, but neither the surface nor its friction.
 
     omega [rad/s], zeta: error dynamics; orientation: (4,) quaternion (x, y, z, w) of the tool frame that is held;
     posture: (nv,) `q_0` [rad]; selected: (nv,) diagonal of `S`; stiffness `K` [1/s^2]; damping `D` [1/s].

@@ -1,4 +1,4 @@
-"""The models of a comparison, by name: each is told the same training rows and makes a posterior of them.
+"""The models of a comparison, by name: each fits a posterior to the same training rows.
 
 A name is an entry of `CANDIDATES`, a way to identify the system (`identified-torque`), or an expression of priors as in
 `forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. Add yours:
@@ -34,19 +34,19 @@ MEAN = "@"
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """What a model is told.
+    """What a model is fitted to.
 
     Fields
     ------
     rows: the training rows, the same for every model of a seed.
     given: the system as it was given.
-    identified: the systems identified from the same rows, by the name of the identification; a text says why there is
-        none.
+    identified: the systems identified from the same rows, by the name of the identification; a text where it
+        failed.
     seed: of the search and of random weights.
     restarts, iterations: of the search for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins [Nm or N]; None is none.
-    measured_torque: whether predictions know that their u is as noisy (`Noise`).
-    levels: the noise about the identified system, where its identification knows it; else it is learned.
+    measured_torque: whether predictions account for the noise of their u (`Noise`).
+    levels: the noise about the identified system, where its identification estimates it; else it is learned.
     """
 
     rows: Dataset
@@ -208,7 +208,7 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
 
 
 def _is_yardstick(method: str | None, identification: str) -> bool:
-    """Whether it knows more rows than the others: unless all that is `@identified` does."""
+    """Whether it uses more rows than the others: unless all that is `@identified` does."""
     return method is not None and method != identification and IDENTIFICATIONS[method].all_rows
 
 

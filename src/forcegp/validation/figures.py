@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from forcegp.evaluation.figure_style import (
+from forcegp.evaluation.plots.style import (
     LARGE,
     NORMAL,
     QUIET,
@@ -18,10 +20,6 @@ from forcegp.evaluation.figure_style import (
     quiet,
     short_joint_names,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 LINE_STYLES = ("-", "--", ":")
 """For models beyond the number of colours."""
@@ -140,18 +138,9 @@ def _legend(figure: Figure, axes: Axes, count: int) -> None:
     )
 
 
-def _look(place: int, name: str) -> dict[str, Any]:
-    return {"color": _color(place), "linewidth": 1.5, "marker": "o", "markersize": 3.5, "label": name}
-
-
 def _color(place: int) -> str:
     return SERIES[place % len(SERIES)]
 
 
 def _style(place: int) -> str:
     return LINE_STYLES[place // len(SERIES) % len(LINE_STYLES)]
-
-
-def listed_units(units: str | Sequence[str]) -> str:
-    """`Nm`, or `Nm and N` where joints differ."""
-    return units if isinstance(units, str) else " and ".join(dict.fromkeys(units))

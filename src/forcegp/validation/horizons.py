@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.recorded_motions import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.evaluation.recorded_segments import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.models import Posterior
 from forcegp.validation.scores import plain
 
@@ -27,7 +27,7 @@ GAP = 1.5
 
 @dataclass(frozen=True, eq=False)
 class HeldOutMotions:
-    """The motions to predict, and the horizons [s] that they last for; `notes` say what could not be had."""
+    """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing."""
 
     motions: RecordedMotions | None
     horizons: tuple[float, ...]

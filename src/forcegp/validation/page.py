@@ -6,9 +6,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from forcegp.evaluation.spreads import markdown_table, number, shown
-from forcegp.validation.figures import listed_units
-from forcegp.validation.verdicts import SCORES
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, number
+from forcegp.validation.paired_tests import SCORES
 
 ALT_TEXTS = {
     "errors": "Errors of accelerations and in force space, by joint and model",
@@ -18,12 +17,12 @@ ALT_TEXTS = {
 
 
 def page(document: Mapping[str, Any]) -> str:
-    """Markdown: what was done, the verdicts, tables with the best marked, and what failed."""
+    """Markdown: what was done, the conclusions, tables with the best marked, and what failed."""
     models = document["models"]
     finished = {name: model for name, model in models.items() if model["runs"]}
     source = document["source"]
     parts = [f"# Validation{' of ' + source['title'] if source.get('title') else ''}", *_done(document)]
-    parts += ["## Verdicts", _verdicts(document["verdicts"])]
+    parts += ["## Conclusions", _conclusions(document["verdicts"])]
     parts += _against_baseline(document["against_baseline"])
     if finished:
         parts += ["## All joints", _overall(finished, document)]
@@ -50,7 +49,7 @@ def _done(document: Mapping[str, Any]) -> list[str]:
         lines += [f"* {note[0].upper()}{note[1:]}" for note in split["notes"]]
     lines.append(
         f"* Every model learns from the same {document['points']} rows: those that lie farthest apart among two thirds "
-        f"of the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. Tables tell the median "
+        f"of the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. Tables show the median "
         "over runs (seeds and splits) and the range from the best to the worst."
     )
     lines.append(
@@ -63,7 +62,7 @@ def _done(document: Mapping[str, Any]) -> list[str]:
     force_noise = document["configuration"]["force_noise"]
     if force_noise is not None:
         lines.append(f"* Models with physics learn a noise of the joint forces as well, from {force_noise:g} on.")
-    if any("noise" in (cell["result"] or {}) for cell in document["identifications"]):
+    if any("noise" in (run["result"] or {}) for run in document["identifications"]):
         lines.append(
             "* Models that rest on an identification of all training rows do not learn their noise: they have that of "
             "accelerations and forces about stretches of training rows, each predicted by a system identified from the "
@@ -82,7 +81,7 @@ def _done(document: Mapping[str, Any]) -> list[str]:
     return ["\n".join(lines)]
 
 
-def _verdicts(found: Sequence[Mapping[str, Any]]) -> str:
+def _conclusions(found: Sequence[Mapping[str, Any]]) -> str:
     if not found:
         return "There are no two finished models to compare for any question."
     lines = []
@@ -91,7 +90,7 @@ def _verdicts(found: Sequence[Mapping[str, Any]]) -> str:
         lines += [f"  * {answer['sentence']}" for answer in item["answers"]]
     lines.append(
         "\nOf each kind the model with the lowest median is taken, which favours kinds with many models a little. "
-        "Pairs share their training rows and held-out rows; intervals are Student's over runs, which say nothing about "
+        "Pairs share their training rows and held-out rows; intervals are Student's over runs, which do not hold for "
         "other recordings."
     )
     return "\n".join(lines)
@@ -105,23 +104,23 @@ def _against_baseline(found: Mapping[str, Any] | None) -> list[str]:
     for name, answers in found["models"].items():
         given = [answers[score] for score in scores]
         rows.append([name, *(_against(answer) for answer in given)])
-    told = []
-    for verdict, words in (("better", "Better than it by every score"), ("worse", "Worse than it by every score")):
+    sentences = []
+    for outcome, words in (("better", "Better than it by every score"), ("worse", "Worse than it by every score")):
         names = [
             name
             for name, answers in found["models"].items()
-            if all(answer["verdict"] == verdict for answer in answers.values() if answer is not None)
+            if all(answer["verdict"] == outcome for answer in answers.values() if answer is not None)
         ]
-        told.append(f"{words}: {', '.join(names) if names else 'none'}.")
+        sentences.append(f"{words}: {', '.join(names) if names else 'none'}.")
     never = [
         name
         for name, answers in found["models"].items()
         if not any(answer["verdict"] == "better" for answer in answers.values() if answer is not None)
     ]
-    told.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
+    sentences.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
     header = ["model", *(f"{SCORES[score]}{', difference' if score == 'nlpd' else ', ratio'}" for score in scores)]
     text = "Paired over runs, with 95 % intervals; bold where the interval shows the model to be better."
-    return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(told)]
+    return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(sentences)]
 
 
 def _against(answer: Mapping[str, Any] | None) -> str:
@@ -137,7 +136,7 @@ def _against(answer: Mapping[str, Any] | None) -> str:
 
 
 def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
-    force = listed_units(document["units"]["u"])
+    force = _listed_units(document["units"]["u"])
     header = [
         "model",
         "nRMSE",
@@ -153,7 +152,7 @@ def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
     for name, model in models.items():
         cells = [_marked(model[s], 3, low("least", s)) for s in ("nrmse", "force_rms", "force_mae", "nlpd")]
         cells += [_percent(model[s], low("nearest", s)) for s in ("coverage_95", "coverage_50")]
-        rows.append([_named(name, model), *cells, shown(model["cpu_seconds"], 1)])
+        rows.append([_named(name, model), *cells, formatted(model["cpu_seconds"], 1)])
     return markdown_table(header, rows)
 
 
@@ -171,7 +170,7 @@ def _by(models: Mapping[str, Any], value: Callable[[Any, str], float | None]) ->
 
 
 def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:
-    force = listed_units(document["units"]["u"])
+    force = _listed_units(document["units"]["u"])
     tables = (
         ("nrmse_per_joint", "Normalised error of the acceleration (RMSE / standard deviation of the target)", 3),
         ("force_rms_per_joint", f"Force-space error, rms [{force}]", 3),
@@ -217,7 +216,7 @@ def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
             cell = _marked(motions["rms"][k], 4, best[k] if lost == fewest[k] else None)
             cells.append(f"{cell}, {lost} of {motions['motions']} diverged" if lost else cell)
         rows.append([_named(name, model), *cells])
-    unit = listed_units(document["units"]["q"])
+    unit = _listed_units(document["units"]["q"])
     table = markdown_table(["model", *(f"after {h:g} s" for h in first["horizons"])], rows)
     last = first["horizons"][-1]
     each = _motion_joints(moving, document, len(first["horizons"]) - 1)
@@ -245,8 +244,8 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
             (f["error"], f"{f['split']}, seed {f['seed']}") for f in model["failures"]
         ).items():
             lines.append(f"* **{name}** failed in {len(runs)} of {_runs(model)} runs ({'; '.join(runs)}): {reason}")
-    failed = [cell for cell in document["identifications"] if cell["error"] is not None]
-    reasons = _grouped((f"{cell['name']}\n{cell['error']}", f"{cell['split']}, seed {cell['seed']}") for cell in failed)
+    failed = [run for run in document["identifications"] if run["error"] is not None]
+    reasons = _grouped((f"{run['name']}\n{run['error']}", f"{run['split']}, seed {run['seed']}") for run in failed)
     for reason, runs in reasons.items():
         name, _, error = reason.partition("\n")
         lines.append(f"* the {name} identification failed ({'; '.join(runs)}): {error}")
@@ -282,7 +281,7 @@ def _least(values: Iterable[Mapping[str, Any] | None]) -> float | None:
 
 def _marked(value: Mapping[str, Any] | None, digits: int, best: float | None) -> str:
     """With the median in bold where it is the best."""
-    text = shown(value, digits)
+    text = formatted(value, digits)
     if value is None or best is None or value["median"] != best:
         return text
     median = number(value["median"], digits)
@@ -297,3 +296,8 @@ def _percent(value: Mapping[str, Any] | None, best: float | None = None) -> str:
         for name, number in value.items()
     }
     return _marked(in_percent, 1, None if best is None else 100.0 * best) + " %"
+
+
+def _listed_units(units: str | Sequence[str]) -> str:
+    """`Nm`, or `Nm and N` where joints differ."""
+    return units if isinstance(units, str) else " and ".join(dict.fromkeys(units))

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from forcegp.data.whole_files import write_json, write_text
-from forcegp.errors import BackendError, InvalidInput
-from forcegp.evaluation.figure_style import save_figure
-from forcegp.evaluation.machine import machine
-from forcegp.parallel import Backend, Pool, Shared, backend_for
+import forcegp.evaluation
+import forcegp.validation
+from forcegp import __version__
+from forcegp.atomic_files import write_json, write_text
+from forcegp.errors import InvalidInput
+from forcegp.jobs import JobStore, Progress, run_jobs
+from forcegp.jobs.machine import machine
+from forcegp.parallel import Backend, backend_for
 from forcegp.validation.candidates import DEFAULT_MODELS, candidates
-from forcegp.validation.comparison import Cell, Comparison, cells_of, compute
-from forcegp.validation.figures import figures_of
-from forcegp.validation.kept_cells import KeptCells
+from forcegp.validation.comparison import Comparison
+from forcegp.validation.jobs import jobs_of, kept
 from forcegp.validation.page import page
-from forcegp.validation.preparation_words import preparation_lines
+from forcegp.validation.paired_tests import against_baseline, conclusions
+from forcegp.validation.preparation_summary import preparation_lines
 from forcegp.validation.summary import summary_of
-from forcegp.validation.verdicts import against_baseline, verdicts
 
+KIND = "forcegp validate"
 RESULTS, PAGE = "results.json", "report.md"
-
-Progress = Callable[[int, int, str], None]
-"""Called as `progress(work done, work in total, note)`; work is a rough estimate."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def validate(
 ) -> Validation:
     """Fit every model for every split and seed, score it on the rows held out, and write one page about all of them.
 
-    Every finished piece is kept in `folder/cells` at once; the same call goes on after an interruption, and one with
+    Every finished piece is kept in `folder/jobs` at once; the same call goes on after an interruption, and one with
     more models or seeds computes only these. A model that fails is a row that says why.
 
     Parameters
@@ -80,79 +80,27 @@ def validate(
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     chosen = candidates(models, comparison.system, comparison.identification)
     configuration = comparison.configuration()
-    kept = KeptCells.open(Path(folder), configuration, overwrite=overwrite)
-    identifications, fits = cells_of(comparison, chosen, seeds)
-    with kept.locked():
-        kept.remove_leftovers()
-        missing = [
-            [cell for cell in stage if not kept.has(cell.file_name(comparison))] for stage in (identifications, fits)
-        ]
-        _Work(comparison, kept, [cell for stage in missing for cell in stage], progress).on(workers, missing)
-        cells = {name: [_read(kept, comparison, cell) for cell in fits if cell.name == name] for name in chosen}
-        document = _document(comparison, cells, chosen, seeds)
-        document |= {"configuration": configuration, "source": dict(source or {})}
-        document["identifications"] = [_brief(_read(kept, comparison, cell)) for cell in identifications]
-        figures = figures_of(document)
+    store = JobStore.open(Path(folder), KIND, configuration, overwrite=overwrite)
+    identifications, fits = jobs_of(comparison, chosen, seeds)
+    run_jobs(store, [*identifications, *fits], workers, progress)
+    runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
+    document = _document(comparison, runs, chosen, seeds)
+    document |= {"configuration": {"forcegp": __version__, **configuration}, "source": dict(source or {})}
+    document["identifications"] = [_brief(kept(store, job.name)) for job in identifications]
+    with store.locked():
+        figures = forcegp.validation.figures_of(document)
         for name, figure in figures.items():
-            save_figure(figure, kept.folder / f"{name}.png")
+            forcegp.evaluation.save_figure(figure, store.folder / f"{name}.png")
         document["figures"] = sorted(figures)
-        write_json(kept.folder / RESULTS, document)
-        write_text(kept.folder / PAGE, page(document))
-    return Validation(kept.folder, document)
-
-
-class _Work:
-    """The pieces that are missing, and how far they are."""
-
-    def __init__(
-        self, comparison: Comparison, kept: KeptCells, missing: Sequence[Cell], progress: Progress | None
-    ) -> None:
-        self.comparison, self.kept, self.progress = comparison, kept, progress
-        self.total = sum(cell.cost for cell in missing)
-        self.count, self.done, self.done_cost = len(missing), 0, 0.0
-
-    def on(self, backend: Backend, stages: Sequence[Sequence[Cell]]) -> None:
-        """One stage after the other, for the second reads what the first has kept; costly pieces first."""
-        for stage in stages:
-            waiting = sorted(stage, key=lambda cell: cell.cost)
-            if not waiting:
-                continue
-            comparison = Shared(self.comparison)
-            try:
-                with backend.pool() as pool:
-                    while waiting or len(pool):
-                        self._submit(pool, waiting, comparison)
-                        for cell, future in pool.finished():
-                            future.result()  # raises for a defect of this program: failures of models are kept
-                            self._tell(cell)
-            except BackendError as error:
-                raise BackendError(
-                    f"{error}. {self.done} of {self.count} pieces are kept; the same command goes on"
-                ) from None
-
-    def _submit(self, pool: Pool, waiting: list[Cell], comparison: Shared) -> None:
-        while waiting and pool.free > 0:
-            cell = waiting.pop()
-            pool.submit(cell, compute, comparison, self.kept, cell)
-
-    def _tell(self, cell: Cell) -> None:
-        self.done += 1
-        self.done_cost += cell.cost
-        if self.progress is not None:
-            note = f"{self.done} of {self.count} pieces, last {cell.name}, seed {cell.seed}"
-            self.progress(int(10 * self.done_cost), max(1, int(10 * self.total)), note)
-
-
-def _read(kept: KeptCells, comparison: Comparison, cell: Cell) -> dict[str, Any]:
-    stored = kept.read(cell.file_name(comparison))
-    assert stored is not None, "every cell was computed"
-    return stored
+        write_json(store.folder / RESULTS, document)
+        write_text(store.folder / PAGE, page(document))
+    return Validation(store.folder, document)
 
 
 def _document(
-    comparison: Comparison, cells: Mapping[str, Sequence[Mapping[str, Any]]], chosen: Mapping[str, Any], seeds: int
+    comparison: Comparison, runs: Mapping[str, Sequence[Mapping[str, Any]]], chosen: Mapping[str, Any], seeds: int
 ) -> dict[str, Any]:
-    summary = summary_of(cells, chosen)
+    summary = summary_of(runs, chosen)
     units = {name: comparison.rows.units[name] for name in ("q", "u", "a")}
     return {
         "kind": "forcegp validate",
@@ -165,12 +113,12 @@ def _document(
         "points": comparison.points,
         "seeds": list(range(seeds)),
         "mass_matrix": sorted(
-            {cell["result"]["mass_matrix"] for each in cells.values() for cell in each if cell["result"] is not None}
+            {run["result"]["mass_matrix"] for each in runs.values() for run in each if run["result"] is not None}
         ),
         "models": summary,
-        "verdicts": verdicts(summary, cells),
-        "against_baseline": against_baseline(summary, cells),
-        "cells": {name: [_brief(cell) for cell in each] for name, each in cells.items()},
+        "verdicts": conclusions(summary, runs),
+        "against_baseline": against_baseline(summary, runs),
+        "runs": {name: [_brief(run) for run in each] for name, each in runs.items()},
     }
 
 
@@ -182,9 +130,9 @@ def _described(comparison: Comparison, split: Any) -> dict[str, Any]:
     return split.to_dict() | sides
 
 
-def _brief(cell: Mapping[str, Any]) -> dict[str, Any]:
+def _brief(run: Mapping[str, Any]) -> dict[str, Any]:
     """Without the system of an identification, which its own file holds."""
-    result = cell["result"]
-    if cell["kind"] == "identification" and result is not None:
+    result = run["result"]
+    if run["kind"] == "identification" and result is not None:
         result = {name: value for name, value in result.items() if name != "system"}
-    return {**cell, "result": result}
+    return {**run, "result": result}

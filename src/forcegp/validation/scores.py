@@ -16,7 +16,7 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Of the central intervals whose coverage is told."""
+"""Of the central intervals whose coverage is reported."""
 
 STRETCHES = 20
 """Parts of the held-out time in which models are compared by themselves."""

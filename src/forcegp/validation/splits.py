@@ -47,7 +47,7 @@ class Stretch:
 class Split:
     """Which stretches of time are held out, and how far training rows must stay away from them.
 
-    Because it speaks of times, it divides a recording and its decimated version at the same moments.
+    Because it is given in times, it divides a recording and its decimated version at the same moments.
 
     Fields
     ------
@@ -131,8 +131,8 @@ def hold_out_episodes(dataset: Dataset, episodes: Sequence[int]) -> Split:
             f"all episodes {list(dataset.episodes)} are held out; leave one to learn from, or hold out blocks of time "
             f"({DEFAULT_BLOCKS})."
         )
-    told, others = (_listed([_called(dataset, number) for number in numbers]) for numbers in (episodes, rest))
-    words = f"trained on whole episodes ({others}), tested on others ({told})"
+    tested, others = (_listed([_called(dataset, number) for number in numbers]) for numbers in (episodes, rest))
+    words = f"trained on whole episodes ({others}), tested on others ({tested})"
     return Split(f"episodes-{'-'.join(map(str, episodes))}", words, tuple(Stretch(number) for number in episodes))
 
 

@@ -1,4 +1,4 @@
-"""What the finished pieces of a comparison say: medians and ranges over seeds and splits, as plain JSON values."""
+"""Results of the finished pieces of a comparison: medians and ranges over seeds and splits, as plain JSON values."""
 
 from __future__ import annotations
 
@@ -6,55 +6,53 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from forcegp.errors import FileFormatError
-from forcegp.evaluation.spreads import spread
+from forcegp.evaluation.summary_statistics import median_and_range
 from forcegp.validation.candidates import Candidate
 from forcegp.validation.scores import over_joints
 
 Result = Mapping[str, Any]
 
 
-def summary_of(cells: Mapping[str, Sequence[Mapping[str, Any]]], models: Mapping[str, Candidate]) -> dict[str, Any]:
+def summary_of(runs: Mapping[str, Sequence[Mapping[str, Any]]], models: Mapping[str, Candidate]) -> dict[str, Any]:
     """By model: what it is, spreads of its scores, and why runs failed.
 
-    `cells` holds what was kept of every model, one for each split and seed. Over joints see `scores.over_joints`.
-    Raises FileFormatError where cells used different mass matrices for their force errors.
+    `runs` holds what was kept of every model, one for each split and seed. Over joints see `scores.over_joints`.
+    Raises FileFormatError where runs used different mass matrices for their force errors.
     """
-    for split in {cell["split"] for each in cells.values() for cell in each}:
+    for split in {run["split"] for each in runs.values() for run in each}:
         used = {
-            cell["result"]["mass_matrix"]
-            for each in cells.values()
-            for cell in each
-            if cell["result"] is not None and cell["split"] == split
+            run["result"]["mass_matrix"]
+            for each in runs.values()
+            for run in each
+            if run["result"] is not None and run["split"] == split
         }
         if len(used) > 1:
             raise FileFormatError(
                 f"force errors of split {split!r} rest on different mass matrices ({'; '.join(sorted(used))}); "
-                "delete the folder of cells and run the same command again."
+                "delete the folder of jobs and run the same command again."
             )
-    return {name: _model(cells[name], models[name]) for name in models}
+    return {name: _model(runs[name], models[name]) for name in models}
 
 
-def _model(cells: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str, Any]:
-    results = [cell["result"] for cell in cells if cell["result"] is not None]
+def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str, Any]:
+    results = [run["result"] for run in runs if run["result"] is not None]
     failures = [
-        {"split": cell["split"], "seed": cell["seed"], "error": cell["error"]}
-        for cell in cells
-        if cell["result"] is None
+        {"split": run["split"], "seed": run["seed"], "error": run["error"]} for run in runs if run["result"] is None
     ]
     out: dict[str, Any] = {
         "kind": candidate.kind,
         "summary": candidate.summary,
         "runs": len(results),
         "failures": failures,
-        "warnings": sorted({warning for cell in cells for warning in cell["warnings"]}),
+        "warnings": sorted({warning for run in runs for warning in run["warnings"]}),
     }
     if not results:
         return out
     for score in ("nrmse", "rmse", "mae", "force_rms", "force_mae"):
-        out[score] = spread(over_joints(score, result[score]) for result in results)
+        out[score] = median_and_range(over_joints(score, result[score]) for result in results)
         out[f"{score}_per_joint"] = _per_joint(results, lambda result, score=score: result[score])
     for score in ("nlpd", "cpu_seconds"):
-        out[score] = spread(result[score] for result in results)
+        out[score] = median_and_range(result[score] for result in results)
     out["nlpd_per_joint"] = _per_joint(results, lambda result: result["nlpd_per_joint"])
     levels = results[0]["levels"]
     for level in (0.5, 0.95):
@@ -65,7 +63,7 @@ def _model(cells: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str
     out["calibration"] = {
         "levels": levels,
         "covered": [
-            spread(over_joints("coverage", result["coverage"][place]) for result in results)
+            median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
             for place in range(len(levels))
         ],
     }
@@ -74,7 +72,7 @@ def _model(cells: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str
 
 
 def _covered(results: Sequence[Result], place: int) -> dict[str, Any] | None:
-    return spread(over_joints("coverage", result["coverage"][place]) for result in results)
+    return median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
 
 
 def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
@@ -89,10 +87,10 @@ def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
         "motions": sum(run["motions"] for run in given),
         "integrator": given[0]["integrator"],
         "dt": given[0]["dt"],
-        "rms": [spread(run["rms"][at] for run, at in zip(given, here, strict=True)) for here in places],
+        "rms": [median_and_range(run["rms"][at] for run, at in zip(given, here, strict=True)) for here in places],
         "rms_per_joint": [
             [
-                spread(run["rms_per_joint"][at][joint] for run, at in zip(given, here, strict=True))
+                median_and_range(run["rms_per_joint"][at][joint] for run, at in zip(given, here, strict=True))
                 for joint in range(len(given[0]["rms_per_joint"][0]))
             ]
             for here in places
@@ -102,4 +100,4 @@ def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
 
 
 def _per_joint(results: Sequence[Result], values: Callable[[Result], Sequence[float | None]]) -> list[Any]:
-    return [spread(values(result)[joint] for result in results) for joint in range(len(values(results[0])))]
+    return [median_and_range(values(result)[joint] for result in results) for joint in range(len(values(results[0])))]

@@ -1,0 +1,174 @@
+"""What the checks look at: the log as it is, and the same at even times, filtered and differentiated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from forcegp.data import Dataset, Preparation, Prepared, resample, uniform_step
+from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.mechanics import MechanicalSystem
+from forcegp.robots import Robot
+
+GAP = 5.0
+"""Median steps without a row at which a motion is taken for two."""
+
+COMPARED = 0.5
+"""Of the cut-off: where torques are compared."""
+
+LONGEST_TRIM = 0.1
+"""Most that is trimmed from either end, as a share of the shortest stretch."""
+
+MOST_ROWS = 1000
+"""Rows on which torques are compared: neighbouring rows hold the same information."""
+
+DEGREE = np.pi / 180.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CheckInput:
+    """One log and, if known, its robot.
+
+    `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
+    `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
+    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the
+    cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
+    by more than pi otherwise. `prepared` and `compared` are None where jumps forbid any derivative.
+    """
+
+    log: Dataset
+    robot: Robot | None
+    contacts: int
+    even: Dataset
+    prepared: Prepared | None
+    compared: Dataset | None
+    automatic: bool
+    wraps: Bool[np.ndarray, "rows nv"]
+    jumps: Bool[np.ndarray, "rows nv"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return tuple(self.log.joint_names)
+
+    @property
+    def rotates(self) -> Bool[np.ndarray, " nv"]:
+        """Whether a joint turns; others slide."""
+        units = self.log.units["q"]
+        return np.array([unit == "rad" for unit in ([units] * self.log.nv if isinstance(units, str) else units)])
+
+    def rows(self) -> Dataset:
+        """Up to 1000 rows of `compared`, evenly over the log."""
+        assert self.compared is not None
+        data = self.compared
+        return data.rows(slice(None, None, max(1, -(-len(data) // MOST_ROWS))))
+
+    @property
+    def price(self) -> Mapping[str, Any]:
+        """What the filter of the check did, or that of an earlier preparation where this one filters nothing."""
+        assert self.prepared is not None
+        return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
+
+    @classmethod
+    def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> CheckInput:
+        """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
+        if not dataset.time_ordered:
+            raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
+        system = dataset.system if system is None else system
+        wraps, jumps = _leaps(dataset)
+        even = _even(_unwrapped(dataset, wraps), jumps)
+        prepared = compared = None
+        if not jumps.any():
+            shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
+            chosen = replace(preparation, every=1, delay=0.0).resolved(even)
+            trim = 0.0 if chosen.cutoff is None else min(1.0 / float(chosen.cutoff), LONGEST_TRIM * shortest)
+            prepared = replace(chosen, trim=float(trim)).apply(even)
+            compared = prepared.dataset
+            applied = chosen.cutoff or _earlier(dataset).get("cutoff")
+            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(_first(even)):
+                lower = COMPARED * float(applied)
+                compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
+        return cls(
+            log=dataset,
+            robot=None if system is None else system.robot,
+            contacts=0 if system is None else len(system.contacts),
+            even=even,
+            prepared=prepared,
+            compared=compared,
+            automatic=preparation.cutoff == "auto",
+            wraps=wraps,
+            jumps=jumps,
+        )
+
+
+def _earlier(dataset: Dataset) -> Mapping[str, Any]:
+    """The report of a preparation with a filter that this dataset went through; empty without one."""
+    report = dataset.metadata.get("preparation")
+    while isinstance(report, Mapping):
+        if report.get("cutoff") is not None:
+            return report
+        report = report.get("earlier")
+    return {}
+
+
+def _first(even: Dataset) -> np.ndarray:
+    return even.time[even.episode == even.episode[0]]
+
+
+def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
+    """Whether the next row belongs to the same episode and follows; False for the last row."""
+    return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
+
+
+def _leaps(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Jumps of an angle by a turn, and by more than pi otherwise, after each row."""
+    change = np.zeros_like(dataset.q)
+    change[:-1] = np.diff(dataset.q, axis=0)
+    change[~consecutive(dataset)] = 0.0
+    units = dataset.units["q"]
+    angular = np.array([unit == "rad" for unit in ([units] * dataset.nv if isinstance(units, str) else units)])
+    size = np.abs(change)
+    turn = (np.abs(size - 2.0 * np.pi) < 0.5) & angular
+    return turn, (size > np.pi) & angular & ~turn
+
+
+def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:
+    if not wraps.any():
+        return dataset
+    q = dataset.q.copy()
+    for number in dataset.episodes:
+        own = dataset.episode == number
+        q[own] = np.unwrap(q[own], axis=0)
+    return replace(dataset, q=q, truth={})
+
+
+def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:
+    """Stretches without gaps, each an episode, at even times."""
+    pieces: list[np.ndarray] = []
+    for number in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == number)
+        steps = np.diff(dataset.time[rows])
+        breaks = np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else []
+        pieces += [piece for piece in np.split(rows, breaks) if len(piece) >= FEWEST_ROWS]
+    if not pieces:
+        raise InvalidInput(
+            f"no stretch of {FEWEST_ROWS} rows without a gap; a check needs one. Give a longer recording, or number "
+            "the episodes."
+        )
+    rows = np.concatenate(pieces)
+    numbers = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    even = replace(dataset.rows(rows), episode=numbers, noise_std=None, truth={}, time_ordered=True)
+    try:
+        steps = [uniform_step(even.time[even.episode == number]) for number in even.episodes]
+        if max(steps) - min(steps) <= 1e-3 * max(steps):
+            return even
+    except DatasetError:
+        pass
+    if jumps.any():
+        return even  # a spline through a jump would be of no use, and nothing is differentiated then
+    return resample(even, float(np.median(np.concatenate([np.diff(dataset.time[piece]) for piece in pieces]))))

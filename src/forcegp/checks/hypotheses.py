@@ -1,0 +1,252 @@
+"""Hypotheses about errors in a log: wrong signs, exchanged joints, wrong units, a wrong direction of gravity.
+
+Each hypothesis corrects one error. The hypothesis under which inverse dynamics fits the torques best is reported if it
+leaves far less unexplained than the log as it is; then the next is sought, on top of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from forcegp.checks.check_input import DEGREE, CheckInput
+from forcegp.checks.findings import Finding, listed
+from forcegp.checks.gravity import estimated_gravity, with_gravity
+from forcegp.checks.torques import Correction, TorqueFit, fit_torques, inverse_dynamics, unexplained_share
+from forcegp.data import Dataset
+from forcegp.robots import Robot
+
+SMALLEST = 1e-3
+"""Unexplained shares below this are all the same: a log fits."""
+
+GAIN = np.log(4.0)
+"""What a correction must explain: the product over all joints of what remains falls by this factor at least."""
+
+STILL_UNEXPLAINED = 0.6
+"""A joint of which more remains even then has not been explained."""
+
+EXPLAINED = 0.1
+"""Where no more than this remains in any joint there is nothing to explain."""
+
+MAX_CORRECTIONS = 4
+TILTED = np.deg2rad(15.0)
+"""Angle from which a direction of gravity is reported."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """A log with one error corrected: robot, correction, rows compared, their inverse dynamics and the fit.
+
+    `cost` is subtracted from what it explains: of two explanations the simpler one is reported. `concerns` are the
+    joints that it must explain.
+    """
+
+    robot: Robot
+    correction: Correction
+    rows: Dataset
+    tau: Float[np.ndarray, "rows nv"]
+    fit: TorqueFit
+    finding: Finding | None = None
+    cost: float = 0.0
+    concerns: tuple[int, ...] = ()
+
+    @property
+    def score(self) -> float:
+        """Logarithm of what remains unexplained, over all joints."""
+        known = self.fit.unexplained[np.isfinite(self.fit.unexplained)]
+        return float(np.log(np.maximum(known, SMALLEST)).sum())
+
+
+def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Finding]]:
+    """The corrected log and one finding for each correction, chosen greedily. Needs a robot, without contacts."""
+    assert inputs.robot is not None
+    given = inputs.rows()
+    now = _hypothesis(inputs.robot, Correction.none(given.nv), given)
+    found: list[Finding] = []
+    for _ in range(MAX_CORRECTIONS):
+        if not np.nanmax(now.fit.unexplained, initial=0.0) > EXPLAINED:
+            break
+        candidates = [*_candidates(now, given, inputs)]
+        best = max(candidates, key=lambda other: now.score - other.score - other.cost, default=None)
+        if best is None or now.score - best.score - best.cost < GAIN or not _explains(now, best):
+            break
+        assert best.finding is not None
+        found.append(best.finding)
+        now = replace(best, finding=None, cost=0.0, concerns=())
+    return now, found
+
+
+def _explains(now: Hypothesis, best: Hypothesis) -> bool:
+    """Whether every joint that the correction concerns is explained now, and none much worse than before."""
+    before, after = now.fit.unexplained, best.fit.unexplained
+    concerned = [joint for joint in best.concerns if np.isfinite(after[joint])]
+    better = all(after[joint] < STILL_UNEXPLAINED and after[joint] < before[joint] for joint in concerned)
+    known = np.isfinite(after)
+    return better and bool((after[known] < np.maximum(2.0 * before[known], 0.1)).all())
+
+
+def _candidates(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+    yield from _torque_signs(now, given, inputs.names)
+    yield from _torque_places(now, given, inputs.names)
+    yield from _degrees(now, given, inputs)
+    yield from _motion_signs(now, given, inputs.names)
+    yield from _motion_places(now, given, inputs.names)
+    yield from _gravity(now, given)
+
+
+def _hypothesis(robot: Robot, correction: Correction, given: Dataset, **more: Any) -> Hypothesis:
+    rows = correction.applied(given)
+    tau = inverse_dynamics(robot, rows)
+    return Hypothesis(robot=robot, correction=correction, rows=rows, tau=tau, fit=fit_torques(tau, rows), **more)
+
+
+def _torque_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """All joints whose torque fits with the other sign, together."""
+    other = fit_torques(now.tau, now.rows, -now.rows.u)
+    with np.errstate(invalid="ignore"):
+        turned = (other.unexplained < 0.5 * now.fit.unexplained) & (other.unexplained < STILL_UNEXPLAINED)
+        turned &= now.fit.unexplained > SMALLEST
+    if not turned.any():
+        return
+    joints = tuple(names[joint] for joint in np.flatnonzero(turned))
+    finding = Finding(
+        severity="wrong",
+        subject="torque sign",
+        seen=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
+        f"motion needs ({_remains(now.fit, other, turned)}).",
+        remedy="Turn the sign of u (forcegp import --sign), or of the joint's whole motion if its axis in the URDF "
+        "points the other way.",
+        joints=joints,
+    )
+    correction = now.correction.torque(np.arange(len(names)), np.where(turned, -1.0, 1.0))
+    yield _hypothesis(now.robot, correction, given, finding=finding, concerns=_places(turned))
+
+
+def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """Torques in the places of other joints: the assignment that leaves least unexplained."""
+    places = np.arange(len(names))
+
+    def unexplained(joint: int, column: int) -> float:
+        rows = now.rows
+        left = unexplained_share(now.tau[:, joint], rows.v[:, joint], rows.a[:, joint], rows.u[:, column])
+        return float(np.log(np.clip(left, SMALLEST, 1.0))) if np.isfinite(left) else 0.0
+
+    nv = len(names)
+    table = np.array([[unexplained(joint, column) for column in range(nv)] for joint in range(nv)])
+    _, order = linear_sum_assignment(table)
+    moved = order != places
+    if not moved.any():
+        return
+    correction = now.correction.torque(order, np.ones(len(names)))
+    better = _hypothesis(now.robot, correction, given, cost=0.5, concerns=_places(moved))
+    text = ", ".join(f"that of {names[joint]} stands under {names[int(order[joint])]}" for joint in _places(moved))
+    finding = Finding(
+        severity="wrong",
+        subject="joints exchanged",
+        seen=f"torques stand under wrong joints: {text} ({_remains(now.fit, better.fit, moved)}).",
+        remedy="Correct the order of the torque columns.",
+        joints=tuple(names[joint] for joint in _places(moved)),
+        numbers={"order": [names[int(column)] for column in order]},
+    )
+    yield replace(better, finding=finding)
+
+
+def _degrees(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+    """All angles in degrees."""
+    largest = np.abs(now.rows.q * inputs.rotates).max()
+    if largest < 1.0:
+        return  # less than a degree of motion is not worth the question
+    finding = Finding(
+        severity="wrong",
+        subject="degrees",
+        seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken for "
+        "radians.",
+        remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
+        joints=tuple(name for name, turns in zip(inputs.names, inputs.rotates, strict=True) if turns),
+    )
+    factor = np.where(inputs.rotates, DEGREE, 1.0)
+    yield _hypothesis(now.robot, now.correction.motion(np.arange(len(factor)), factor), given, finding=finding)
+
+
+def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """The motion of one joint, or all of that joint, in the other direction."""
+    places = np.arange(len(names))
+    for joint, name in enumerate(names):
+        turned = np.where(places == joint, -1.0, 1.0)
+        motion = now.correction.motion(places, turned)
+        for seen, correction in (
+            (f"positions and velocities of {name} have", motion),
+            (f"the whole joint {name} (motion and torque) has", motion.torque(places, turned)),
+        ):
+            finding = Finding(
+                severity="wrong",
+                subject="motion sign",
+                seen=f"{seen} the opposite sign of the URDF's.",
+                remedy="Turn the signs (forcegp import --sign), or the joint's axis in the URDF.",
+                joints=(name,),
+            )
+            yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
+
+
+def _motion_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """Two joints in each other's place: their motion, or all of them."""
+    ones = np.ones(len(names))
+    for one in range(len(names)):
+        for other in range(one + 1, len(names)):
+            order = np.arange(len(names))
+            order[[one, other]] = order[[other, one]]
+            motion = now.correction.motion(order, ones)
+            for what, correction in (
+                ("positions and velocities", motion),
+                ("all signals", motion.torque(order, ones)),
+            ):
+                finding = Finding(
+                    severity="wrong",
+                    subject="joints exchanged",
+                    seen=f"{what} of {names[one]} and {names[other]} stand in each other's place.",
+                    remedy="Correct the order of the columns, or the joint names of the log.",
+                    joints=(names[one], names[other]),
+                )
+                yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
+
+
+def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
+    """The direction of gravity that the torques show: along an axis of the base, or as estimated."""
+    nominal = now.robot.gravity.cpu().numpy()
+    size = float(np.linalg.norm(nominal))
+    estimated = estimated_gravity(now.robot, now.rows, now.tau, now.fit)
+    if estimated is None or size == 0.0:
+        return
+    directions = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
+    directions.append(estimated / np.linalg.norm(estimated))
+    for index, direction in enumerate(directions):
+        angle = float(np.arccos(np.clip(direction @ nominal / size, -1.0, 1.0)))
+        if angle < TILTED:
+            continue
+        gravity = size * direction
+        text = ", ".join(f"{value + 0.0:.3g}" for value in gravity)
+        finding = Finding(
+            severity="wrong",
+            subject="gravity",
+            seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
+            f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",
+            remedy=f"Give --gravity={text.replace(' ', '')}.",
+            numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
+        )
+        cost = 1.5 if index == len(directions) - 1 else 1.0  # a base along its axes is the likelier one
+        yield _hypothesis(with_gravity(now.robot, gravity), now.correction, given, finding=finding, cost=cost)
+
+
+def _places(chosen: np.ndarray) -> tuple[int, ...]:
+    return tuple(int(place) for place in np.flatnonzero(chosen))
+
+
+def _remains(before: TorqueFit, after: TorqueFit, joints: np.ndarray) -> str:
+    """`then at most 2 % of it remains unexplained, instead of 98 %`."""
+    then, now = (float(np.nanmax(fit.unexplained[joints])) for fit in (after, before))
+    return f"then at most {100.0 * then:.2g} % of it remains unexplained, instead of {100.0 * now:.3g} %"

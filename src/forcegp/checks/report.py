@@ -1,0 +1,120 @@
+"""`check`: one log against itself and its robot, as a list of findings that a person acts on."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from forcegp.checks.check_input import CheckInput
+from forcegp.checks.excitation import excitation_findings
+from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
+from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
+from forcegp.checks.motion import motion_findings
+from forcegp.checks.noise import noise_findings, numbers_of, torque_noise
+from forcegp.checks.robot_model import robot_findings
+from forcegp.checks.sampling import sampling_findings
+from forcegp.checks.signals import signal_findings
+from forcegp.checks.torque_findings import not_compared, torque_findings
+from forcegp.data import Dataset, Preparation
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import MechanicalSystem
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CheckReport:
+    """The findings, worst first, and what they rest on.
+
+    `inputs` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
+    with the errors corrected that were found (None without a robot, or with contacts).
+    """
+
+    __no_type_check__: ClassVar[bool] = True  # made by `check` alone
+
+    findings: tuple[Finding, ...]
+    inputs: CheckInput
+    comparison: Hypothesis | None
+
+    @property
+    def evidence(self) -> CheckInput:
+        """Deprecated name of `inputs`."""
+        warnings.warn("CheckReport.evidence is now called inputs.", DeprecationWarning, stacklevel=2)
+        return self.inputs
+
+    @property
+    def severity(self) -> Severity:
+        """That of the worst finding."""
+        return worst(self.findings)
+
+    def of(self, subject: str) -> tuple[Finding, ...]:
+        """The findings on one subject."""
+        return tuple(finding for finding in self.findings if finding.subject == subject)
+
+    def per_joint(self) -> list[dict[str, Any]]:
+        """What was measured of every joint; None where it is not known.
+
+        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics
+        (see `forcegp.checks.torques`), the factor only where the torque rests on it; "noise_before" and "noise_after"
+        the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
+        """
+        nothing = [None] * self.inputs.log.nv
+        columns: dict[str, list[Any]] = {"joint": list(self.inputs.names)}
+        fit = None if self.comparison is None else self.comparison.fit
+        rows = None if self.comparison is None else self.comparison.rows
+        columns["unexplained"] = nothing if fit is None else plain(fit.unexplained)
+        columns["residual"] = nothing
+        if fit is not None and rows is not None:
+            columns["residual"] = plain(np.std(rows.u - fit.predicted, axis=0))
+        columns["factor"] = nothing if fit is None else plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
+        report = {} if self.inputs.prepared is None else self.inputs.price
+        noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
+        columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
+        torque = torque_noise(self.inputs, numbers_of(noise["after"])) if self.inputs.prepared is not None else None
+        columns["noise_torque"] = nothing if torque is None else plain(torque)
+        return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON: severity, counts, numbers of every joint, findings."""
+        counts = {severity: sum(each.severity == severity for each in self.findings) for severity in SEVERITIES}
+        return {
+            "severity": self.severity,
+            "counts": counts,
+            "cutoff": None if self.inputs.prepared is None else self.inputs.price.get("cutoff"),
+            "joints": self.per_joint(),
+            "findings": [finding.to_dict() for finding in self.findings],
+        }
+
+
+def check(
+    dataset: Dataset, system: MechanicalSystem | None = None, *, preparation: Preparation | None = None
+) -> CheckReport:
+    """Look for what would spoil a model: wrong units, signs, joints, delays; dead channels; motion that shows nothing.
+
+    `system` is the robot that was recorded (default: that of the dataset); without one, torques are not compared.
+    `preparation` sets how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
+    `trim` are not used. Nothing is changed.
+
+    Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
+    """
+    system = dataset.system if system is None else system
+    if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
+        raise InvalidInput(
+            f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
+            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
+        )
+    inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
+    findings = [*sampling_findings(inputs), *signal_findings(inputs), *motion_findings(inputs)]
+    comparison = None
+    if inputs.robot is not None:
+        findings += robot_findings(inputs.robot)
+    if inputs.prepared is not None:
+        if inputs.robot is None or inputs.contacts:
+            findings.append(not_compared(inputs))
+        elif dataset.u.any():
+            comparison, corrections = best_hypothesis(inputs)
+            findings += [*corrections, *torque_findings(inputs, comparison)]
+        findings += [*excitation_findings(inputs), *noise_findings(inputs)]
+    ordered = sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
+    return CheckReport(findings=tuple(ordered), inputs=inputs, comparison=comparison)

@@ -1,0 +1,159 @@
+"""`--robot`, `--inertias`, `--lock`, `--armature`, `--gravity` and `--identified`: which robot a command works with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+import forcegp
+from forcegp.cli.command import IDENTIFIED, URDF, Command
+from forcegp.errors import FileFormatError, InvalidInput
+
+SYSTEM_FILE = "system.json"
+"""Where a folder that `forcegp identify` wrote holds robot and known forces."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotOptions(Command):
+    """What every command asks that needs a robot."""
+
+    robot: Annotated[Path | None, URDF, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
+    """Use this robot instead of the dataset's."""
+    inertias: Annotated[Literal["strict", "nearest"], arg(metavar="strict|nearest")] = "strict"
+    """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
+    inertia that a body can have, and warn how far it is."""
+    lock: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="JOINT=RAD", help_behavior_hint="(repeatable; default: as recorded)"),
+    ] = ()
+    """Hold a joint of the URDF at this position (rad or m), for instance a finger that was not recorded."""
+    armature: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="JOINT=VALUE", help_behavior_hint="(repeatable; default: as recorded, or 0)"),
+    ] = ()
+    """Rotor inertia seen at a joint, in kg m² (kg for a prismatic one)."""
+    gravity: Annotated[
+        str | None, arg(metavar="X,Y,Z", constructor=str, help_behavior_hint="(default: as recorded, or 0,0,-9.81)")
+    ] = None
+    """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
+    identified: Annotated[
+        Path | None, IDENTIFIED, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: none)")
+    ] = None
+    """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
+
+    def chosen_robot(self, recorded: forcegp.Robot | None = None) -> forcegp.Robot | None:
+        """The robot that the options ask for, else `recorded`; what no URDF holds is as recorded.
+
+        None where there is neither. Raises InvalidInput for options that contradict each other or make no sense, and
+        what `Robot.from_urdf` raises.
+        """
+        if self.identified is not None:
+            system = self._identified_system()
+            return None if system is None else system.robot
+        changes = self._changes()
+        if self.robot is None and recorded is None:
+            if changes:
+                raise InvalidInput(f"--{next(iter(changes)).replace('locked', 'lock')} needs --robot ARM.urdf.")
+            return None
+        if self.robot is None and not changes:
+            return recorded
+        return self._made(recorded, changes)
+
+    def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
+        """What is known about the robot of `dataset`, which came from `path`: its own system, with what is replaced.
+
+        Raises InvalidInput where it carries none and none is given, or where joints differ.
+        """
+        system = dataset.system
+        found = self._identified_system()
+        if found is not None and system is not None:
+            found = replace(found, contacts=system.contacts, baumgarte=system.baumgarte)
+        robot = self.chosen_robot(None if system is None else system.robot) if found is None else found.robot
+        if robot is None:
+            raise InvalidInput(
+                f"{path} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
+            )
+        if robot.joint_names != tuple(dataset.joint_names):
+            raise InvalidInput(
+                f"{self.robot or self.identified or 'the robot'} has joints {', '.join(robot.joint_names)}; {path} has "
+                f"{', '.join(dataset.joint_names)}. Give the robot that was recorded, or --lock what was not."
+            )
+        if found is not None:
+            return found
+        return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
+
+    def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
+        """A robot from a URDF file, or from the recorded one's text, with what the options change."""
+        if recorded is not None:
+            changes = {"gravity": recorded.gravity.tolist(), "locked": recorded.locked} | changes
+        if self.robot is not None:
+            robot = forcegp.Robot.from_urdf(self.robot, inertias=self.inertias, **changes)
+        else:
+            assert recorded is not None, "checked by the caller"
+            robot = forcegp.Robot.from_urdf_text(
+                recorded.urdf_text, source=recorded.source, inertias=self.inertias, **changes
+            )
+        # robots with other joints are refused by their names: clearer than an armature of the wrong length
+        if recorded is None or robot.joint_names != recorded.joint_names:
+            return robot
+        kept = dict(zip(recorded.joint_names, recorded.armature.tolist(), strict=True))
+        return robot.with_armature(kept | changes.get("armature", {}))
+
+    def _changes(self) -> dict[str, Any]:
+        """Arguments of `Robot.from_urdf` by name."""
+        changes: dict[str, Any] = {}
+        if self.gravity is not None:
+            words = self.gravity.split(",")
+            if len(words) != 3:
+                raise InvalidInput(f"--gravity {self.gravity} holds {len(words)} numbers; write --gravity 0,0,-9.81.")
+            changes["gravity"] = [_number(word, f"--gravity {self.gravity}") for word in words]
+        if self.lock:
+            changes["locked"] = _named(self.lock, "--lock", "JOINT=RAD")
+        if self.armature:
+            changes["armature"] = _named(self.armature, "--armature", "JOINT=VALUE")
+        return changes
+
+    def _identified_system(self) -> forcegp.MechanicalSystem | None:
+        if self.identified is None:
+            return None
+        given = {"robot": self.robot, "lock": self.lock, "armature": self.armature, "gravity": self.gravity}
+        contradicting = [f"--{name}" for name, value in given.items() if value]
+        if contradicting:
+            raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
+
+        path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileFormatError(
+                f"{path}: cannot be read ({error}); give a folder that `forcegp identify` wrote."
+            ) from None
+        return forcegp.MechanicalSystem.from_json(text)
+
+
+def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
+    """Words NAME=NUMBER as a mapping, each name once."""
+    out: dict[str, float] = {}
+    for word in words:
+        name, _, text = word.rpartition("=")
+        if not name:
+            raise InvalidInput(f"{option} {word} is not {syntax}.")
+        if name in out:
+            raise InvalidInput(f"{option} names {name} twice; give each joint once.")
+        out[name] = _number(text, f"{option} {word}")
+    return out
+
+
+def _number(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InvalidInput(f"{what}: {text!r} is not a finite number.")
+    return value

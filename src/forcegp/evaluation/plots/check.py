@@ -1,0 +1,136 @@
+"""Plot: one look at a log. Measured torques against inverse dynamics, the spectrum with its cut-off, the time steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from forcegp.checks import CheckReport
+from forcegp.checks.torques import inverse_dynamics
+from forcegp.data import Dataset, Preparation, motion_spectrum
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.spectrum import draw_cutoff, draw_time_steps
+from forcegp.evaluation.plots.style import (
+    KNOWN_PHYSICS,
+    LARGE,
+    MEASUREMENT,
+    NORMAL,
+    PREDICTION,
+    SERIES,
+    SMALL,
+    TRUTH,
+    joint_units,
+    new_figure,
+    quiet,
+    short_joint_names,
+    window,
+)
+
+COLUMNS = 3
+SECONDS = 5.0
+MOST_ROWS = 1000
+
+
+def check_figure(report: CheckReport) -> Figure:
+    """Torques of every joint over up to 5 s, then the spectra of all accelerations, then all time steps.
+
+    Where torques were not compared, positions are drawn instead.
+    """
+    inputs = report.inputs
+    nv = inputs.log.nv
+    columns = min(nv, COLUMNS if nv != 4 else 2)
+    grid = -(-nv // columns)
+    figure = new_figure(10.0, 1.75 * grid + 3.4)
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7))
+    panels = halves[0].subplots(grid, columns, sharex=True, squeeze=False)
+    names = short_joint_names(inputs.names)
+    shown = window(inputs.log if inputs.compared is None else inputs.compared, 0.0, SECONDS)
+    shown = shown.rows(slice(None, None, max(1, len(shown) // MOST_ROWS)))
+    drawn = [_draw_joint(panel, report, shown, joint) for joint, panel in zip(range(nv), panels.flat, strict=False)]
+    for joint, panel in enumerate(panels.flat):
+        if joint >= nv:
+            panel.set_visible(False)
+            continue
+        bottom = joint + columns >= nv
+        panel.tick_params(labelbottom=bottom)
+        quiet(panel, title=_title(names[joint], report, joint), y=drawn[joint], x="time in s" if bottom else "")
+    handles, labels = legend_entries(*panels.flat[:nv])
+    halves[0].legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=max(1, len(labels)),
+        fontsize=NORMAL,
+        frameon=False,
+        markerscale=4,
+        title=_heading(report),
+        title_fontproperties={"size": LARGE, "weight": "bold"},
+        alignment="left",
+    )
+    left, right = halves[1].subplots(1, 2, squeeze=False)[0]
+    _draw_spectra(left, report, names)
+    draw_time_steps(right, inputs.log)
+    quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
+    return figure
+
+
+def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> str:
+    """Torque, or position where torques were not compared, of one joint; returns the unit."""
+    axes.margins(x=0)
+    log = report.comparison
+    if log is None:
+        axes.plot(shown.time, shown.q[:, joint], color=TRUTH, linewidth=1.0, label="position")
+        return joint_units(shown, "q")[joint]
+    rows = log.correction.applied(shown)
+    tau = inverse_dynamics(log.robot, rows)
+    measured, fitted = rows.u[:, joint], log.fit.at(tau, rows)[:, joint]
+    mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
+    if mended:
+        axes.plot(rows.time, shown.u[:, joint], color=KNOWN_PHYSICS, linewidth=0.9, label="before the correction")
+    axes.plot(rows.time, measured, color=MEASUREMENT, linewidth=2.2, label="measured, filtered")
+    axes.plot(rows.time, tau[:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics")
+    style = (0, (4, 1.5))
+    label = "with factor, armature, friction"
+    axes.plot(rows.time, fitted, color=PREDICTION, linewidth=1.1, linestyle=style, label=label)
+    drawn = [measured, fitted, *([shown.u[:, joint]] if mended else [])]
+    low, high = min(values.min() for values in drawn), max(values.max() for values in drawn)
+    space = 0.3 * max(float(high - low), 1e-9)
+    axes.set_ylim(low - space, high + space)  # inverse dynamics alone may be far off: for example with a wrong unit
+    return joint_units(shown, "u")[joint]
+
+
+def _heading(report: CheckReport) -> str:
+    counts = report.to_dict()["counts"]
+    wrong = dict.fromkeys(finding.subject for finding in report.findings if finding.severity == "wrong")
+    what = f" ({', '.join(wrong)})" if wrong else ""
+    return f"Check: {counts['wrong']} wrong{what}, {counts['look']} to look at, {counts['ok']} ok"
+
+
+def _title(name: str, report: CheckReport, joint: int) -> str:
+    if report.comparison is None:
+        return name
+    left = report.comparison.fit.unexplained[joint]
+    return f"{name}: {100.0 * left:.2g} % unexplained" if np.isfinite(left) else f"{name}: constant torque"
+
+
+def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
+    """Power of the accelerations of all joints, by differences of the positions, and the cut-off."""
+    inputs = report.inputs
+    spectrum = motion_spectrum(inputs.even)
+    for joint, name in enumerate(names):
+        power = np.maximum(spectrum.acceleration_density[:, joint], 1e-300)
+        axes.loglog(spectrum.frequency, power, color=SERIES[joint % len(SERIES)], linewidth=0.9, label=name)
+    shown = spectrum.acceleration_density[spectrum.acceleration_density > 0.0]
+    if len(shown):
+        axes.set_ylim(max(0.3 * float(shown.min()), 1e-12 * float(shown.max())), 5.0 * float(shown.max()))
+    preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
+    title = "Acceleration as logged: no filter"
+    if preparation.cutoff is not None:
+        draw_cutoff(axes, float(preparation.cutoff), TRUTH)
+        title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
+    axes.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
+    axes.legend(fontsize=SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
+    quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

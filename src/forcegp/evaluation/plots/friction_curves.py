@@ -1,0 +1,290 @@
+"""Plot: the friction curves that a model learned, one panel each, over velocity, and the truth where it is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.evaluation.force_errors import true_names
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.style import (
+    LARGE,
+    NORMAL,
+    PREDICTION,
+    TRUTH,
+    new_figure,
+    quiet,
+    short_joint_names,
+)
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
+from forcegp.models.structured.components import Curve, term_slices
+from forcegp.priors import ContactFriction, ForcePrior, ToolForces
+
+LARGEST_GRID = 12
+BEYOND = 0.18
+"""Part of the visited range that is drawn on either side of it."""
+POINTS = 241
+TRUE_POINTS = 200
+TRUE_DOTS = "#A8A8A8"
+ALONG = 0.15
+"""Largest |velocity along other axes| relative to that along its own of rows whose true force belongs on a slice."""
+
+
+@dataclass(frozen=True, eq=False)
+class CurvePanel:
+    """One process over one velocity: which one, its own number in its term, and which feature runs along the axis."""
+
+    latent: str
+    component: str
+    term: ForcePrior
+    index: int
+    feature: int
+    resisting: float
+    """-1 where the process is a force along its axis instead of the force that resists the motion, else 1."""
+
+
+def curve_panels(posterior: Posterior) -> list[CurvePanel]:
+    """All processes of a model that are curves: those of one feature, and tool forces along their own velocity."""
+    if not isinstance(posterior, StructuredPosterior):
+        return []
+    robot = posterior.model.system.robot
+    names = posterior.latent_names
+    widths = [z.shape[-1] for z in posterior.likelihood.standardization.shift]
+    panels = []
+    for component, term, which in term_slices(posterior.model.prior, robot):
+        for index, place in enumerate(range(which.start, which.stop)):
+            along = _velocity_along(term, term.latent_names(robot)[index], index) if widths[place] > 1 else None
+            if widths[place] == 1:
+                panels.append(CurvePanel(names[place], component, term, index, 0, 1.0))
+            elif along is not None:
+                panels.append(CurvePanel(names[place], component, term, index, along, -1.0))
+    return panels
+
+
+def friction_curves_figure(
+    posterior: Posterior, dataset: Dataset | None = None, *, latents: Sequence[str] | None = None
+) -> Figure:
+    """Every curve with its 95 % band over the velocities that were visited in training, and a little beyond.
+
+    Shown are processes of one feature, and of tool forces the force along each axis over the velocity along it, at
+    rest along the others, as the force that resists. Where `dataset` holds the true parts of the unknown force, dots
+    show them at its rows (of tool forces: at rows that move nearly along that axis). `latents` chooses among the
+    names of `posterior.latent_names`; None takes the first LARGEST_GRID. Raises InvalidInput if there is no curve.
+    """
+    panels = curve_panels(posterior)
+    if not isinstance(posterior, StructuredPosterior) or not panels:
+        raise InvalidInput(
+            f"a model of {posterior.description} has no process that is a curve; fit one with friction priors, for "
+            "example JointFriction() or ContactFriction()."
+        )
+    chosen = panels[:LARGEST_GRID] if latents is None else [_panel(panels, name) for name in latents]
+    columns = min(4 if len(chosen) > 6 else 3, len(chosen))
+    rows = math.ceil(len(chosen) / columns)
+    figure = new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    titles = _titles(chosen, posterior)
+    truth = {} if dataset is None else _truth(posterior, dataset, chosen)
+    for number, (axes, panel) in enumerate(zip(grid, chosen, strict=False)):
+        curve = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
+        what = {"Nm": "torque in Nm", "": "force / normal force"}.get(curve.unit, f"force in {curve.unit}")
+        what = f"resisting {what}" if panel.resisting < 0 else what
+        quiet(axes, title=titles[number], x=_label(curve.feature_names[panel.feature]), y=what)
+    for axes in grid[len(chosen) :]:
+        axes.set_visible(False)
+    handles, labels = legend_entries(*grid[: len(chosen)])
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(len(labels), 5 if columns > 2 else 3),
+        fontsize=NORMAL,
+        frameon=False,
+        markerscale=2,
+    )
+    what = "Friction" if all("friction" in panel.component for panel in chosen) else "Forces"
+    left_out = len(panels) - len(chosen)
+    figure.suptitle(
+        f"{what} learned from {len(posterior.training)} points"
+        + (f" ({len(chosen)} of {len(panels)} curves)" if left_out else ""),
+        fontsize=LARGE,
+        fontweight="bold",
+        x=0.01,
+        ha="left",
+    )
+    return figure
+
+
+def _velocity_along(term: ForcePrior, name: str, index: int) -> int | None:
+    """The feature that is the velocity along a tool force's own axis; None for other processes."""
+    if not isinstance(term, ToolForces) or not name.startswith("force"):
+        return None
+    if term.inputs == ("velocity",) or term.inputs == ("velocity", "angular-velocity"):
+        return index
+    return None
+
+
+def _panel(panels: Sequence[CurvePanel], name: str) -> CurvePanel:
+    for panel in panels:
+        if panel.latent == name:
+            return panel
+    raise InvalidInput(unknown_name_message("curve", name, "this model", [panel.latent for panel in panels]))
+
+
+def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:
+    """What every panel shows: the component where there are several, and the joint or axis."""
+    robot = posterior.model.system.robot
+    short = dict(zip(robot.joint_names, short_joint_names(robot.joint_names), strict=True))
+    several = len({panel.component for panel in panels}) > 1
+    titles = []
+    for panel in panels:
+        own = panel.term.latent_names(robot)[panel.index]
+        own = short.get(own, own).replace("force-", "force along ")
+        titles.append(f"{panel.component}: {own}" if several else own)
+    return titles
+
+
+def _label(feature: str) -> str:
+    """`velocity of lbr_iiwa_joint_1 [rad/s]` -> `velocity in rad/s`: the title names the joint."""
+    what, _, unit = feature.partition(" [")
+    what = what.split(" of ")[0]
+    return f"{what} in {unit.removesuffix(']')}" if unit else what
+
+
+def _draw_curve(
+    axes: Axes, posterior: StructuredPosterior, panel: CurvePanel, truth: tuple[np.ndarray, np.ndarray] | None
+) -> Curve:
+    """Mean and band, solid where the training data were; training velocities as ticks; the truth as dots."""
+    visited = _visited(posterior, panel)
+    low, high = float(visited.min()), float(visited.max())
+    margin = BEYOND * (high - low)
+    start = max(0.0, low - margin) if low >= 0.0 else low - margin  # a speed is never negative
+    at = np.linspace(start, high + margin, POINTS)
+    width = len(posterior.likelihood.standardization.shift[posterior.latent_names.index(panel.latent)])
+    features = np.zeros((POINTS, width))
+    features[:, panel.feature] = at
+    curve = posterior.curve(panel.latent, features)
+    mean = panel.resisting * curve.mean.cpu().numpy()
+    spread = 1.959963984540054 * curve.std.cpu().numpy()
+    inside = (at >= low) & (at <= high)
+    axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
+    if start < 0.0:
+        axes.axvline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
+    axes.plot(at[inside], mean[inside], color=PREDICTION, linewidth=1.5, label="learned")
+    axes.fill_between(
+        at,
+        mean - spread,
+        mean + spread,
+        where=inside.tolist(),
+        color=PREDICTION,
+        alpha=0.28,
+        linewidth=0,
+        label="95 % band",
+    )
+    axes.fill_between(at, mean - spread, mean + spread, color=PREDICTION, alpha=0.12, linewidth=0)
+    axes.plot(
+        at, mean, color=PREDICTION, linewidth=1.2, linestyle=(0, (3, 2)), label="beyond the training data", zorder=1.9
+    )
+    axes.plot(
+        visited,
+        np.full(len(visited), 0.025),
+        "|",
+        color=TRUTH,
+        markersize=5,
+        markeredgewidth=0.6,
+        alpha=0.5,
+        transform=axes.get_xaxis_transform(),
+        label="training velocities",
+        zorder=4,
+    )
+    levels = [(mean - spread)[inside], (mean + spread)[inside]]
+    if truth is not None and len(truth[0]):
+        shown = (truth[0] >= at[0]) & (truth[0] <= at[-1])
+        axes.plot(
+            truth[0][shown],
+            truth[1][shown],
+            "o",
+            color=TRUE_DOTS,
+            markersize=4.0,
+            markeredgewidth=0,
+            label="true",
+            zorder=1.8,
+        )
+        if shown.any():
+            levels.append(np.percentile(truth[1][shown], (1.0, 99.0)))  # a load near 0 makes any coefficient
+    values = np.concatenate(levels)
+    room = 0.12 * max(float(values.max() - values.min()), 1e-12)
+    axes.set_ylim(float(values.min()) - 1.6 * room, float(values.max()) + room)
+    axes.set_xlim(at[0], at[-1])
+    return curve
+
+
+def _visited(posterior: StructuredPosterior, panel: CurvePanel) -> Float[np.ndarray, " N"]:
+    """The feature of a panel at the training points."""
+    with torch.no_grad():
+        features = panel.term.features(posterior.likelihood.dynamics(posterior.parameters))
+    return features[panel.index][:, panel.feature].cpu().numpy()
+
+
+def _truth(
+    posterior: StructuredPosterior, dataset: Dataset, panels: Sequence[CurvePanel]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Feature and true value of the processes at rows of the Dataset, as far as its truth holds them."""
+    if posterior.carries_known_forces:
+        return {}
+    named = true_names(list(dict.fromkeys(panel.component for panel in panels)), dataset)
+    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRUE_POINTS).astype(int)))
+    system = posterior.model.system if dataset.system is None else dataset.system
+    q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
+    with torch.no_grad():
+        dynamics = system.dynamics(q, v, u)
+        found = {}
+        for panel in panels:
+            values = _true_latents(panel, named.get(panel.component), rows, dynamics)
+            if values is None:
+                continue
+            features = panel.term.features(dynamics)[panel.index]
+            own = features[:, panel.feature]
+            others = torch.cat([features[:, : panel.feature], features[:, panel.feature + 1 :]], dim=-1)
+            kept = torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()
+            if not features.shape[-1] > 1:
+                kept = torch.ones_like(kept)
+            latent = panel.resisting * values[:, panel.index]
+            kept = kept & torch.isfinite(latent)
+            found[panel.latent] = (own[kept].numpy(), latent[kept].numpy())
+    return found
+
+
+def _true_latents(panel: CurvePanel, name: str | None, rows: Dataset, dynamics: ConstrainedDynamics) -> Tensor | None:
+    """The values (rows, C) that the processes of a term must have for the true force, in the least-squares sense."""
+    if name is None:
+        return None
+    directions = panel.term.point_force(dynamics)
+    if directions is None:
+        key, directions = f"Q_U.{name}", panel.term.mixing(dynamics)
+    else:
+        key = f"force.{name}"
+    if key not in rows.truth:
+        return None
+    if isinstance(panel.term, ContactFriction) and panel.term.load:
+        contact = panel.term.contact
+        if "lambda" not in rows.truth or rows.truth["lambda"].shape[1] <= contact:
+            return None
+        size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
+        load = size * torch.tensor(rows.truth["lambda"][:, contact]).abs()
+        # the model's own load is that of the known forces alone; a coefficient is meant for the load that was there
+        unit = directions / torch.linalg.vector_norm(directions, dim=-2, keepdim=True)
+        directions = load[:, None, None] * unit
+    truth = torch.tensor(rows.truth[key])
+    return (torch.linalg.pinv(directions) @ truth[..., None])[..., 0]

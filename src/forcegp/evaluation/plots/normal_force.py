@@ -1,0 +1,143 @@
+"""Plot: the normal force of every contact over time, and how large its errors are beside what the model expects."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots.style import (
+    KNOWN_PHYSICS,
+    LARGE,
+    NORMAL,
+    PREDICTION,
+    SMALL,
+    TRUTH,
+    new_figure,
+    quiet,
+    window,
+)
+from forcegp.models.protocol import Posterior
+
+QUANTILE = 1.959963984540054
+"""Of the standard normal distribution at 97.5 %."""
+LARGEST_ERROR = 5.0
+"""Standard deviations at which the histogram of errors ends; what lies beyond is counted at the ends."""
+ERROR_ROWS = 2000
+
+
+def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
+    """One row per contact: force over `seconds` of the first episode; errors in standard deviations beside it.
+
+    The force is |s_p| lambda in N, positive where the surface pushes along its gradient. Where the Dataset holds
+    "lambda", it is drawn, with a histogram of (prediction - truth) / standard deviation over up to ERROR_ROWS rows of
+    the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
+    Raises InvalidInput without contacts, and for models without forces.
+    """
+    if not posterior.system.contacts or not posterior.predicts_forces:
+        raise InvalidInput(
+            f"a model of {posterior.description} has no normal force to show; give one with contacts that speaks of "
+            "forces."
+        )
+    rows = window(dataset, start, seconds)
+    contacts = len(posterior.system.contacts)
+    known = "lambda" in dataset.truth and dataset.truth["lambda"].shape[1] == contacts
+    figure = new_figure(11.0 if known else 8.0, 1.2 + 2.4 * contacts)
+    grid = figure.subplots(contacts, 2 if known else 1, squeeze=False, width_ratios=(2.4, 1.0) if known else None)
+    forces = _normal_forces(posterior, rows)
+    every = None
+    if known:
+        spread = np.unique(np.linspace(0, len(dataset) - 1, ERROR_ROWS).astype(int))
+        every = _normal_forces(posterior, dataset.rows(spread))
+    for index, contact in enumerate(posterior.system.contacts):
+        name = f"{type(contact.surface).__name__.lower()} at {contact.frame}"
+        title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
+        _draw_force(grid[index, 0], rows, forces, index, known)
+        quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
+        if every is not None:
+            _draw_errors(grid[index, 1], every, index)
+            quiet(grid[index, 1], title=_summary(every, index), x="error / standard deviation", y="density")
+    handles, labels = legend_entries(*grid.ravel())
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False)
+    figure.suptitle(
+        f"Normal force after {len(posterior.training)} training points",
+        fontsize=LARGE,
+        fontweight="bold",
+        x=0.01,
+        ha="left",
+    )
+    return figure
+
+
+class _Forces:
+    """Normal forces (rows, m) in N: prediction, its standard deviation, the known forces alone, and the truth."""
+
+    def __init__(
+        self,
+        mean: Float[np.ndarray, "rows m"],
+        std: Float[np.ndarray, "rows m"],
+        nominal: Float[np.ndarray, "rows m"],
+        truth: Float[np.ndarray, "rows m"] | None,
+    ) -> None:
+        self.mean, self.std, self.nominal, self.truth = mean, std, nominal, truth
+
+
+def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
+    q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
+    with torch.no_grad():
+        multiplier = posterior.predict(q, v, u).multiplier
+        assert multiplier is not None, "models with forces predict lambda"
+        dynamics = posterior.dynamics(q, v, u)
+        size = torch.linalg.vector_norm(dynamics.normals, dim=-1)
+        own = size if rows.system is None else torch.linalg.vector_norm(rows.system.dynamics(q, v, u).normals, dim=-1)
+        truth = rows.truth.get("lambda")
+        if truth is not None:
+            truth = own.numpy() * truth if truth.shape == own.shape == size.shape else None
+        parts = (size * multiplier.mean, size * multiplier.std, size * dynamics.multiplier_map().offset)
+    mean, std, nominal = (part.cpu().numpy() for part in parts)
+    return _Forces(mean, std, nominal, truth)
+
+
+def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: bool) -> None:
+    time, mean, spread = rows.time, forces.mean[:, index], QUANTILE * forces.std[:, index]
+    axes.plot(time, forces.nominal[:, index], color=KNOWN_PHYSICS, linewidth=1.1, label="known physics alone")
+    if known and forces.truth is not None:
+        axes.plot(time, forces.truth[:, index], color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
+    axes.fill_between(time, mean - spread, mean + spread, color=PREDICTION, alpha=0.3, linewidth=0, label="95 % band")
+    axes.plot(time, mean, color=PREDICTION, linewidth=1.3, label="predicted")
+    axes.margins(x=0)
+
+
+def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
+    assert forces.truth is not None, "errors are drawn where the truth is known"
+    errors = (forces.mean - forces.truth)[:, index] / np.maximum(forces.std[:, index], np.finfo(float).tiny)
+    bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
+    # half a bin inside of the ends, so that the errors beyond them are seen
+    kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
+    axes.hist(kept, bins=list(bins), density=True, color=PREDICTION, alpha=0.45, linewidth=0)
+    at = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 201)
+    axes.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=TRUTH, linewidth=1.0, label="standard normal")
+    axes.set_xlim(-LARGEST_ERROR, LARGEST_ERROR)
+    inside = float((np.abs(errors) <= QUANTILE).mean())
+    axes.annotate(
+        f"{100.0 * inside:.0f} % inside\nthe 95 % band",
+        (0.98, 0.95),
+        xycoords="axes fraction",
+        ha="right",
+        va="top",
+        fontsize=SMALL,
+        color=TRUTH,
+    )
+
+
+def _summary(forces: _Forces, index: int) -> str:
+    assert forces.truth is not None, "errors are drawn where the truth is known"
+    truth = forces.truth[:, index]
+    error, size = (float(np.sqrt(np.square(x).mean())) for x in (forces.mean[:, index] - truth, truth))
+    relative = f" ({100.0 * error / size:.2g} %)" if size else ""
+    return f"Errors: root mean square {error:.2g} N{relative}"

@@ -1,0 +1,103 @@
+"""What all figures share: colours that everyone can tell apart, quiet axes, names, units, and whole PNG files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from PIL import Image
+
+from forcegp.atomic_files import atomic_file
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+
+# Okabe & Ito (2008): distinguishable with every kind of colour vision.
+PREDICTION = "#0072B2"
+KNOWN_PHYSICS = "#D55E00"
+TRUTH = "#111111"
+MEASUREMENT = "#9A9A9A"
+QUIET = "#5F6670"
+SERIES = (PREDICTION, KNOWN_PHYSICS, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", TRUTH)
+
+SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
+RESOLUTION = 150  # dots per inch
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of that size in inches on its own Agg canvas; touches no global state of pyplot."""
+    figure = Figure(figsize=(width, height), dpi=RESOLUTION, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def speed_colors() -> ListedColormap:
+    """Viridis (even for every kind of colour vision) without its yellow end, which vanishes on white."""
+    return ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)), name="speed")
+
+
+def quiet(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
+    """Titles and labels in place, and nothing that draws the eye away from the data."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("#B8BCC2")
+    axes.grid(True, color="#ECEEF0", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=SMALL, color="#B8BCC2", labelcolor=QUIET, length=3)
+    if title:
+        axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH)
+    axes.set_xlabel(x, fontsize=SMALL, color=QUIET)
+    axes.set_ylabel(y, fontsize=SMALL, color=QUIET)
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a PNG. Raises InvalidInput if the folder does not exist."""
+    with atomic_file(path) as temporary:
+        _render(figure).save(temporary, format="png", optimize=True)
+
+
+def _render(figure: Figure) -> Image.Image:
+    """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
+    canvas = figure.canvas
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas
+    return Image.fromarray(pixels[..., :3].copy()).quantize(
+        256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+    )
+
+
+def window(dataset: Dataset, start: float, seconds: float) -> Dataset:
+    """The rows of the first episode from `start` seconds after its beginning on, for `seconds`, in the order of time.
+
+    Raises InvalidInput if there are none.
+    """
+    rows = np.flatnonzero(dataset.episode == dataset.episodes[0])
+    rows = rows[np.argsort(dataset.time[rows], kind="stable")]
+    elapsed = dataset.time[rows] - dataset.time[rows[0]]
+    chosen = rows[(elapsed >= start) & (elapsed <= start + seconds)]
+    if not chosen.size:
+        raise InvalidInput(
+            f"no rows from {start} s on for {seconds} s: episode {dataset.episodes[0]} lasts {elapsed[-1]:.3g} s."
+        )
+    return dataset.rows(chosen)
+
+
+def short_joint_names(names: Sequence[str]) -> list[str]:
+    """`lbr_iiwa_joint_1`, `lbr_iiwa_joint_2` -> `joint 1`, `joint 2`: the common beginning of all names is left out."""
+    columns = list(zip(*names, strict=False)) if len(names) > 1 else []
+    different = next((place for place, letters in enumerate(columns) if len(set(letters)) > 1), len(columns))
+    shared = names[0][:different]
+    shared = shared[: max(shared.rfind(mark) for mark in "_-/. ") + 1]
+    ends = [name[len(shared) :] for name in names]
+    return [f"joint {end}" if end.isdigit() else end for end in ends]
+
+
+def joint_units(dataset: Dataset, quantity: str) -> list[str]:
+    """Unit of every joint's `quantity` as a plot shows it: rad/s² for "rad/s^2"."""
+    units = dataset.units[quantity]
+    each = [units] * dataset.nv if isinstance(units, str) else list(units)
+    return [unit.replace("^2", "²") for unit in each]

@@ -1,0 +1,168 @@
+"""Plot: where the tool went on the surface, how fast, how far off the surface, and where the model was trained."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.evaluation.plots.style import (
+    NORMAL,
+    QUIET,
+    SMALL,
+    TRUTH,
+    new_figure,
+    quiet,
+    speed_colors,
+)
+from forcegp.mechanics import MechanicalSystem, Plane
+from forcegp.models.protocol import Posterior
+
+PATH_SECONDS = 20.0
+"""Length of the path that is drawn: more becomes a tangle."""
+
+
+def tool_path_figure(posterior: Posterior, dataset: Dataset) -> Figure:
+    """The first contact point on x, y, coloured by speed, the training points, and its distance to the surface.
+
+    Raises InvalidInput for a system without contacts: there is no surface to show.
+    """
+    figure = new_figure(9.0, 4.6)
+    path, height = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
+    lines = draw_tool_path(path, posterior, dataset)
+    fit_figure_to_path(figure, path, least=2.0, most=4.0)
+    finish_tool_path(figure, path, lines, tool_path_title(posterior.system, dataset))
+    _draw_height(height, posterior.system, dataset)
+    return figure
+
+
+def draw_tool_path(axes: Axes, posterior: Posterior, dataset: Dataset, *, start: float = 0.0) -> LineCollection:
+    """The path of the test data coloured by speed (m/s) and the training points on top; returns the coloured lines.
+
+    Drawn are at most PATH_SECONDS of the recording, from `start` seconds on.
+    """
+    dataset = _path_rows(dataset, start)
+    position, speed, _ = tool_motion(posterior.system, dataset.q, dataset.v)
+    segments = np.stack([position[:-1, :2], position[1:, :2]], axis=1)
+    pauses = np.diff(dataset.time)
+    usual = np.median(pauses[pauses > 0]) if (pauses > 0).any() else 0.0
+    joined = (np.diff(dataset.episode) == 0) & (pauses > 0) & (pauses < 3.0 * usual)  # no line across gaps
+    lines = LineCollection(list(segments[joined]), cmap=speed_colors(), linewidths=1.3, capstyle="round")
+    lines.set_array(speed[:-1][joined])
+    axes.add_collection(lines)
+    axes.plot([], [], color=speed_colors()(0.55), linewidth=1.3, label="test: path of the tool")
+    training = posterior.training
+    points, _, _ = tool_motion(posterior.system, training.q.cpu().numpy(), training.v.cpu().numpy())
+    axes.plot(
+        points[:, 0],
+        points[:, 1],
+        "o",
+        color="white",
+        markersize=4.0,
+        markeredgecolor=TRUTH,
+        markeredgewidth=0.9,
+        label=f"training: {len(points)} points",
+    )
+    axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="datalim")  # wider limits fill the panel; "box" would shrink it to a stamp
+    return lines
+
+
+def fit_figure_to_path(figure: Figure, axes: Axes, *, least: float, most: float) -> None:
+    """Let the first row of the figure grow for a tall path: `least` and `most` are its parts of the row heights."""
+    grid = axes.get_gridspec()
+    assert grid is not None  # the axes come from subplots
+    rows = [least, *list(grid.get_height_ratios())[1:]]  # type: ignore[arg-type]  # the stub omits that ratios are a sequence
+    inch = figure.get_figheight() / sum(rows)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    wanted = 0.8 * figure.get_figwidth() * (high - low) / (right - left) / inch
+    rows[0] = float(np.clip(wanted, least, most))
+    grid.set_height_ratios(rows)
+    figure.set_figheight(inch * sum(rows))
+
+
+def tool_path_title(system: MechanicalSystem, dataset: Dataset, *, start: float = 0.0) -> str:
+    """What the map shows: from which side, and how much of the recording."""
+    surface = system.contacts[0].surface
+    level = isinstance(surface, Plane) and bool(np.hypot(*surface.normal[:2]) < 1e-6)
+    side = "seen from above" if level else "projected on x, y"
+    return f"Tool on the surface, {side}{excerpt(_path_rows(dataset, start), dataset, before=': ')}"
+
+
+def excerpt(part: Dataset, whole: Dataset, *, before: str = "", after: str = "") -> str:
+    """`20 s of 100 s` between the given texts if the part is shorter than the whole, nothing otherwise."""
+    shown, recorded = (_elapsed(dataset)[1].max(initial=0.0) for dataset in (part, whole))
+    texts = [f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s" for seconds in (shown, recorded)]
+    return "" if texts[0] == texts[1] else f"{before}{texts[0]} of {texts[1]}{after}"
+
+
+def _elapsed(dataset: Dataset) -> tuple[Int[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """The order of the rows by episode and time, and in it the recorded seconds, one episode after the other."""
+    order = np.lexsort((dataset.time, dataset.episode))
+    steps = np.diff(dataset.time[order], prepend=dataset.time[order[:1]])
+    steps[1:][np.diff(dataset.episode[order]) != 0] = 0.0
+    return order, np.cumsum(steps)
+
+
+def _path_rows(dataset: Dataset, start: float) -> Dataset:
+    order, elapsed = _elapsed(dataset)
+    chosen = order[(elapsed >= start) & (elapsed <= start + PATH_SECONDS)]
+    if not chosen.size:
+        raise InvalidInput(f"no rows from {start} s on: the recording lasts {elapsed.max(initial=0.0):.3g} s.")
+    return dataset.rows(chosen)
+
+
+def finish_tool_path(figure: Figure, axes: Axes, lines: LineCollection, title: str) -> None:
+    """Labels, legend and the scale of speeds."""
+    quiet(axes, x="x in m", y="y in m")
+    axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH, pad=20.0)  # a row of its own above the legend
+    bar = figure.colorbar(lines, ax=axes, pad=0.01, aspect=12)
+    bar.set_label("speed in m/s", fontsize=SMALL, color=QUIET)
+    bar.ax.tick_params(labelsize=SMALL, labelcolor=QUIET)
+    bar.outline.set_visible(False)  # type: ignore[operator]  # the stubs call it a spine with another signature
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=2,
+        fontsize=SMALL,
+        frameon=False,
+        borderaxespad=0.1,
+        borderpad=0.2,
+    )
+
+
+def tool_motion(
+    system: MechanicalSystem, q: Float[np.ndarray, "rows nv"], v: Float[np.ndarray, "rows nv"]
+) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """Position (m), speed (m/s) and distance from the surface (m) of the first contact point.
+
+    Raises InvalidInput for a system without contacts.
+    """
+    if not system.contacts:
+        raise InvalidInput(f"{system.robot.name} touches nothing, so there is no tool path to show; give a contact.")
+    contact = system.contacts[0]
+    kinematics = system.robot.kinematics(torch.tensor(q), torch.tensor(v))
+    jacobian = kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
+    velocity = (jacobian @ torch.tensor(v)[..., None])[..., 0]
+    return (
+        contact.position(kinematics).numpy(),
+        torch.linalg.vector_norm(velocity, dim=-1).numpy(),
+        contact.distance(kinematics).numpy(),
+    )
+
+
+def _draw_height(axes: Axes, system: MechanicalSystem, dataset: Dataset) -> None:
+    _, _, distance = tool_motion(system, dataset.q, dataset.v)
+    largest = float(np.abs(distance).max())
+    factor, unit = (1e6, "µm") if largest < 1e-3 else (1e3, "mm")
+    for episode in dataset.episodes:
+        rows = dataset.episode == episode
+        order = np.argsort(dataset.time[rows], kind="stable")
+        axes.plot(dataset.time[rows][order], factor * distance[rows][order], color=QUIET, linewidth=0.8)
+    axes.margins(x=0)
+    quiet(axes, title="Distance of the tool from the surface", x="time in s", y=f"distance in {unit}")

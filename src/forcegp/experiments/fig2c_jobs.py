@@ -1,0 +1,108 @@
+"""The jobs of figure 2c: estimate the tool's mass and centre of mass from a wrong start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset
+from forcegp.experiments.data import scored_rows, training_rows
+from forcegp.inference import OptimizerOptions
+from forcegp.jobs import JobStore
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import Identification, StructuredGP, StructuredPosterior
+from forcegp.priors import JointForces, NoForces
+from forcegp.robots import parameters_from_physical, physical_from_parameters
+from forcegp.simulation.kuka_description import TOOL_LINK
+
+MODELS = {"s-gp": "S-GP", "analytical": "analytical model"}
+MEANS = {"analytical": "with Q_K", "zero": "without Q_K"}
+MASS_BOUND, CENTER_BOUND = 0.02, 1e-3
+"""Errors that count as found [kg, m]."""
+
+MASS_OFFSET = 0.5
+CENTER_OFFSET = (0.05, 0.05, -0.03)
+"""How wrong the start is [kg, m]."""
+
+PRIORS = {"s-gp": JointForces(), "analytical": NoForces()}
+NAMES = {f"{TOOL_LINK}.{name}": name for name in ("mass", "com.x", "com.y", "com.z")}
+
+
+def trace(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """One search, with the errors of mass and centre [kg, m] and the MAE after every iteration."""
+    train = training_rows(results, spec["data"], spec["points"])
+    test = scored_rows(results, spec["data"])
+    true = _values(train.system)
+    posterior = _fitted(train, spec)
+    history = [{NAMES[name]: value for name, value in point.items()} for point in _identification(posterior).history]
+    return {
+        "mass_error": [point["mass"] - true["mass"] for point in history],
+        "center_error": [_center_error(point, true) for point in history],
+        "mae": [_mae(posterior.at_iteration(k), test) for k in range(len(history))],
+        "start_mass": MASS_OFFSET,
+        "start_center": list(CENTER_OFFSET),
+        "converged": posterior.result.converged,
+        "status": posterior.result.status,
+        **_uncertainty(posterior),
+    }
+
+
+def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Errors and standard errors of S-GP + analytical mean."""
+    train = training_rows(results, spec["data"], spec["points"])
+    true = _values(train.system)
+    posterior = _fitted(train, {**spec, "model": "s-gp", "mean": "analytical"})
+    values = {NAMES[name]: value for name, value in _identification(posterior).values.items()}
+    error = {name: values[name] - true[name] for name in values}
+    search = {"iterations": len(posterior.result.history) - 1, "converged": posterior.result.converged}
+    return {"error": error, **search, **_uncertainty(posterior)}
+
+
+def wrong_system(system: MechanicalSystem) -> MechanicalSystem:
+    """The same with a tool that is too heavy and has its centre of mass elsewhere; its inertia stays."""
+    robot = system.robot
+    mass, center, inertia = physical_from_parameters(robot.inertial_parameters(TOOL_LINK)[TOOL_LINK])
+    moved = center + torch.tensor(CENTER_OFFSET, dtype=center.dtype)
+    return system.with_robot(
+        robot.with_inertials({TOOL_LINK: parameters_from_physical(mass + MASS_OFFSET, moved, inertia)})
+    )
+
+
+def _fitted(train: Dataset, spec: Mapping[str, Any]) -> StructuredPosterior:
+    assert train.system is not None
+    system = wrong_system(train.system)
+    options = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"], keep_iterates=True)
+    learn = system.robot.link(TOOL_LINK).inertial("mass", "com")
+    return StructuredGP(system, PRIORS[spec["model"]], spec["mean"]).identify(train, learn, restarts=1, options=options)
+
+
+def _values(system: MechanicalSystem | None) -> dict[str, float]:
+    assert system is not None
+    link = system.robot.link(TOOL_LINK)
+    return {"mass": link.mass, **{f"com.{axis}": value for axis, value in zip("xyz", link.center_of_mass, strict=True)}}
+
+
+def _center_error(point: Mapping[str, float], true: Mapping[str, float]) -> float:
+    return float(np.linalg.norm([point[f"com.{axis}"] - true[f"com.{axis}"] for axis in "xyz"]))
+
+
+def _mae(posterior: StructuredPosterior, test: Dataset) -> float:
+    return float(np.abs(posterior.predict(test.q, test.v, test.u, covariance=False).mean.numpy() - test.a).mean())
+
+
+def _uncertainty(posterior: StructuredPosterior) -> dict[str, Any]:
+    """Standard errors by parameter (None where infinite), and a sentence about what cannot be identified."""
+    identification = _identification(posterior)
+    errors = {NAMES[name]: value for name, value in identification.standard_errors.items()}
+    std = {name: value if math.isfinite(value) else None for name, value in errors.items()}
+    return {"std": std, "verdict": identification.verdict.replace(f"{TOOL_LINK}.", "")}
+
+
+def _identification(posterior: StructuredPosterior) -> Identification:
+    assert posterior.identification is not None, "the fit was given parameters to learn"
+    return posterior.identification

@@ -1,0 +1,139 @@
+"""Jobs of the experiments on force priors: simulate one trajectory, fit one model, score it on several."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset, farthest_rows, rows_in_contact
+from forcegp.errors import InvalidInput
+from forcegp.evaluation import curve_coverage, evaluate, force_scores
+from forcegp.experiments.extrapolation_jobs import TEST_X, TRAIN_X, tool_motion
+from forcegp.experiments.fits import MODEL, search_report
+from forcegp.experiments.true_curves import true_curves
+from forcegp.inference import OptimizerOptions
+from forcegp.jobs import JobStore
+from forcegp.models import IndependentGP, StructuredGP, save_posterior
+from forcegp.priors import named_prior
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+FILE = "data.h5"
+BLACK_BOX, KNOWN_PHYSICS = "independent-gp", "none"
+"""Models of the trials that are no prior expressions: a Gaussian process per joint, and no unknown force at all."""
+
+
+def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """One trajectory of a scenario: its `rows` that lie farthest apart, or every `every`-th.
+
+    Where contacts can open, training rows are those that the data show to be in contact.
+    """
+    config = KukaSurfaceConfig(seconds=spec["seconds"], seed=spec["seed"], **spec["scenario"])
+    everything = simulate_kuka_surface(config)
+    counts: dict[str, Any] = {"rows_available": len(everything)}
+    if "in_contact" in everything.truth:
+        counts["in_contact_truth"] = float(everything.truth["in_contact"].mean())
+    if spec["rows"] is None:
+        kept = everything.rows(slice(None, None, spec["every"]))
+    else:
+        usable = everything
+        if "in_contact" in everything.truth:
+            usable = rows_in_contact(everything)
+            counts["in_contact_detected"] = len(usable) / len(everything)
+        if spec["rows"] > len(usable):
+            raise InvalidInput(
+                f"{spec['rows']} rows are asked for, but {spec['seconds']:g} s of motion have {len(usable)}; ask for "
+                "fewer points or a longer recording."
+            )
+        kept = farthest_rows(usable, spec["rows"])
+    kept.save(folder / FILE)
+    return counts | {"rows": len(kept)}
+
+
+def load(results: JobStore, name: str) -> Dataset:
+    """The rows of a data job."""
+    return Dataset.load(results.place(name) / FILE)
+
+
+def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Fit to the first `points` training rows and score on every test trajectory, under the contacts of its own."""
+    train = load(results, spec["train"])
+    if spec["region"]:
+        train = train.rows(tool_motion(train)[0] < TRAIN_X)
+    if spec["points"] > len(train):
+        raise InvalidInput(f"{spec['points']} training points are asked for, but there are {len(train)}.")
+    posterior = fitted(spec, train.rows(slice(spec["points"])))
+    save_posterior(posterior, folder / MODEL)
+    tests = {}
+    for label, name in spec["tests"].items():
+        test = load(results, name)
+        if spec["region"]:
+            test = test.rows(tool_motion(test)[0] > TEST_X)
+        tests[label] = scores(posterior, test)
+    left_out = posterior.leave_out().total / spec["points"]
+    search = search_report(posterior)
+    return {"tests": tests, "curves": curve_scores(posterior), "leave_one_out": left_out, "search": search}
+
+
+def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
+    """The model of `spec` fitted to these rows."""
+    system = train.system
+    assert system is not None, "simulated data carry their system"
+    options = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
+    how = {"seed": spec["seed"], "restarts": spec["restarts"], "options": options}
+    if spec["prior"] == BLACK_BOX:
+        return IndependentGP(system).fit(train, **how)
+    return StructuredGP(system, named_prior(spec["prior"], system), spec["mean"]).fit(train, **how)
+
+
+def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
+    """Errors of the acceleration and, where the model has them, of the forces; plain JSON values."""
+    assert test.system is not None, "simulated data carry their system"
+    if posterior.predicts_forces:
+        posterior = posterior.with_system(test.system)
+    out = evaluate(posterior, test).to_dict()
+    kept = {name: out[name] for name in ("mae", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae")}
+    if "a" in test.truth:  # what nothing can be better than on these rows
+        kept["mae_of_truth"] = float(np.abs(test.truth["a"] - test.a).mean())
+    if "in_contact" in test.truth:
+        open_contacts = (np.asarray(test.truth["in_contact"]) == 0.0).sum(axis=1)
+        for name, where in (("touching", open_contacts == 0), ("in_the_air", open_contacts > 0)):
+            chosen = np.flatnonzero(where)
+            kept[f"mae_{name}"] = evaluate(posterior, test.rows(chosen)).mae if chosen.size else None
+    if not posterior.predicts_forces:
+        return kept
+    return kept | _forces(posterior, test)
+
+
+def _forces(posterior: Any, test: Dataset) -> dict[str, Any]:
+    """Scores of lambda, how far the components are from their sum, and the error of every known joint force [Nm].
+
+    Without contacts there is nothing about lambda; its coverage is None where the model has no uncertainty of it.
+    """
+    known = force_scores(posterior, test)
+    out: dict[str, Any] = {}
+    if known.multiplier is not None:
+        out["normal_force_error"] = known.multiplier.relative_rmse
+        out["normal_force_coverage"] = known.multiplier.coverage_95
+    found = posterior.components(test.q, test.v, test.u, covariance=False)
+    if found:
+        total = sum(part.joint_force.mean for part in found.values())
+        out["component_sum_error"] = float((total - found.total.mean).abs().max())
+    return out | {f"force_mae.{name}": score.mae for name, score in known.joint_force.items()}
+
+
+def curve_scores(posterior: Any) -> dict[str, Any]:
+    """Share of the visited range where the 95 % band of a friction curve holds the true law, per curve."""
+    out = {}
+    for latent, law in true_curves(posterior).items():
+        curve = posterior.curve(latent)
+        truth = torch.tensor(law(curve.features[:, 0].numpy()))
+        size = float(truth.square().mean().sqrt())
+        out[latent] = {
+            "coverage": curve_coverage(curve, law),
+            "relative_error": float((curve.mean - truth).square().mean().sqrt()) / size if size else None,
+        }
+    return out

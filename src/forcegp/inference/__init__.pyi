@@ -1,0 +1,18 @@
+from .block_cross_validation import LeaveOut as LeaveOut, leave_blocks_out as leave_blocks_out
+from .engines import (
+    ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing, Iterative as
+    Iterative, ProblemSize as ProblemSize, Stochastic as Stochastic, choose_engine as choose_engine, engine_from_dict as
+    engine_from_dict, engine_of as engine_of,
+)
+from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound
+from .iterative import IterativePosterior as IterativePosterior
+from .kernels import LatentKernels as LatentKernels
+from .likelihood import negative_log_likelihood as negative_log_likelihood
+from .linear_functionals import FunctionalPosterior as FunctionalPosterior
+from .memory import require_memory as require_memory
+from .optimization import (
+    OptimizationResult as OptimizationResult, OptimizerOptions as OptimizerOptions, best_of as best_of,
+    minimize_objective as minimize_objective,
+)
+from .posterior import ExactPosterior as ExactPosterior, LatentPosterior as LatentPosterior, exact as exact
+from .terms import Terms as Terms

@@ -1,0 +1,192 @@
+"""`run_jobs`: compute the jobs that a store lacks, several at once, each after its inputs."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from forcegp.atomic_files import write_json
+from forcegp.errors import BackendError, FitError, ForceGPError, OutdatedWarning
+from forcegp.jobs.job import Job, digests
+from forcegp.jobs.machine import machine
+from forcegp.jobs.store import RESULT_FILE, JobStore
+from forcegp.parallel import Backend, Joblib, Pool, Shared
+
+Progress = Callable[[int, int, str], None]
+"""Called as `progress(work done, work in total, note)`; work is an estimate in CPU seconds."""
+
+Files = Mapping[str, bytes]
+
+
+def run_jobs(
+    store: JobStore, jobs: Sequence[Job], backend: Backend | None = None, progress: Progress | None = None
+) -> int:
+    """Compute all jobs that the store lacks, on a backend (None: in one other process); returns how many.
+
+    Every finished job is kept at once, so a run that is killed at any moment goes on where it was. A job that fails
+    stops only what depends on it. Results of other code or settings are computed anew, with a warning. Raises FitError
+    at the end if any job has failed, naming the first, and BackendError if workers cannot be had, or if those of one
+    job died again and again.
+    """
+    wanted = digests(jobs)
+    if all(store.has(name, digest) for name, digest in wanted.items()):
+        return 0
+    with store.locked():
+        store.remove_leftovers()
+        missing = {job.name: job for job in jobs if not store.has(job.name, wanted[job.name])}
+        if missing:
+            _warn_of_outdated(store, missing)
+            _Run(store, jobs, missing, wanted, progress).on(backend or Joblib(1))
+    return len(missing)
+
+
+def _warn_of_outdated(store: JobStore, missing: Mapping[str, Job]) -> None:
+    """One sentence for what is there, but of other code or settings."""
+    old = [job for job in missing.values() if store.place(job.name).exists()]
+    if old:
+        code = sum(store.load(job.name)["code"] != job.code_digest for job in old)
+        by = {0: "with other settings", len(old): "by other code"}.get(code, "by other code or with other settings")
+        warnings.warn(
+            f"{len(old)} of the results in {store.folder}, {old[0].name} for example, were computed {by}; they are "
+            "computed anew.",
+            OutdatedWarning,
+            stacklevel=3,
+        )
+
+
+class _Run:
+    """The jobs that wait, those that run, and those that are done."""
+
+    def __init__(
+        self,
+        store: JobStore,
+        jobs: Sequence[Job],
+        missing: Mapping[str, Job],
+        digests: Mapping[str, str],
+        progress: Progress | None,
+    ) -> None:
+        self.store = store
+        self.jobs = {job.name: job for job in jobs}
+        self.digests = digests
+        self.waiting = dict(missing)
+        self.finished = set(self.jobs) - set(missing)
+        self.total = sum(job.cost for job in missing.values())
+        self.count = len(missing)
+        self.done: list[str] = []
+        self.done_cost = 0.0
+        self.failed: dict[str, str] = {}
+        self.progress = progress
+        self.sent: dict[str, Shared] = {}
+
+    def on(self, backend: Backend) -> None:
+        """Compute all."""
+        try:
+            with backend.pool() as pool:
+                while self.waiting or len(pool):
+                    for job in self._ready(pool.free):
+                        self._submit(pool, job, shares_files=backend.shares_files)
+                    if not len(pool):
+                        break  # what still waits depends on jobs that failed
+                    for name, future in pool.finished():
+                        self._record(self.jobs[name], future)
+        except BackendError as error:
+            raise BackendError(f"{error}. {self._kept()}") from None
+        finally:
+            self.store.remove_leftovers()
+        if self.failed:
+            name, cause = next(iter(self.failed.items()))
+            others = f" and {len(self.failed) - 1} more failed" if len(self.failed) > 1 else " failed"
+            skipped = f", {len(self.waiting)} that need them were left out" if self.waiting else ""
+            raise FitError(f"{name}{others}{skipped} ({cause}); {self._kept()}")
+
+    def _submit(self, pool: Pool, job: Job, *, shares_files: bool) -> None:
+        digests = {"digest": self.digests[job.name], "code": job.code_digest}
+        bare = replace(job, arguments=())  # arguments go by themselves, for a pool sends those that are shared once
+        if shares_files:
+            pool.submit(job.name, compute, self.store, bare, digests, *job.arguments)
+            return
+        inputs = self._all_inputs(job)
+        for name in inputs:
+            self.sent.setdefault(name, Shared(self.store.files(name)))
+        files = [self.sent[name] for name in inputs]
+        pool.submit(job.name, computed_elsewhere, bare, digests, inputs, *files, *job.arguments)
+
+    def _all_inputs(self, job: Job) -> list[str]:
+        """The inputs and what these were made from in turn, each once."""
+        found: dict[str, None] = {}
+        for name in job.inputs:
+            found |= dict.fromkeys([*self._all_inputs(self.jobs[name]), name])
+        return list(found)
+
+    def _kept(self) -> str:
+        return f"{len(self.done)} of {self.count} jobs are kept, so the same command goes on from here"
+
+    def _ready(self, free: int | float) -> list[Job]:
+        """The next jobs whose inputs are finished: those that others wait for longest come first."""
+        ready = [job for job in self.waiting.values() if self.finished.issuperset(job.inputs)]
+        ready.sort(key=lambda job: -self._work_behind(job.name))
+        chosen = ready[: int(min(max(free, 0), len(ready)))]
+        for job in chosen:
+            del self.waiting[job.name]
+        return chosen
+
+    def _work_behind(self, name: str) -> float:
+        """Cost of this job and of the longest chain of jobs that wait for it."""
+        job = self.waiting[name]
+        return job.cost + max(
+            (self._work_behind(other.name) for other in self.waiting.values() if name in other.inputs), default=0.0
+        )
+
+    def _record(self, job: Job, future: Future[Files | None]) -> None:
+        try:
+            files = future.result()
+            if files is not None:
+                self.store.put(job.name, files)
+            self.done.append(job.name)
+            self.finished.add(job.name)
+        except ForceGPError as error:
+            self.failed[job.name] = str(error)
+        except Exception as error:  # also a defect in one job must not cost what other jobs have done
+            self.failed[job.name] = f"{type(error).__name__}: {error}"
+        self.done_cost += job.cost
+        if self.progress is not None:
+            note = f"{len(self.done) + len(self.failed)} of {self.count} jobs, last {job.name}"
+            self.progress(int(self.done_cost * 10), max(1, int(self.total * 10)), note)
+
+
+def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: Any) -> None:
+    """Compute one job and keep it with its digests."""
+    module, _, function = job.task.partition(":")
+    task = getattr(import_module(module), function)
+    start, wall = time.process_time(), time.monotonic()
+    with store.writing(job.name) as folder, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = task(store, job.spec, folder, *arguments)
+        stored = {
+            **digests,
+            "task": job.task,
+            "spec": dict(job.spec),
+            "machine": machine(),
+            "result": result,
+            "cpu_seconds": time.process_time() - start,
+            "wall_seconds": time.monotonic() - wall,
+            "warnings": sorted({str(warning.message) for warning in caught}),
+        }
+        write_json(folder / RESULT_FILE, stored)
+
+
+def computed_elsewhere(job: Job, digests: Mapping[str, str], inputs: Sequence[str], *more: Any) -> Files:
+    """Compute one job where the store cannot be seen, from the files of its inputs, which `more` begins with."""
+    with tempfile.TemporaryDirectory(prefix="forcegp-") as folder:
+        store = JobStore(Path(folder))
+        for name, files in zip(inputs, more, strict=False):
+            store.put(name, files)
+        compute(store, job, digests, *more[len(inputs) :])
+        return store.files(job.name)

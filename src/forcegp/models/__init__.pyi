@@ -1,0 +1,18 @@
+from .baselines.independent_gp import IndependentGP as IndependentGP
+from .baselines.independent_posterior import IndependentPosterior as IndependentPosterior
+from .baselines.network_ensemble import NetworkEnsemble as NetworkEnsemble
+from .baselines.network_posterior import NetworkPosterior as NetworkPosterior
+from .baselines.neural_network import NeuralNetwork as NeuralNetwork
+from .identification.identification import Identification as Identification
+from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned
+from .noise import Noise as Noise
+from .prediction import Gaussian as Gaussian, Prediction as Prediction
+from .predictor import Linearization as Linearization, Predictor as Predictor
+from .protocol import Model as Model, Posterior as Posterior
+from .rollout import Rollout as Rollout
+from .search import ALL_ROWS as ALL_ROWS, default_options as default_options, default_restarts as default_restarts
+from .storage import load_posterior as load_posterior, save_posterior as save_posterior
+from .structured.gp import StructuredGP as StructuredGP
+from .structured.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
+from .structured.posterior import StructuredPosterior as StructuredPosterior
+from .training_data import TrainingData as TrainingData

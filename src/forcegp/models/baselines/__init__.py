@@ -1,0 +1,1 @@
+"""Models without physics to compare with: one Gaussian process per joint, networks."""

@@ -1,0 +1,215 @@
+"""`IndependentPosterior`: one Gaussian process per joint acceleration, conditioned on data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.inference import (
+    ExactPosterior,
+    LatentKernels,
+    LeaveOut,
+    OptimizationResult,
+    leave_blocks_out,
+    negative_log_likelihood,
+)
+from forcegp.inference.pathwise import StackedFunctions, draw_functions
+from forcegp.mechanics import Baumgarte
+from forcegp.models.noise import ACCELERATION
+from forcegp.models.prediction import Prediction
+from forcegp.models.protocol import Model, Posterior
+from forcegp.models.rollout import AccelerationFunction, AccelerationModel
+from forcegp.models.search import blas_threads
+from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
+from forcegp.priors.expressed_kernels import kernels_of
+
+
+def joint_part(parameters: Mapping[str, Tensor], joint: int) -> dict[str, Tensor]:
+    """Of the parameters of all joints those of one, under the names of a model with that joint alone."""
+    prefix = f"kernels.{joint}."
+    part = {f"kernels.0.{name[len(prefix) :]}": value for name, value in parameters.items() if name.startswith(prefix)}
+    if ACCELERATION in parameters:
+        part[ACCELERATION] = parameters[ACCELERATION][joint : joint + 1]
+    return part
+
+
+def one_joint(kernels: LatentKernels, joint: int) -> LatentKernels:
+    """The kernel of one joint alone."""
+    return LatentKernels([list(kernels)[joint]])
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentLikelihood:
+    """-log p(a_j | q, v, u) of every joint on one training set: exact inference with W = 1 and N rows."""
+
+    inputs: tuple[str, ...]
+    training: TrainingData
+
+    @cached_property
+    def standardization(self) -> Standardization:
+        """From the inputs of the training states."""
+        return Standardization.of([self._columns(self.training.q, self.training.v, self.training.u)])
+
+    def features(
+        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"]
+    ) -> Float[Tensor, "rows d"]:
+        """Standardised inputs, the same for every joint."""
+        return self.standardization([self._columns(q, v, u)])[0]
+
+    def kernels(self) -> LatentKernels:
+        """One kernel per joint with start values: the mean square of its acceleration, and lengths as in JointForces.
+
+        Raises InvalidInput if all accelerations are zero.
+        """
+        variances = self.training.a.square().mean(0)
+        largest = float(variances.max())
+        if not largest > 0.0:
+            raise InvalidInput("all accelerations are zero, so there is nothing to learn; check that a was measured.")
+        dimension = self._training_features.shape[-1]
+        floored = variances.clamp_min(RESIDUAL_FLOOR * largest)
+        kernels = kernels_of("squared-exponential", (dimension,) * len(variances), floored)
+        return LatentKernels(kernels).to(floored.device)
+
+    def __call__(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """The negative log marginal likelihood of one joint, at parameters named as by `joint_part`."""
+        matrices = kernels.matrices(parameters, [self._training_features])
+        return negative_log_likelihood(*self._terms(joint, parameters), matrices)
+
+    def condition(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> ExactPosterior:
+        """The posterior of one joint's function at fixed parameters."""
+        terms = self._terms(joint, parameters)
+        return ExactPosterior.condition(kernels.at(parameters), [self._training_features], *terms)
+
+    def leave_out(
+        self,
+        joint: int,
+        latent: ExactPosterior,
+        parameters: Mapping[str, Tensor],
+        blocks: Sequence[Sequence[int]] | None,
+    ) -> LeaveOut:
+        """Left-out accelerations of one joint; `latent` is its posterior at `parameters`."""
+        *_, noise = self._terms(joint, parameters)
+        return leave_blocks_out(latent.system, noise, blocks)
+
+    @cached_property
+    def _training_features(self) -> Tensor:
+        return self.features(self.training.q, self.training.v, self.training.u)
+
+    def _terms(self, joint: int, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Mixing W = 1, residual and noise variance of one joint."""
+        target = self.training.a[:, joint : joint + 1]
+        variance = (2.0 * parameters[ACCELERATION]).exp()[None]
+        factors = self.training.noise_factors
+        if factors is not None:
+            variance = variance * factors[:, joint : joint + 1].square()
+        return torch.ones_like(target)[..., None], target, variance
+
+    def _columns(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        states = {"q": q, "v": v, "u": u}
+        return torch.cat([states[name] for name in self.inputs], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentPosterior(Posterior):
+    """An `IndependentGP` conditioned on training data; made by `IndependentGP.fit` or `load_posterior`.
+
+    Predictions have a diagonal covariance and no forces. Parameters have the names that a `StructuredGP` with
+    one kernel per joint gives them, so either can start the search of the other.
+    """
+
+    model: Model
+    likelihood: IndependentLikelihood
+    parameters: Mapping[str, Tensor]
+    result: OptimizationResult
+    settings: Mapping[str, Any]
+    latents: tuple[ExactPosterior, ...]
+    """The posterior of every joint's function."""
+
+    @property
+    @override
+    def training(self) -> TrainingData:
+        return self.likelihood.training
+
+    @property
+    @override
+    def description(self) -> str:
+        return "independent GP"
+
+    @override
+    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
+        base = super().accelerations(baumgarte)  # refuses a stabilisation, for no constraint is known
+
+        def through(functions: Sequence[Callable[[list[Tensor]], Tensor]]) -> AccelerationFunction:
+            def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+                z = self.likelihood.features(*(x.reshape(-1, x.shape[-1]) for x in (q, v, u)))
+                points = [z.reshape(*q.shape[:-1], -1)]
+                return torch.cat([function(points) for function in functions], dim=-1)
+
+            return acceleration
+
+        def mean() -> AccelerationFunction:
+            return through([StackedFunctions.mean_of(latent) for latent in self.latents])
+
+        def sampled(samples: int, seed: int) -> AccelerationFunction:
+            seeds = np.random.SeedSequence(seed).generate_state(len(self.latents))  # joints are independent
+            each = zip(self.latents, seeds, strict=True)
+            return through([draw_functions(latent, samples, int(own)) for latent, own in each])
+
+        return AccelerationModel(base.system, None, mean, sampled)
+
+    @property
+    @override
+    def predicts_forces(self) -> bool:
+        return False
+
+    @property
+    @override
+    def noise_std(self) -> Float[Tensor, "nv"]:
+        return self.parameters[ACCELERATION].exp()
+
+    @cached_property
+    @override
+    def negative_log_likelihood(self) -> float:
+        kernels = self.likelihood.kernels()
+        with torch.no_grad():
+            return sum(
+                float(self.likelihood(joint, one_joint(kernels, joint), joint_part(self.parameters, joint)))
+                for joint in range(self.system.robot.nv)
+            )
+
+    @override
+    def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
+        with blas_threads(len(self.training.q)):
+            parts = [
+                self.likelihood.leave_out(joint, latent, joint_part(self.parameters, joint), blocks)
+                for joint, latent in enumerate(self.latents)
+            ]
+        return LeaveOut.of_independent_outputs(parts)
+
+    @override
+    def predict_rows(
+        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
+    ) -> Prediction:
+        z = [self.likelihood.features(q, v, u)]
+        mean = torch.cat([latent.mean(z) for latent in self.latents], dim=-1)
+        variance = None
+        if covariance:
+            variance = torch.cat([latent.covariance(z)[..., 0] for latent in self.latents], dim=-1)
+        noise = self.noise_std.square().expand_as(mean)
+        return Prediction(
+            mean,
+            None if variance is None else torch.diag_embed(variance),
+            multiplier=None,
+            contact_force=None,
+            unknown_force=None,
+            noise_covariance=torch.diag_embed(noise),
+        )

@@ -1,0 +1,189 @@
+"""What networks share: checks of their arguments, standardised inputs, and a posterior with a diagonal covariance."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.inference import Engine, OptimizationResult
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models.fit_arguments import check_search_numbers, described_rows, resolved_noise, training_rows
+from forcegp.models.noise import ACCELERATION, Noise
+from forcegp.models.prediction import Prediction
+from forcegp.models.protocol import Model, Posterior
+from forcegp.models.training_data import Standardization, TrainingData
+
+
+class NetworkModel(Model):
+    """A network from (q, v, u) to the acceleration. Subclasses are frozen dataclasses with `system` and `noise`.
+
+    Training weighs all rows alike: of data that state the noise of every row, a network takes only the level, its root
+    mean square over the training rows.
+    """
+
+    # These constructors are the checks, with messages for people; checks of annotations must not come before them.
+    __no_type_check__: ClassVar[bool] = True
+
+    noise: Noise | None
+    name: ClassVar[str]
+    objective: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.system, MechanicalSystem):
+            given = type(self.system).__name__
+            raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
+        if self.noise is not None and not isinstance(self.noise, Noise):
+            object.__setattr__(self, "noise", Noise(self.noise))
+        if self.noise is not None and (self.noise.learn or self.noise.force is not None):
+            raise InvalidInput(
+                "a network takes known noise of the acceleration only; without it, it estimates noise from residuals"
+            )
+
+    @abstractmethod
+    def moments(
+        self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]
+    ) -> tuple[Float[Tensor, "rows nv"], Float[Tensor, "rows nv"], Float[Tensor, "rows nv"]]:
+        """Mean, its variance, and the variance of data about it, at standardised inputs."""
+
+    @override
+    def condition(
+        self,
+        training: TrainingData,
+        parameters: Mapping[str, Tensor],
+        result: OptimizationResult,
+        settings: Mapping[str, Any],
+        engine: Engine | None = None,
+        solution: Tensor | None = None,
+    ) -> NetworkPosterior:
+        return NetworkPosterior(self, training, dict(parameters), result, dict(settings))
+
+    def resolved_noise(self, rows: Dataset) -> Noise | None:
+        """The noise given, else the level that the training rows state, else None: it is estimated."""
+        if self.noise is None and rows.noise_std is None:
+            return None
+        return resolved_noise(self.noise, rows)
+
+    def prepared(self, dataset: Dataset, points: int | None, seed: int) -> tuple[Dataset, TrainingData]:
+        """The rows to train on, as a Dataset and as tensors."""
+        rows = training_rows(self.system.robot.joint_names, dataset, points)
+        check_search_numbers(1, seed)
+        return rows, TrainingData.of(rows, self.system.robot.device)
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkPosterior(Posterior):
+    """A trained network or ensemble; made by its `fit` or by `load_posterior`.
+
+    The network sees how far measurements scatter about its mean, and cannot separate noise from its own error. Where
+    the noise is known (`model.noise`, given or stated by the Dataset) the noise covariance is that, and what the
+    scatter exceeds it by counts to the covariance of the acceleration; where it is not known, all of the scatter is
+    noise.
+    """
+
+    model: NetworkModel
+    data: TrainingData
+    parameters: Mapping[str, Tensor]
+    result: OptimizationResult
+    settings: Mapping[str, Any]
+
+    @property
+    @override
+    def training(self) -> TrainingData:
+        return self.data
+
+    @property
+    @override
+    def description(self) -> str:
+        return self.model.name
+
+    @property
+    @override
+    def objective(self) -> str:
+        return self.model.objective
+
+    @cached_property
+    def standardization(self) -> Standardization:
+        """Of the inputs and of the accelerations, from the training points."""
+        return Standardization.of([inputs(self.data.q, self.data.v, self.data.u), self.data.a])
+
+    @cached_property
+    def _known_variance(self) -> Tensor | None:
+        if self.model.noise is None:
+            return None
+        parameters = self.model.noise.parameters(self.system.robot.nv)
+        return (2.0 * parameters[ACCELERATION]).exp().to(self.data.a)
+
+    @cached_property
+    def _estimated_noise(self) -> Tensor:
+        with torch.no_grad():
+            _, _, scatter = self._moments(self.data.q, self.data.v, self.data.u)
+        return scatter.mean(0).sqrt()
+
+    @property
+    @override
+    def predicts_forces(self) -> bool:
+        return False
+
+    @property
+    @override
+    def noise_std(self) -> Float[Tensor, "nv"]:
+        return self._estimated_noise if self._known_variance is None else self._known_variance.sqrt()
+
+    @cached_property
+    @override
+    def negative_log_likelihood(self) -> float:
+        with torch.no_grad():
+            prediction = self.predict(self.data.q, self.data.v, self.data.u)
+        variance = prediction.measurement.variance
+        squared = (self.data.a - prediction.mean).square()
+        return float(0.5 * (squared / variance + variance.log() + math.log(2.0 * math.pi)).sum())
+
+    @override
+    def predict_rows(
+        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
+    ) -> Prediction:
+        mean, variance, scatter = self._moments(q, v, u)
+        noise = scatter
+        if self._known_variance is not None:
+            variance = variance + (scatter - self._known_variance).clamp_min(0.0)
+            noise = self._known_variance.expand_as(mean)
+        return Prediction(
+            mean,
+            torch.diag_embed(variance) if covariance else None,
+            multiplier=None,
+            contact_force=None,
+            unknown_force=None,
+            noise_covariance=torch.diag_embed(noise),
+        )
+
+    def _moments(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        shift, scale = self.standardization.shift[0], self.standardization.scale[0]
+        return self.model.moments(self, (inputs(q, v, u) - shift) / scale)
+
+
+def inputs(
+    q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"]
+) -> Float[Tensor, "rows d"]:
+    """What a network sees of a state."""
+    return torch.cat([q, v, u], dim=-1)
+
+
+def fit_settings(rows: Dataset, dataset: Dataset, seed: int, noise: Noise | None, **numbers: Any) -> dict[str, Any]:
+    """The resolved configuration of a fit, as plain JSON values."""
+    return {
+        **described_rows(rows, dataset),
+        "seed": seed,
+        "noise": None if noise is None else noise.to_dict(),
+        **numbers,
+    }

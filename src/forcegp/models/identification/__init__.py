@@ -1,0 +1,1 @@
+"""Physical parameters as unknowns of a fit, and what was learned of them."""

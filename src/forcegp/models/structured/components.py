@@ -1,0 +1,144 @@
+"""Every force of a fitted model by itself: joint friction, tool friction, normal force, their sum."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.models.prediction import Gaussian
+from forcegp.priors import ForcePrior, SumPrior
+from forcegp.robots import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class ForceComponent:
+    """One of the forces that add up to the unknown force, at a batch of states.
+
+    `joint_force` (..., nv) in Nm or N; `latents` (..., C) are the values of its processes, in `latent_units`;
+    `point_force` (..., 3) in N along the axes of the world, for forces that act at a point of the robot, else None;
+    `acceleration` (..., nv) in rad/s^2 or m/s^2 is what it adds to the acceleration under the constraint.
+    """
+
+    name: str
+    latent_names: tuple[str, ...]
+    latent_units: tuple[str, ...]
+    latents: Gaussian
+    joint_force: Gaussian
+    acceleration: Gaussian
+    point_force: Gaussian | None
+
+
+@dataclass(frozen=True, eq=False)
+class Components(Mapping[str, ForceComponent]):
+    """The components by name, what they add up to, and the constraint's answer.
+
+    `total` (..., nv) in Nm or N is the whole unknown force, with the covariances between components; `multiplier` is
+    lambda (..., m) and `contact_force` the world force of every contact on the robot (..., 3 m), in N, both with the
+    known forces in them.
+    """
+
+    total: Gaussian
+    multiplier: Gaussian
+    contact_force: Gaussian
+    parts: Mapping[str, ForceComponent] = field(default_factory=dict)
+
+    @override
+    def __getitem__(self, name: str) -> ForceComponent:
+        if name not in self.parts:
+            raise InvalidInput(unknown_name_message("component", name, "this model", list(self.parts)))
+        return self.parts[name]
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.parts)
+
+    @override
+    def __len__(self) -> int:
+        return len(self.parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Latents:
+    """Joint distribution of all processes at a batch of states: mean (..., C) and covariance (..., C, C) or None."""
+
+    mean: Float[Tensor, "*batch C"]
+    covariance: Float[Tensor, "*batch C C"] | None
+
+    def through(self, matrix: Float[Tensor, "*batch k C"], offset: Float[Tensor, "*batch k"] | None = None) -> Gaussian:
+        """The distribution of offset + matrix f."""
+        mean = (matrix @ self.mean[..., None])[..., 0]
+        covariance = None if self.covariance is None else symmetric(matrix @ self.covariance @ matrix.mT)
+        return Gaussian(mean if offset is None else offset + mean, covariance)
+
+    def part(self, which: slice) -> Latents:
+        """Some of the processes alone."""
+        covariance = None if self.covariance is None else self.covariance[..., which, which]
+        return Latents(self.mean[..., which], covariance)
+
+
+def term_slices(prior: ForcePrior, robot: Robot) -> list[tuple[str, ForcePrior, slice]]:
+    """Name, prior and latents of every term that adds up to `prior`."""
+    if isinstance(prior, SumPrior):
+        return list(zip(prior.term_names, prior.terms, prior.slices(robot), strict=True))
+    return [(prior.title, prior, slice(0, len(prior.latent_names(robot))))]
+
+
+def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Latents, known: bool) -> Components:
+    """All components of Q_U = B f at the states of `dynamics`; `known`: whether Q_K acts beside them."""
+    robot = dynamics.state.robot
+    B = prior.mixing(dynamics)
+    parts = {}
+    for name, term, which in term_slices(prior, robot):
+        own, mixing = latents.part(which), B[..., which]
+        point = term.point_force(dynamics)
+        parts[name] = ForceComponent(
+            name,
+            term.latent_names(robot),
+            term.latent_units(robot),
+            Gaussian(own.mean, own.covariance),
+            joint_force=own.through(mixing),
+            acceleration=own.through(dynamics.H @ mixing),
+            point_force=None if point is None else own.through(point),
+        )
+
+    def constraint(affine: tuple[Tensor, Tensor]) -> Gaussian:
+        return latents.through(affine[1] @ B, affine[0])
+
+    multiplier, contact_force = dynamics.multiplier_map(known), dynamics.contact_force_map(known)
+    return Components(latents.through(B), constraint(multiplier), constraint(contact_force), parts)
+
+
+def symmetric(matrix: Float[Tensor, "*batch k k"]) -> Float[Tensor, "*batch k k"]:
+    """Its symmetric part: products of covariances are symmetric up to rounding only."""
+    return 0.5 * (matrix + matrix.mT)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One process over some of its features, for example a friction curve: force over velocity.
+
+    `features` (n, d) and their names with units; `mean` and `std` (n,) in `unit`; `visited` (2, d) is the range of the
+    features in the training data.
+    """
+
+    name: str
+    unit: str
+    feature_names: tuple[str, ...]
+    features: Float[Tensor, "n d"]
+    mean: Float[Tensor, " n"]
+    std: Float[Tensor, " n"]
+    visited: Float[Tensor, "2 d"]
+
+    def interval(self, probability: float = 0.95) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Lower and upper end of the central interval of this probability."""
+        if not 0.0 < probability < 1.0:
+            raise InvalidInput(f"probability is {probability}; give a number between 0 and 1")
+        quantile = torch.special.ndtri(torch.tensor(0.5 * (1.0 + probability), dtype=torch.float64))
+        return self.mean - quantile * self.std, self.mean + quantile * self.std

@@ -1,0 +1,69 @@
+"""What a structured model is: a system, a prior on the unknown force, the mean and the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, get_args
+
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.inference import ProblemSize
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models.noise import Noise
+from forcegp.models.protocol import Model
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, Mean
+from forcegp.models.training_data import TrainingData
+from forcegp.priors import ForcePrior, JointForces
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredModel(Model):
+    """The fields of a `StructuredGP`, checked, and the likelihood that they define."""
+
+    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
+    __no_type_check__: ClassVar[bool] = True
+
+    system: MechanicalSystem
+    prior: ForcePrior = field(default_factory=JointForces)
+    mean: Mean = "analytical"
+    noise: Noise | None = None
+
+    def __post_init__(self) -> None:
+        for name, kind in (("system", MechanicalSystem), ("prior", ForcePrior)):
+            if not isinstance(getattr(self, name), kind):
+                given = type(getattr(self, name)).__name__
+                raise InvalidInput(f"{name} is a {given}; give a {kind.__name__}, for example system=dataset.system")
+        if self.noise is not None and not isinstance(self.noise, Noise):
+            object.__setattr__(self, "noise", Noise(self.noise))
+        if self.mean not in get_args(Mean):
+            raise InvalidInput(f"mean is {self.mean!r}; allowed: {', '.join(map(repr, get_args(Mean)))}")
+        self.prior.check(self.system)
+
+    def likelihood(self, training: TrainingData) -> MarginalLikelihood:
+        """That of these rows or windows."""
+        return MarginalLikelihood(self.system, self.prior, self.mean, training)
+
+    def problem_size(self, rows: int) -> ProblemSize:
+        """Of the posterior of so many rows, without computing anything; contacts count as independent."""
+        nv, latents = self.system.robot.nv, len(self.prior.latent_names(self.system.robot))
+        return ProblemSize(rows, nv, min(latents, nv - len(self.system.contacts)), latents, 0)
+
+    @property
+    def known_noise(self) -> Noise:
+        """The noise of a model that a fit has resolved."""
+        assert self.noise is not None, "a fitted model has its noise"
+        return self.noise
+
+    @property
+    def split_noise(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Noise parameters that are learned, and those that stay."""
+        parameters = self.known_noise.parameters(self.system.robot.nv, self.system.robot.device)
+        return (parameters, {}) if self.known_noise.learn else ({}, parameters)
+
+    @override
+    def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
+        noise = (self.noise or Noise()).parameters(self.system.robot.nv)
+        named = self.likelihood(training).kernels().initial_parameters() | noise
+        return {name: tuple(value.shape) for name, value in named.items()}

@@ -1,0 +1,386 @@
+"""`StructuredGP`: Gaussian processes on the unknown forces inside known constrained rigid-body dynamics."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows
+from forcegp.errors import DataWarning, InvalidInput
+from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
+from forcegp.models.fit_arguments import (
+    described_rows,
+    noise_of_windows,
+    resolved_noise,
+    training_rows,
+    training_windows,
+)
+from forcegp.models.identification.identification import Identification
+from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
+from forcegp.models.search import ALL_ROWS, MOST_POINTS_FOR_RESTARTS, FitProgress, with_steps_before
+from forcegp.models.structured.definition import StructuredModel
+from forcegp.models.structured.engine_selection import learning_rows, on_all_rows, require_memory_to_learn
+from forcegp.models.structured.load_refinement import fit_with_refined_loads
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.objective import LOG_VARIANCE_SPREAD, FitObjective, with_variance_priors
+from forcegp.models.structured.physical_start import PhysicalStart
+from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.models.structured.prior_checks import check_prior
+from forcegp.models.structured.search import Search
+from forcegp.models.structured.surface_distance import check_distance
+from forcegp.models.training_data import TrainingData
+from forcegp.parallel import Backend, backend_for
+from forcegp.priors import ForcePrior, prior_to_dict
+
+CONTINUE_FROM = (250, 500)
+"""Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
+
+MOVED = {"observe", "learn", "prior_strength"}
+"""Keywords that `fit` had in version 0.1, when it was also `fit_windows` and `identify`."""
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredGP(StructuredModel):
+    """a = M^-1 Q_b + H (Q_K + B f) + noise with f ~ GP (Rath et al. 2021, eq. 6; eq. 7 with the analytical mean).
+
+    Three ways to learn: `fit` from rows of accelerations, `fit_windows` from raw positions or velocities, `identify`
+    with physical parameters (masses, friction coefficients) beside the unknown forces.
+
+    Parameters
+    ----------
+    system: robot, contacts and known forces, for example `dataset.system`.
+    prior: the unknown force Q_U = B f; the default is one Gaussian process per joint on (q, v, u).
+    mean: "analytical" keeps the known forces Q_K in the mean; "zero" drops them, so that the processes carry Q_K + Q_U.
+    noise: measurement noise, a `Noise` or just its standard deviation. None takes `dataset.noise_std`, and raises if
+        the dataset does not state it: then pass `Noise(0.1, learn=True)` to learn it. Where the dataset states the
+        noise of every row, the level given or learned here is its root mean square over the training rows.
+    """
+
+    def fit(
+        self,
+        dataset: Dataset,
+        *,
+        points: int | None = None,
+        restarts: int | None = None,
+        seed: int = 0,
+        jobs: int | None = None,
+        backend: Backend | str | None = None,
+        hyperprior: bool = True,
+        options: OptimizerOptions | None = None,
+        start: Mapping[str, Tensor] | None = None,
+        engine: Engine | str = "auto",
+        learning_points: int | None = None,
+        progress: FitProgress | None = None,
+        **moved: Any,
+    ) -> StructuredPosterior:
+        """Find all kernel and learned noise parameters by marginal likelihood, then condition on the points.
+
+        Parameters
+        ----------
+        dataset: rows with the joints of the robot in its order; nothing in it is changed.
+        points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
+        restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
+            factors, every other one from a smoother start; the best final value wins. None means 4 up to 400 points,
+            where local optima cost most and searches cost little, and 1 beyond, which then begins where searches on
+            250 and 500 of the rows ended.
+        seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
+        jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
+        backend: where restarts run: `Serial()`, `Joblib(jobs)`, `Ray(address)` or a name, "serial", "joblib", "ray"
+            (docs/clusters.md). None is this process for one job and processes of this machine for several.
+        hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
+            maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
+        options: the search itself; None is `models.search.default_options`, which is content sooner beyond 400 points.
+        start: unconstrained parameters at which the first search begins instead of moments, for example
+            `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
+        engine: how the posterior is computed from all points: "exact", "iterative", "inducing", or one of
+            `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
+            memory, with the reason in `settings["engine_reason"]`.
+        learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all
+            up to 1500 and 600 beyond. The posterior is that of all points.
+        progress: called as progress(restart, iteration, nll) where the restarts run in this process. The restart is
+            `models.search.ALL_ROWS` while the engine takes in all points.
+
+        Where the prior has a friction that is proportional to the normal force, and no `expected` friction is given,
+        the fit is repeated with the normal force under the friction that was found, until it settles.
+        The keywords `observe`, `learn` and `prior_strength` of version 0.1 warn (DeprecationWarning) and still work.
+
+        Raises
+        ------
+        InvalidInput: the dataset does not fit the system, or an argument is out of range.
+        ContactError: a contact cannot hold at some row, or no row touches its surface.
+        FitError: no restart could be evaluated; the message names the cause.
+        NotEnoughMemory: the engine, or the likelihood of the learning points, would need more than is free.
+        NumericalError: the engine failed, for example to reach its tolerance.
+        """
+        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
+        if moved:
+            return self._fit_as_before(dataset, points, search, engine, learning_points, moved)
+        return self._fit_rows(dataset, points, search, engine, learning_points)
+
+    def fit_windows(
+        self,
+        dataset: Dataset,
+        observe: WindowObservation | str,
+        *,
+        points: int | None = None,
+        restarts: int | None = None,
+        seed: int = 0,
+        jobs: int | None = None,
+        backend: Backend | str | None = None,
+        hyperprior: bool = True,
+        options: OptimizerOptions | None = None,
+        start: Mapping[str, Tensor] | None = None,
+        progress: FitProgress | None = None,
+    ) -> StructuredPosterior:
+        """Learn from windows of raw positions or velocities instead of the column `a` (docs/without-accelerations.md).
+
+        Parameters
+        ----------
+        dataset: raw, and at the rate of its sensors.
+        observe: `WeakForm(seconds=0.1)`, `VelocityIncrements(seconds=0.1)` or the name of one.
+        points: train on this many windows, those that lie farthest apart; None takes all. Inference is exact.
+
+        The noise is that of a window's weighted mean acceleration; a model without `noise` learns it, from where the
+        noise of the sensors puts it. All other arguments, and what is raised, as for `fit`.
+        """
+        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
+        return self._fit_windows(dataset, observe, points, search)
+
+    def identify(
+        self,
+        dataset: Dataset,
+        learn: Learned | Sequence[Learned],
+        *,
+        observe: WindowObservation | str | None = None,
+        prior_strength: float = 0.0,
+        points: int | None = None,
+        restarts: int | None = None,
+        seed: int = 0,
+        jobs: int | None = None,
+        backend: Backend | str | None = None,
+        hyperprior: bool = True,
+        options: OptimizerOptions | None = None,
+        start: Mapping[str, Tensor] | None = None,
+        engine: Engine | str = "auto",
+        learning_points: int | None = None,
+        progress: FitProgress | None = None,
+    ) -> StructuredPosterior:
+        """Estimate physical parameters along with the unknown forces, from the values that the system has.
+
+        Afterwards `posterior.system` has the estimates, and `posterior.identification` their standard errors.
+
+        Parameters
+        ----------
+        learn: `robot.link("tool").inertial("mass", "com")`, `Coefficients("viscous-joint-friction")`, or several.
+        observe: learn from windows as in `fit_windows`; None learns from accelerations.
+        prior_strength: weight w of the prior on learned inertias, w/2 times the squared distance of pseudo-inertias
+            (`objective.squared_distance`) from the given ones: a body with all masses (1 + x) times as large costs
+            2 w x^2. 0 is no prior.
+        hyperprior: as for `fit`; the variances of the processes have a weak one as well
+            (`objective.with_variance_priors`).
+        restarts: draw kernel parameters only; all begin at the same physical values.
+        learning_points: None means all points, since standard errors are those of the rows that were learned from.
+
+        All other arguments, and what is raised, as for `fit`. Loads of friction under load are not refined.
+        """
+        if not 0.0 <= prior_strength < float("inf"):
+            raise InvalidInput(f"prior_strength is {prior_strength}; it must be finite and at least 0")
+        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
+        if observe is not None:
+            _require_exact(engine, learning_points)
+            return self._fit_windows(dataset, observe, points, search, learn, prior_strength)
+        return self._fit_rows(dataset, points, search, engine, learning_points, learn, prior_strength)
+
+    @override
+    def condition(
+        self,
+        training: TrainingData,
+        parameters: Mapping[str, Tensor],
+        result: OptimizationResult,
+        settings: Mapping[str, Any],
+        engine: Engine | None = None,
+        solution: Tensor | None = None,
+    ) -> StructuredPosterior:
+        """The posterior at given parameters, without optimisation; names as in `MarginalLikelihood`."""
+        likelihood = self.likelihood(training)
+        kernels = likelihood.kernels()
+        engine = engine or Exact()
+        # now: a failure belongs to the fit, not to the first prediction
+        latent = likelihood.condition(kernels, parameters, engine, start=solution)
+        return StructuredPosterior(self, likelihood, kernels, dict(parameters), result, dict(settings), latent, engine)
+
+    def _fit_rows(
+        self,
+        dataset: Dataset,
+        points: int | None,
+        search: Search,
+        engine: Engine | str,
+        learning_points: int | None,
+        learn: Learned | Sequence[Learned] | None = None,
+        prior_strength: float = 0.0,
+    ) -> StructuredPosterior:
+        """From accelerations: parameters from some of the rows, the posterior from all."""
+        chosen = engine_of(engine)
+        all_rows = training_rows(self.system.robot.joint_names, dataset, points)
+        if chosen is not None:
+            chosen.require_memory(
+                self.problem_size(len(all_rows)), self.system.robot.device
+            )  # now, not after the search
+        if learn is not None and learning_points is None:
+            learning_points = len(all_rows)
+        rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
+        if learn is None:
+            search = replace(search, start=self._continuation(rows, dataset, search))
+            fitted = self._with_refined_loads(self._fit(rows, dataset, search), rows, dataset, search)
+        else:
+            fitted = self._identify(rows, dataset, search, learn, prior_strength)
+        report = None if search.progress is None else partial(search.progress, ALL_ROWS)
+        described = described_rows(all_rows, dataset)
+        return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
+
+    def _fit_windows(
+        self,
+        dataset: Dataset,
+        observe: WindowObservation | str,
+        points: int | None,
+        search: Search,
+        learn: Learned | Sequence[Learned] | None = None,
+        prior_strength: float = 0.0,
+    ) -> StructuredPosterior:
+        """From windows: parameters and the posterior from all of them."""
+        windows = training_windows(self.system.robot.joint_names, dataset, points, observe)
+        model = replace(self, noise=noise_of_windows(self.noise, windows))
+        if learn is None:
+            fitted = model._with_refined_loads(model._fit(windows, dataset, search), windows, dataset, search)
+        else:
+            fitted = model._identify(windows, dataset, search, learn, prior_strength)
+        reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
+        described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
+        return fitted.with_settings(**described, engine=Exact().to_dict(), engine_reason=reason)
+
+    def _fit_as_before(
+        self,
+        dataset: Dataset,
+        points: int | None,
+        search: Search,
+        engine: Engine | str,
+        learning_points: int | None,
+        moved: Mapping[str, Any],
+    ) -> StructuredPosterior:
+        """`fit` with the keywords of version 0.1. Raises TypeError for any other keyword."""
+        unknown = moved.keys() - MOVED
+        if unknown:
+            raise TypeError(f"StructuredGP.fit() got an unexpected keyword argument {min(unknown)!r}")
+        now = "identify(dataset, learn, ...)" if moved.get("learn") else "fit_windows(dataset, observe, ...)"
+        message = f"fit({'=..., '.join(moved)}=...) is deprecated and will be removed; call {now}"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
+        learning = moved.get("learn"), moved.get("prior_strength", 0.0)
+        if moved.get("observe") is None:
+            return self._fit_rows(dataset, points, search, engine, learning_points, *learning)
+        _require_exact(engine, learning_points)
+        return self._fit_windows(dataset, moved["observe"], points, search, *learning)
+
+    def _continuation(self, rows: Dataset, dataset: Dataset, search: Search) -> Mapping[str, Tensor] | None:
+        """Where a single search on many rows begins: at the end of searches on fewer of them."""
+        if search.start is not None or len(rows) <= MOST_POINTS_FOR_RESTARTS or search.restarts not in (None, 1):
+            return search.start
+        _, options = search.resolved(len(rows))
+        stages = [stage for stage in CONTINUE_FROM if 1.5 * stage < len(rows)]
+        ordered = farthest_rows(rows, stages[-1])
+        start: Mapping[str, Tensor] | None = None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # the fit to all rows gives it
+            for stage in stages:
+                begin = replace(search, restarts=1, start=start, options=options)
+                start = self._fit(ordered.rows(slice(stage)), dataset, begin).parameters
+        return start
+
+    def _with_refined_loads(
+        self, first: StructuredPosterior, rows: Dataset | Windows, dataset: Dataset, search: Search
+    ) -> StructuredPosterior:
+        """`first`, or a fit with the normal force under the friction that was found."""
+
+        def again(prior: ForcePrior, last: StructuredPosterior) -> StructuredPosterior:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)  # the first fit gave it, of the same rows
+                begin = replace(search, restarts=1, start=last.parameters)
+                return replace(self, prior=prior)._fit(rows, dataset, begin)
+
+        return fit_with_refined_loads(first, again)
+
+    def _fit(self, rows: Dataset | Windows, dataset: Dataset, search: Search) -> StructuredPosterior:
+        """One search on these rows or windows of the dataset with the prior as it is, and the exact posterior there."""
+        fitted, likelihood = self._checked(rows)
+        learned_noise, fixed = fitted.split_noise
+        kernels = likelihood.kernels()
+        objective = FitObjective(likelihood, kernels, fitted.known_noise, fixed, search.hyperprior)
+        result, of_search = search.best(objective, kernels.initial_parameters() | learned_noise)
+        settings = fitted._settings(rows, dataset, of_search)
+        return fitted.condition(likelihood.training, result.parameters | fixed, result, settings)
+
+    def _identify(
+        self,
+        rows: Dataset | Windows,
+        dataset: Dataset,
+        search: Search,
+        learn: Learned | Sequence[Learned],
+        prior_strength: float,
+    ) -> StructuredPosterior:
+        """One search for physical parameters and all others on these rows or windows of the dataset."""
+        fitted, likelihood = self._checked(rows)
+        learned_noise, fixed = fitted.split_noise
+        begin = PhysicalStart.of(learn, likelihood, learned_noise | fixed, prior_strength)
+        kernels = with_variance_priors(begin.kernels) if search.hyperprior else begin.kernels
+        objective = FitObjective(
+            likelihood, kernels, fitted.known_noise, fixed, search.hyperprior, begin.physical, prior_strength
+        )
+        result, of_search = search.best(objective, begin.path[-1] | learned_noise, keep_iterates=True)
+        # the steps before the search are its first iterations
+        result = with_steps_before(result, objective, [point | learned_noise for point in begin.path[:-1]])
+        settings = fitted._settings(rows, dataset, of_search) | {
+            "learned": learn_to_list(begin.physical),
+            "prior_strength": prior_strength,
+            "log_variance_spread": LOG_VARIANCE_SPREAD if search.hyperprior else None,
+        }
+        identification = Identification.of(begin.physical, objective, result, likelihood.training.q.numel())
+        parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
+        posterior = replace(fitted, system=identification.system).condition(
+            likelihood.training, parameters | fixed, replace(result, parameters=parameters), settings
+        )
+        return replace(posterior, identification=identification)
+
+    def _checked(self, rows: Dataset | Windows) -> tuple[StructuredGP, MarginalLikelihood]:
+        """The model with its noise resolved, and its likelihood of these rows, which have passed every check."""
+        fitted = replace(self, noise=resolved_noise(self.noise, rows))
+        likelihood = fitted.likelihood(TrainingData.of(rows, self.system.robot.device))
+        training = likelihood.training
+        self.system.check_states(training.q, training.v, training.u)
+        check_distance(self.system, training)
+        check_prior(likelihood)
+        require_memory_to_learn(likelihood)
+        return fitted, likelihood
+
+    def _settings(self, rows: Dataset | Windows, dataset: Dataset, of_search: Mapping[str, Any]) -> dict[str, Any]:
+        """The resolved configuration of a fit as plain JSON values."""
+        return {
+            **described_rows(rows, dataset),
+            **of_search,
+            "mean": self.mean,
+            "prior": prior_to_dict(self.prior),
+            "noise": self.known_noise.to_dict(),
+        }
+
+
+def _require_exact(engine: Engine | str, learning_points: int | None) -> None:
+    """Raises InvalidInput for what windows cannot use."""
+    if not isinstance(engine_of(engine) or Exact(), Exact) or learning_points is not None:
+        raise InvalidInput(
+            "engine and learning_points are for rows with accelerations; windows (observe=...) are conditioned on "
+            "exactly, and all are learned from: leave both out, and give fewer points if it takes too long"
+        )

@@ -1,0 +1,179 @@
+"""Where physics and Gaussian processes meet: from states and a prior to (m, W), features, start values and NLL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.inference import (
+    Engine,
+    Exact,
+    FunctionalPosterior,
+    LatentKernels,
+    LatentPosterior,
+    Terms,
+    collapsed_bound,
+    negative_log_likelihood,
+)
+from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.linear_functionals import functional_negative_log_likelihood, weighted
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.models.identification.physical_parameters import COEFFICIENTS, INERTIALS, coefficients_of, inertials_of
+from forcegp.models.noise import ACCELERATION, FORCE, Noise
+from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
+from forcegp.priors import ForcePrior
+
+Mean = Literal["analytical", "zero"]
+
+
+@dataclass(frozen=True, eq=False)
+class MarginalLikelihood:
+    """-log p(a | q, v, u, parameters) of one model on one training set, as a function of unconstrained parameters.
+
+    Parameters by name: those of the kernels, `noise.log_acceleration` (nv,), optionally `noise.log_force` (nv,), and
+    optionally `inertials.<link>` (10,) log-Cholesky parameters of links and `coefficients.<known force>` (nv,). All of
+    them receive gradients in one backward pass.
+    """
+
+    system: MechanicalSystem
+    prior: ForcePrior
+    mean: Mean
+    training: TrainingData
+    fixed_standardization: Standardization | None = None
+    """That of the reference rows where it is known already; None computes it."""
+
+    def dynamics(self, parameters: Mapping[str, Tensor] | None = None) -> ConstrainedDynamics:
+        """The constrained dynamics of the training states, at the physical parameters among `parameters`."""
+        inertials, coefficients = inertials_of(parameters or {}), coefficients_of(parameters or {})
+        if not inertials and not coefficients and not self._known_forces_are_learned:
+            return self._nominal_dynamics
+        system = self.system.with_coefficients(coefficients) if coefficients else self.system
+        return system.dynamics(self.training.q, self.training.v, self.training.u, inertials)
+
+    @property
+    def _known_forces_are_learned(self) -> bool:
+        """Whether a tensor inside a known force wants a gradient; then nothing that depends on it may be kept."""
+        forces = self.system.known_forces
+        values = [getattr(force, name) for force in forces for name in force.per_joint]
+        return any(isinstance(value, Tensor) and value.requires_grad for value in values)
+
+    @cached_property
+    def _nominal_dynamics(self) -> ConstrainedDynamics:
+        with torch.no_grad():
+            return self.system.dynamics(self.training.q, self.training.v, self.training.u)
+
+    @cached_property
+    def standardization(self) -> Standardization:
+        """From the features of the reference states, at the nominal inertial parameters."""
+        if self.fixed_standardization is not None:
+            return self.fixed_standardization
+        if self._reference is not None:
+            return self._reference.standardization
+        scalings = self.prior.scalings(self.system.robot)
+        return Standardization.of(self.prior.features(self._nominal_dynamics), scalings)
+
+    @cached_property
+    def _reference(self) -> MarginalLikelihood | None:
+        """The same model on the rows that standardise features, where they are others than the training rows."""
+        rows = self.training.reference
+        return None if rows is None else replace(self, training=rows)
+
+    @cached_property
+    def _nominal_features(self) -> list[Tensor]:
+        return self.standardization(self.prior.features(self._nominal_dynamics))
+
+    @cached_property
+    def _nominal_mixing(self) -> Tensor:
+        return self._nominal_dynamics.H @ self.prior.mixing(self._nominal_dynamics)
+
+    def terms(self, parameters: Mapping[str, Tensor]) -> Terms:
+        """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`.
+
+        Of windows, those of all nodes; the residual of a window is repeated for all of its nodes.
+        """
+        dynamics = self.dynamics(parameters)
+        residual = self.training.a - dynamics.acceleration_map(known=self.mean == "analytical").offset
+        weights = self.training.weights
+        if weights is not None:
+            residual = weighted(weights, residual).repeat_interleave(weights.shape[1], dim=0)
+        noise = Noise.covariance(parameters, dynamics.H, self.training.noise_factors)
+        if dynamics is self._nominal_dynamics:
+            return Terms(self._nominal_features, self._nominal_mixing, residual, noise)
+        # shifted and scaled at these parameters, as a posterior does that has them in its system
+        given = self.prior.features(dynamics)
+        rows = self if self._reference is None else self._reference
+        by = given if rows is self else self.prior.features(rows.dynamics(parameters))
+        features = Standardization.of(by, self.prior.scalings(self.system.robot))(given)
+        return Terms(features, dynamics.H @ self.prior.mixing(dynamics), residual, noise)
+
+    def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
+        """Kernels with moment-based start values, at the physical parameters among `parameters`.
+
+        Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force
+        residual.
+        """
+        any_noise = {ACCELERATION: torch.zeros_like(self.training.a[0])}
+        with torch.no_grad():
+            features, W, residual, _ = self.terms({**any_noise, **(parameters or {})})
+        estimate = (torch.linalg.pinv(W, rtol=1e-8) @ residual[..., None])[..., 0]
+        variances = estimate.square().mean(0)
+        largest = float(variances.max()) if variances.numel() else 0.0
+        if variances.numel() and not largest > 0.0:
+            raise InvalidInput(
+                "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was "
+                "measured and not computed from "
+                "the model itself"
+            )
+        variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
+        dimensions = tuple(z.shape[-1] for z in features)
+        return LatentKernels(self.prior.kernels(self.system.robot, dimensions, variances)).to(variances.device)
+
+    def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """The negative log marginal likelihood, exact and differentiable in every parameter.
+
+        Raises InvalidInput for a parameter of a name that means nothing here.
+        """
+        known = {*kernels.initial_parameters(), ACCELERATION, FORCE}
+        physical = (INERTIALS, COEFFICIENTS)
+        unknown = next((name for name in parameters if name not in known and not name.startswith(physical)), None)
+        if unknown is not None:
+            raise InvalidInput(
+                f"no parameter {unknown!r}; there are {', '.join(sorted(known))}, {INERTIALS}<link> and "
+                f"{COEFFICIENTS}<known force>"
+            )
+        terms = self.terms(parameters)
+        features, W, residual, noise = terms
+        matrices = kernels.matrices(parameters, features)
+        if self.training.weights is not None:
+            return functional_negative_log_likelihood(self.training.weights, terms, matrices)
+        return negative_log_likelihood(W, residual, noise, matrices)
+
+    def bound(
+        self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
+    ) -> Float[Tensor, ""]:
+        """`collapsed_bound` of the same with these inducing points (prepared features) of every latent."""
+        features, W, residual, noise = self.terms(parameters)
+        return collapsed_bound(W, residual, noise, kernels, parameters, features, points)
+
+    def condition(
+        self,
+        kernels: LatentKernels,
+        parameters: Mapping[str, Tensor],
+        engine: Engine | None = None,
+        *,
+        start: Tensor | None = None,
+        report: Iteration | None = None,
+    ) -> LatentPosterior:
+        """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`."""
+        with torch.no_grad():
+            terms = self.terms(parameters)
+            if self.training.weights is not None:
+                return FunctionalPosterior.condition(kernels.at(parameters), self.training.weights, terms)
+            return (engine or Exact()).condition(kernels.at(parameters), terms, start=start, report=report)

@@ -1,0 +1,171 @@
+"""What data cannot teach a prior, checked before anything is fitted."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from forcegp.errors import DataWarning, InvalidInput
+from forcegp.models.structured.components import term_slices
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.training_data import CONSTANT
+from forcegp.priors import ForcePrior
+
+INVISIBLE = 1e-9
+"""|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
+ROUNDING = 1e-12
+"""|M^-1 B_c| relative to the largest of them below which a latent moves nothing."""
+EQUAL = 1e-9
+"""Relative difference of two latents' effects and features below which they are the same."""
+
+LEFT_OUT = 0.1
+"""Share of what the known forces do that may lie where no latent acts, without a word."""
+SPAN = 1e-9
+"""Singular values of unit effects relative to the largest below which they are one effect fewer."""
+ROWS_LOOKED_AT = 500
+
+
+def check_prior(likelihood: MarginalLikelihood) -> None:
+    """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
+
+    Raises InvalidInput if no latent changes the acceleration at any training point, if all of one term do nothing at
+    all, if all features of a latent are constant (a tool or joint that never moves), and if latents of two terms do the
+    same in every row. Warns (DataWarning) of single features that are constant, of latents that move nothing or that
+    the constraint hides while others show, and, with the mean "zero", of known forces that no latent can take over.
+    """
+    names = likelihood.prior.latent_names(likelihood.system.robot)
+    if not names:
+        return
+    dynamics = likelihood.dynamics()
+    B = likelihood.prior.mixing(dynamics)
+    features = likelihood.prior.features(dynamics)
+    _check_features(likelihood, names, features)
+    effect = dynamics.H @ B
+    terms = [number for number, (*_, which) in enumerate(_terms(likelihood)) for _ in range(which.stop - which.start)]
+    shows = _check_visible(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
+    _check_distinct(names, terms, shows, effect, likelihood.standardization(features))
+    if likelihood.mean == "zero":
+        _check_known_forces(effect, (dynamics.H @ dynamics.Q_K[..., None])[..., 0])
+
+
+def _terms(likelihood: MarginalLikelihood) -> list[tuple[str, ForcePrior, slice]]:
+    return term_slices(likelihood.prior, likelihood.system.robot)
+
+
+def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
+    robot = likelihood.system.robot
+    labels = likelihood.prior.feature_names(robot)
+    scalings = likelihood.prior.scalings(robot)
+    idle: dict[tuple[str, ...], list[str]] = {}
+    for index, (name, z) in enumerate(zip(names, features, strict=True)):
+        if not z.shape[-1]:
+            continue
+        spread = z.var(0, correction=0).sqrt()
+        constant = spread <= CONSTANT * (1.0 + z.mean(0).abs())
+        known = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
+        which = tuple(label for label, flat in zip(known, constant.tolist(), strict=True) if flat)
+        if bool(constant.all()):
+            raise InvalidInput(
+                f"latent {name!r} depends on {', '.join(which)}, which is the same in all {len(z)} training rows "
+                f"({_values(z[0])}), so its function cannot be learned; give data in which it changes, or leave this "
+                "prior (or this joint) out"
+            )
+        if which and any(way != "none" for way in _ways(scalings[index], z)):
+            idle.setdefault(which, []).append(name)
+    for which, latents in idle.items():
+        some = f"{', '.join(which[:4])}{' ...' if len(which) > 4 else ''}"
+        warnings.warn(
+            f"{some} never changes in the training rows, so nothing is learned of how {_few(latents)} depends on it; "
+            "leave that input out (inputs=...), or give data in which it changes",
+            DataWarning,
+            stacklevel=5,
+        )
+
+
+def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> list[bool]:
+    """Which latents show; `free` is what each would do without the contacts, `effect` what it does (N, nv, C)."""
+    size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
+    absent = (size <= ROUNDING * size.max()).tolist()
+    for term in set(terms):
+        own = [index for index, number in enumerate(terms) if number == term]
+        if all(absent[index] for index in own):
+            raise InvalidInput(
+                f"{_few([names[index] for index in own])} exerts no force at any training row; check frame, point and "
+                "contact of the prior, or leave it out"
+            )
+    if any(absent):
+        warnings.warn(
+            f"{_few([name for name, nothing in zip(names, absent, strict=True) if nothing])} moves no joint at any "
+            "training row, so its posterior is its prior; give data in other postures, or leave it out "
+            "if the prior can do without",
+            DataWarning,
+            stacklevel=5,
+        )
+    hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
+    blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
+    remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
+    shows = [not (nothing or flat) for nothing, flat in zip(absent, hidden, strict=True)]
+    if not any(shows):
+        raise InvalidInput(
+            f"no data can identify {_few(blind)}: the contacts take the whole force, and the acceleration shows none "
+            f"of it; {remedy}"
+        )
+    if blind:
+        warnings.warn(
+            f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
+            f"its posterior and that of the normal force are the prior; {remedy}",
+            DataWarning,
+            stacklevel=5,
+        )
+    return shows
+
+
+def _check_distinct(
+    names: Sequence[str], terms: Sequence[int], shows: Sequence[bool], effect: Tensor, features: Sequence[Tensor]
+) -> None:
+    """Latents of two terms with the same effect on the same features are one function; data see only their sum."""
+    columns = effect.flatten(0, 1)
+    norms = torch.linalg.vector_norm(columns, dim=0)
+    cosines = (columns.mT @ columns) / torch.outer(norms, norms).clamp_min(torch.finfo(columns.dtype).tiny)
+    for first, second in torch.nonzero(torch.triu(cosines.abs() > 1.0 - EQUAL, diagonal=1)).tolist():
+        one, other = features[first], features[second]
+        if terms[first] == terms[second] or not (shows[first] and shows[second]):
+            continue  # joints that the constraint couples; one prior makes its own latents independent
+        if one.shape == other.shape and bool(((one - other).abs() <= EQUAL * (1.0 + one.abs())).all()):
+            raise InvalidInput(
+                f"no data can separate {names[first]!r} and {names[second]!r}: both act in the same direction and "
+                "depend on the same inputs; leave one of them out"
+            )
+
+
+def _check_known_forces(effect: Tensor, known: Tensor) -> None:
+    """Whether the latents act where the known forces do: the part of `known` (N, nv) outside the span of `effect`."""
+    step = -(-len(known) // ROWS_LOOKED_AT)
+    effect, known = effect[::step], known[::step]
+    columns = effect / torch.linalg.vector_norm(effect, dim=-2, keepdim=True).clamp_min(torch.finfo(effect.dtype).tiny)
+    carried = (columns @ (torch.linalg.pinv(columns, rtol=SPAN) @ known[..., None]))[..., 0]
+    size = float(known.square().sum().sqrt())
+    share = float((known - carried).square().sum().sqrt()) / size if size > 0.0 else 0.0
+    if share > LEFT_OUT:
+        warnings.warn(
+            f"with the mean 'zero' the prior carries gravity, actuation and all known forces, but {share:.0%} of the "
+            "acceleration that they cause lies where none of its forces acts; take mean='analytical' (--mean "
+            "analytical), or add a force on every joint, JointForces() (--prior joint)",
+            DataWarning,
+            stacklevel=5,
+        )
+
+
+def _ways(scaling: Sequence[str] | str, z: Tensor) -> Sequence[str]:
+    return (scaling,) * z.shape[-1] if isinstance(scaling, str) else scaling
+
+
+def _values(row: Tensor) -> str:
+    return ", ".join(f"{value:.4g}" for value in row.tolist()[:4])
+
+
+def _few(names: Sequence[str]) -> str:
+    return f"{', '.join(map(repr, names[:4]))}{f' and {len(names) - 4} more' if len(names) > 4 else ''}"

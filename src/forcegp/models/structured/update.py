@@ -1,0 +1,127 @@
+"""A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.errors import DataWarning, InvalidInput
+from forcegp.inference import ExactPosterior
+from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
+from forcegp.inference.memory import require_memory
+from forcegp.models.noise import ACCELERATION, Noise
+from forcegp.models.search import blas_threads
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.surface_distance import check_distance
+from forcegp.models.training_data import TrainingData
+
+Keep = Callable[[ExactPosterior, int], Tensor]
+"""(posterior, budget) -> numbers of the rows to keep, ascending."""
+
+SHARE_AT_ONCE = 4
+"""With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
+
+OTHER_NOISE = 0.1
+"""Part of the fit's level of noise by which rows may state another one without a warning."""
+
+
+def learn_more_rows(
+    likelihood: MarginalLikelihood,
+    parameters: Mapping[str, Tensor],
+    latent: ExactPosterior,
+    noise: Noise | None,
+    rows: Dataset,
+    budget: int | None,
+    keep: Keep = rows_to_keep,
+) -> tuple[MarginalLikelihood, ExactPosterior]:
+    """What `StructuredPosterior.update` documents: the rows that are conditioned on afterwards, and the posterior.
+
+    `latent` is the posterior on the rows of `likelihood` at `parameters`, `noise` that of the model.
+    """
+    _check(likelihood.system.robot.joint_names, rows, budget)
+    training = likelihood.training
+    height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
+    _require_memory(latent, len(rows), height, budget)
+    reference = training if training.reference is None else training.reference
+    level = parameters[ACCELERATION].exp().cpu().numpy()
+    if noise is not None and noise.from_data and reference.noise_std is None:
+        _warn_of_another_noise(level, rows)
+    added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
+    likelihood.system.check_states(added.q, added.v, added.u)
+    check_distance(likelihood.system, added)
+    # the standardization at hand, instead of one that is computed again from the reference
+    standardized = replace(likelihood, fixed_standardization=likelihood.standardization)
+    with torch.no_grad(), blas_threads(training.q.numel()):
+        features, W, residual, variance = replace(standardized, training=added).terms(parameters)
+        variance = variance.expand(len(W), *variance.shape[1:])
+        for start in range(0, len(W), height):
+            part = slice(start, start + height)
+            latent = with_rows(latent, [z[part] for z in features], W[part], residual[part], variance[part])
+            training = _joined(training, _selected(added, part))
+            if budget is not None and len(training.q) > budget:
+                kept = keep(latent, budget)
+                latent, training = with_only(latent, kept), _selected(training, kept)
+    return replace(standardized, training=replace(training, reference=reference)), latent
+
+
+def _check(joints: Sequence[str], rows: Dataset, budget: int | None) -> None:
+    """Raises InvalidInput for rows of other joints and a budget below 2."""
+    if tuple(rows.joint_names) != tuple(joints):
+        raise InvalidInput(f"the new rows have joints {', '.join(rows.joint_names)}; the model has {', '.join(joints)}")
+    if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 2):
+        raise InvalidInput(f"budget is {budget!r}; it is the number of rows to keep, 2 or more, or None for all")
+
+
+def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
+    """DataWarning where rows state one noise for all of them, another than the fit's data did, which stays in use."""
+    stated = rows.noise_std
+    if stated is None or stated.ndim == 2:
+        return  # nothing stated, or stated row by row: then every row is as noisy as stated
+    if bool((np.abs(stated / level - 1.0) > OTHER_NOISE).any()):
+        levels = ", ".join(f"{mine:.3g} ({fit:.3g})" for mine, fit in zip(stated, level, strict=True))
+        warnings.warn(
+            f"the new rows state another noise per joint than the data of the fit (in brackets): {levels}. The level "
+            "of the fit is used for them, too; state the noise of every row (noise_std of shape (rows, nv)) in the fit "
+            "and here, or fit again to all rows",
+            DataWarning,
+            stacklevel=4,
+        )
+
+
+def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int | None) -> None:
+    """Raise NotEnoughMemory where `added` rows, `height` at a time, do not fit: before anything is computed."""
+    count, rank, latents = latent.system.deflation.C.shape
+    height = min(height, added)
+    before = count if budget is None else min(max(count, budget), count + added - height)  # at the largest step
+    needed = bytes_to_append(before, height, rank, latents)
+    what, remedy = f"a posterior of {count} + {added} rows", "give a budget of rows to keep (budget=N), or fewer rows"
+    if budget is not None:
+        needed = max(needed, bytes_to_choose(before + height, rank))
+        what, remedy = f"learning from {added} rows with budget={budget}", "give a smaller budget"
+        if count > budget:
+            remedy += f", or a posterior of fewer rows (it has {count})"
+    require_memory(needed, what, remedy, latent.system.alpha.device)
+
+
+def _with_row_noise(rows: Dataset, reference: TrainingData) -> Dataset:
+    """Rows that state one noise for all of them state it for every row, where the training rows did so."""
+    if reference.noise_std is None or rows.noise_std is None or rows.noise_std.ndim == 2:
+        return rows
+    return replace(rows, noise_std=np.tile(rows.noise_std, (len(rows), 1)))
+
+
+def _selected(training: TrainingData, index: Tensor | slice) -> TrainingData:
+    values = (getattr(training, name) for name in ("q", "v", "u", "a", "noise_std"))
+    return TrainingData(*(None if value is None else value[index] for value in values))  # type: ignore[arg-type]  # noise_std alone may be None
+
+
+def _joined(first: TrainingData, second: TrainingData) -> TrainingData:
+    states = (torch.cat([getattr(first, name), getattr(second, name)]) for name in ("q", "v", "u", "a"))
+    stated = [part.noise_std for part in (first, second) if part.noise_std is not None]
+    return TrainingData(*states, noise_std=torch.cat(stated) if stated else None)

@@ -1,0 +1,138 @@
+"""`RobotStructure`: what a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
+from forcegp.robots.arguments import Inertials, check_mapping, check_tensor
+from forcegp.robots.layout import WORLD, Layout
+from forcegp.robots.parts import Joint, Link
+from forcegp.robots.tree import Tree, merged_inertias
+from forcegp.robots.urdf import RobotDescription
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RobotStructure:
+    """The constants of a :class:`~forcegp.robots.Robot`, for code that its algorithms are made of."""
+
+    description: RobotDescription
+    layout: Layout
+    tree: Tree
+    urdf_text: str
+    _locked: tuple[tuple[str, float], ...]
+    _frames: dict[str, tuple[int, Tensor]]
+
+    @property
+    def name(self) -> str:
+        """Name of the robot in the URDF."""
+        return self.description.name
+
+    @property
+    def source(self) -> str:
+        """Where the URDF came from, as error messages name it."""
+        return self.description.source
+
+    @property
+    def nv(self) -> int:
+        """Number of movable joints."""
+        return len(self.layout.joints)
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """Movable joints in the order of q."""
+        return tuple(map(Joint.of, self.layout.joints))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the movable joints in the order of q."""
+        return tuple(joint.name for joint in self.layout.joints)
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of all links in file order."""
+        return tuple(self.description.links)
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of all frames: those of the links."""
+        return self.link_names
+
+    @property
+    def gravity(self) -> Float[Tensor, "3"]:
+        """Gravitational acceleration in m/s^2."""
+        return self.tree.gravity.clone()
+
+    @property
+    def armature(self) -> Float[Tensor, "nv"]:
+        """Rotor inertia per joint in kg m^2 or kg."""
+        return self.tree.armature.clone()
+
+    @property
+    def locked(self) -> dict[str, float]:
+        """Movable joints of the URDF that are fixed here, and their positions in rad or m."""
+        return dict(self._locked)
+
+    @property
+    def device(self) -> torch.device:
+        """Device that inputs must be on."""
+        return self.tree.rest.device
+
+    def link(self, name: str) -> Link:
+        """One link by name."""
+        placement = self.layout.links.get(name)
+        if placement is None:
+            raise UnknownLink(unknown_name_message("link", name, self.name, self.layout.links))
+        joint = None if placement.body == WORLD else self.joint_names[placement.body]
+        return Link.of(name, joint, self.description.links[name])
+
+    def joint(self, name: str) -> Joint:
+        """One movable joint by name."""
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise UnknownJoint(unknown_name_message("joint", name, self.name, self.joint_names))
+
+    def inertial_parameters(self, *links: str) -> dict[str, Float[Tensor, "10"]]:
+        """Log-Cholesky parameters (10,) of the named links, to start an identification from.
+
+        Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
+        :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
+        """
+        for name in links:
+            self.layout.require_moving(name, self.name)
+        return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
+
+    def __repr__(self) -> str:
+        kinds = ", ".join(f"{joint.name} ({joint.type})" for joint in self.layout.joints)
+        return f"Robot({self.name!r}, nv={self.nv}, links={len(self.layout.links)}, joints=[{kinds}])"
+
+    # ------------------------------------------------------------------ checks of inputs
+
+    def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
+        """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
+        found = self._frames.get(name)
+        if found is None:
+            raise UnknownFrame(unknown_name_message("frame", name, self.name, self._frames))
+        body, offset = found
+        return body, offset.clone()
+
+    def check_input(self, name: str, value: object) -> None:
+        """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""
+        check_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
+
+    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
+        """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
+        check_mapping(inertials)
+        for name, parameters in inertials.items():
+            self.layout.require_moving(name, self.name)
+            self.check_parameters(name, parameters)
+        return merged_inertias(self.tree, self.layout, inertials)
+
+    def check_parameters(self, link: str, parameters: object) -> None:
+        """:class:`~forcegp.errors.InvalidInput` unless these can be log-Cholesky parameters of ``link``."""
+        check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

@@ -1,0 +1,175 @@
+"""Jobs of the experiments on force priors: which rows they take, and every score against direct computation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.experiments.oracle import Tool
+from tests.experiments.stored_jobs import keep
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.errors import InvalidInput
+from forcegp.experiments import force_jobs
+from forcegp.inference import OptimizerOptions
+from forcegp.jobs import JobStore
+from forcegp.models import IndependentGP, StructuredGP, load_posterior
+from forcegp.priors import ContactFriction, JointForces, JointFriction
+
+OPTIONS = OptimizerOptions(iterations=5)
+TRAIN, TEST = "force-data/train", "force-data/test"
+
+
+@pytest.fixture(scope="module")
+def rubbing():
+    """2 s with Stribeck friction at tool and joints, and a fit of both to every 20th row."""
+    pytest.importorskip("pybullet")
+    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+    data = simulate_kuka_surface(KukaSurfaceConfig(seconds=2, seed=3, friction="stribeck", joint_friction="stribeck"))
+    prior = JointFriction() + ContactFriction(load=True, expected=0.3)
+    posterior = StructuredGP(data.system, prior).fit(data.rows(slice(0, None, 20)), restarts=1, options=OPTIONS)
+    return posterior, data.rows(slice(7, None, 16))
+
+
+@pytest.fixture
+def results(tmp_path):
+    return JobStore.open(tmp_path / "out", "a test", {})
+
+
+def stored(results, **data):
+    for name, rows in data.items():
+        keep(results, f"force-data/{name}", {}, {}, lambda folder, rows=rows: rows.save(folder / force_jobs.FILE))
+
+
+def fit_spec(**changes):
+    spec = {"train": TRAIN, "tests": {"there": TEST}, "prior": "tool-friction", "mean": "analytical", "points": 12}
+    return spec | {"region": False, "seed": 0, "restarts": 1, "iterations": 2, "tolerance": 1e-6} | changes
+
+
+def test_scores_are_what_they_say(rubbing):
+    posterior, test = rubbing
+    found = force_jobs.scores(posterior, test)
+    states = test.q, test.v, test.u
+    prediction, components = posterior.predict(*states), posterior.components(*states)
+    mean = prediction.mean.numpy()
+    assert found["mae"] == pytest.approx(np.abs(mean - test.a).mean(), rel=1e-9)
+    assert found["mae_noise_free"] == pytest.approx(np.abs(mean - test.truth["a"]).mean(), rel=1e-9)
+    assert found["mae_of_truth"] == pytest.approx(np.abs(test.truth["a"] - test.a).mean(), rel=1e-12)
+    force, std = prediction.multiplier.mean.numpy(), prediction.multiplier.std.numpy()
+    error = force - test.truth["lambda"]
+    relative = np.sqrt(np.mean(error**2) / np.mean(test.truth["lambda"] ** 2))
+    assert found["normal_force_error"] == pytest.approx(relative, rel=1e-9)
+    assert found["normal_force_coverage"] == pytest.approx((np.abs(error) <= 1.96 * std).mean(), abs=0.02)
+    assert 0.0 <= found["component_sum_error"] < 1e-9
+    for name, truth in (("joint-friction", "Q_U.joint-friction"), ("load-friction", "Q_U.tool-friction")):
+        own = components[name].joint_force.mean.numpy()
+        assert found[f"force_mae.{name}"] == pytest.approx(np.abs(own - test.truth[truth]).mean(), rel=1e-9)
+    assert found["force_mae.joint-friction"] != found["force_mae.load-friction"]
+    assert "mae_touching" not in found
+
+
+def test_a_force_of_everything_is_not_compared_with_a_part(rubbing):
+    """`JointForces` holds friction of tool and joints together, and the truth has them one by one."""
+    _, test = rubbing
+    posterior = StructuredGP(test.system, JointForces()).fit(test, restarts=1, options=OptimizerOptions(iterations=0))
+    assert not [name for name in force_jobs.scores(posterior, test) if name.startswith("force_mae")]
+
+
+def test_rows_in_the_air_are_scored_by_themselves(rubbing):
+    posterior, test = rubbing
+    touching = np.arange(len(test)) % 3 > 0
+    marked = replace(test, truth={**test.truth, "in_contact": touching[:, None].astype(float)})
+    found = force_jobs.scores(posterior, marked)
+    error = np.abs(posterior.predict(test.q, test.v, test.u).mean.numpy() - test.a)
+    assert found["mae_touching"] == pytest.approx(error[touching].mean(), rel=1e-9)
+    assert found["mae_in_the_air"] == pytest.approx(error[~touching].mean(), rel=1e-9)
+    everywhere = replace(test, truth={**test.truth, "in_contact": np.ones((len(test), 1))})
+    assert force_jobs.scores(posterior, everywhere)["mae_in_the_air"] is None
+
+
+def test_forces_are_scored_under_the_contacts_of_the_test(rubbing):
+    posterior, test = rubbing
+    accelerations = {"a": test.truth["a"]}
+    free = replace(test, system=test.system.with_contacts([]), truth=accelerations)
+    found = force_jobs.scores(posterior, free)
+    carried = posterior.with_contacts([]).predict(test.q, test.v, test.u).mean.numpy()
+    assert found["mae"] == pytest.approx(np.abs(carried - test.a).mean(), rel=1e-9)
+    assert found["mae"] > 2.0 * force_jobs.scores(posterior, test)["mae"]
+    assert "normal_force_error" not in found
+
+
+def test_black_boxes_are_scored_on_accelerations_alone(rubbing):
+    _, test = rubbing
+    black_box = IndependentGP(test.system).fit(test, options=OptimizerOptions(iterations=0))
+    found = force_jobs.scores(black_box, test)
+    assert set(found) == {"mae", "mae_of_truth", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae"}
+    assert force_jobs.curve_scores(black_box) == {}
+
+
+def test_curves_are_held_against_their_laws(rubbing):
+    from forcegp.experiments.true_curves import true_curves
+
+    posterior, _ = rubbing
+    found, laws = force_jobs.curve_scores(posterior), true_curves(posterior)
+    assert set(found) == set(laws) == set(posterior.latent_names)
+    for latent, law in laws.items():
+        curve = posterior.curve(latent)
+        mean, truth = curve.mean.numpy(), law(curve.features[:, 0].numpy())
+        inside = np.abs(mean - truth) <= 1.959963984540054 * curve.std.numpy()
+        assert found[latent]["coverage"] == pytest.approx(inside.mean(), abs=1.1 / len(mean))
+        size = np.sqrt(np.mean(truth**2))
+        assert found[latent]["relative_error"] == pytest.approx(np.sqrt(np.mean((mean - truth) ** 2)) / size, rel=1e-9)
+
+
+def test_the_first_points_are_trained_on_and_every_test_is_scored(results, motion, tmp_path):
+    train = farthest_rows(motion, 30)
+    stored(results, train=train, test=motion.rows(slice(3, None, 9)), other=motion.rows(slice(5, None, 9)))
+    tests = {"there": TEST, "elsewhere": "force-data/other"}
+    found = force_jobs.fit(results, fit_spec(tests=tests), tmp_path)
+    posterior = load_posterior(tmp_path / force_jobs.MODEL)
+    assert np.array_equal(posterior.training.q.numpy(), train.q[:12])
+    assert list(found["tests"]) == ["there", "elsewhere"]
+    for label, name in tests.items():
+        test = force_jobs.load(results, name)
+        mean = posterior.predict(test.q, test.v, test.u).mean.numpy()
+        assert found["tests"][label]["mae"] == pytest.approx(np.abs(mean - test.a).mean(), rel=1e-6)
+    total = posterior.leave_out([[k] for k in range(12)]).total
+    assert found["leave_one_out"] == pytest.approx(total / 12, rel=1e-6)
+    with pytest.raises(InvalidInput, match="31 training points are asked for, but there are 30"):
+        force_jobs.fit(results, fit_spec(points=31), tmp_path)
+
+
+def test_regions_do_not_overlap(results, motion, tmp_path):
+    """The motion, every second row turned about the base's vertical axis, so that the tool is on both sides."""
+    q = motion.q.copy()
+    q[:, 0] += np.where(np.arange(len(q)) % 2 == 0, 1.2, -0.8)
+    turned = replace(motion, q=q, truth={}).rows(slice(0, None, 7))
+    stored(results, train=turned, test=turned)
+    tool = Tool(motion.system)
+    x = np.array([tool.position(row)[0] for row in turned.q])
+    assert min((x < 0.0).sum(), (x > 0.1).sum()) > 12
+    found = force_jobs.fit(results, fit_spec(region=True), tmp_path)
+    posterior = load_posterior(tmp_path / force_jobs.MODEL)
+    assert np.array_equal(posterior.training.q.numpy(), turned.q[x < 0.0][:12])
+    beyond = turned.rows(x > 0.1)
+    mean = posterior.predict(beyond.q, beyond.v, beyond.u).mean.numpy()
+    assert found["tests"]["there"]["mae"] == pytest.approx(np.abs(mean - beyond.a).mean(), rel=1e-6)
+
+
+def test_data_jobs_hold_the_rows_they_promise(results, motion, tmp_path):
+    spec = {"scenario": {}, "seed": 1, "seconds": 2, "rows": None, "every": 12}
+    assert force_jobs.simulate(results, spec, tmp_path) == {"rows_available": 480, "rows": 40}
+    kept = Dataset.load(tmp_path / force_jobs.FILE)
+    assert np.array_equal(kept.q, motion.q[::12])
+    force_jobs.simulate(results, spec | {"rows": 9}, tmp_path)
+    assert np.array_equal(Dataset.load(tmp_path / force_jobs.FILE).q, farthest_rows(motion, 9).q)
+
+
+def test_training_rows_of_a_contact_that_opens_are_in_contact(results, tmp_path):
+    pytest.importorskip("pybullet")
+    spec = {"scenario": {"contact": "bullet"}, "seed": 2, "seconds": 4, "rows": 60, "every": 12}
+    told = force_jobs.simulate(results, spec, tmp_path)
+    kept = Dataset.load(tmp_path / force_jobs.FILE)
+    assert 0.5 < told["in_contact_truth"] < 1.0
+    assert abs(told["in_contact_detected"] - told["in_contact_truth"]) < 0.05
+    assert float(kept.truth["in_contact"].mean()) > 0.98

@@ -1,0 +1,163 @@
+"""Jobs run in order, several at once, each once; failures and kills cost only what was not finished."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from forcegp.errors import BackendError, FitError, OutdatedWarning, WorkerWarning
+from forcegp.jobs import Job, JobStore, digests, run_jobs
+from forcegp.parallel import Joblib, Serial, Shared
+
+TOY = "tests.jobs.toy_tasks"
+
+
+def square(number: int) -> Job:
+    return Job(f"square/{number}", f"{TOY}:square", {"number": number})
+
+
+def next_to(job: Job) -> Job:
+    return Job(f"next/{job.name.rpartition('/')[2]}", f"{TOY}:square", {"before": job.name}, (job.name,))
+
+
+@pytest.fixture
+def results(tmp_path):
+    return JobStore.open(tmp_path / "out", "a test", {})
+
+
+def test_all_jobs_are_computed_once_and_in_order(results):
+    jobs = [next_to(square(3)), square(3), square(4)]
+    told = []
+    assert run_jobs(results, jobs, backend=Joblib(2), progress=lambda *given: told.append(given)) == 3
+    assert results.result("next/3")["value"] == 10
+    assert results.result("square/4")["value"] == 16
+    assert (results.place("square/4") / "note.txt").read_text() == "beside the result"
+    assert results.result("square/3")["process"] != os.getpid()
+    assert [done for done, *_ in told] == sorted(done for done, *_ in told)
+    assert told[-1][0] == told[-1][1]
+    before = results.load("square/3")
+    assert run_jobs(results, [*jobs, square(5)]) == 1
+    assert results.load("square/3") == before
+
+
+def test_a_failure_stops_only_what_needs_it(results):
+    bad = Job("bad", f"{TOY}:fail", {})
+    jobs = [bad, next_to(bad), next_to(next_to(bad)), square(2)]
+    with pytest.raises(FitError, match=r"bad failed.*no luck.*1 of \d jobs are kept"):
+        run_jobs(results, jobs)
+    assert results.result("square/2")["value"] == 4
+    assert not results.place("bad").exists()
+
+
+@pytest.mark.parametrize(("task", "cause"), [("break_down", "ZeroDivisionError"), ("not_a_number", "ValueError")])
+def test_a_defect_in_one_job_does_not_cost_the_others(results, task, cause):
+    with pytest.raises(FitError, match=rf"bad failed \({cause}: .*1 of 2 jobs are kept"):
+        run_jobs(results, [Job("bad", f"{TOY}:{task}", {}), square(2)], backend=Joblib(2))
+    assert results.result("square/2")["value"] == 4
+    assert not results.place("bad").exists()
+
+
+@pytest.mark.nightly
+@pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
+def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(results):
+    with pytest.raises(BackendError, match=r"died 4 times while task dead .*1 of 2 jobs are kept"):
+        run_jobs(results, [square(2), Job("dead", f"{TOY}:die", {}, ("square/2",))])
+    assert results.result("square/2")["value"] == 4
+
+
+def test_a_process_that_is_killed_is_replaced(results, tmp_path):
+    job = Job("killed", f"{TOY}:die_once", {"marker": str(tmp_path / "marker")})
+    with pytest.warns(WorkerWarning, match="task killed"):
+        assert run_jobs(results, [job, square(2)]) == 2
+    assert results.result("killed") == {"survived": True}
+    assert not list((tmp_path / "out").glob("**/*.tmp"))
+
+
+def test_this_process_can_do_it_all(results):
+    assert run_jobs(results, [next_to(square(3)), square(3)], Serial()) == 2
+    assert results.result("next/3")["value"] == 10
+    assert results.result("square/3")["process"] == os.getpid()
+
+
+def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence(results):
+    run_jobs(results, [square(3), next_to(square(3)), square(4)])
+    kept = results.load("square/4")
+    changed = Job("square/3", f"{TOY}:square", {"number": 3, "more": 1})
+    assert digests([changed, next_to(square(3))])["next/3"] != digests([square(3), next_to(square(3))])["next/3"]
+    with pytest.warns(OutdatedWarning, match="2 of the results in .* for example, were computed with other settings"):
+        assert run_jobs(results, [changed, next_to(changed), square(4)]) == 2
+    assert results.load("square/3")["spec"] == {"number": 3, "more": 1}
+    assert results.load("square/4") == kept
+    assert run_jobs(results, [changed, next_to(changed)]) == 0
+
+
+def test_other_code_is_seen_and_computed_anew_with_one_sentence(results, monkeypatch):
+    run_jobs(results, [square(3), next_to(square(3))])
+    monkeypatch.setattr("forcegp.jobs.job.code_digest", lambda *modules: "other")
+    with pytest.warns(OutdatedWarning, match="2 of the results in .*, were computed by other code; they are computed"):
+        assert run_jobs(results, [square(3), next_to(square(3))]) == 2
+    assert results.load("square/3")["code"] == "other"
+
+
+def test_arguments_reach_the_task_wherever_it_runs(results):
+    shared = Shared({"factor": 3})
+    for number, backend in enumerate((Serial(), Joblib(2), Unshared())):
+        job = Job(f"times/{number}", f"{TOY}:times", {"number": 5}, arguments=(shared, 2))
+        after = Job(f"after/{number}", f"{TOY}:square", {"before": job.name}, (job.name,))
+        assert run_jobs(results, [after, job], backend) == 2
+        assert results.result(job.name)["value"] == 5 * 3 * 2
+        assert results.result(after.name)["value"] == 31
+
+
+class Unshared(Serial):
+    """The same process, as if its tasks did not see the files."""
+
+    shares_files = False
+
+
+def test_warnings_are_kept_with_the_job(results):
+    run_jobs(results, [Job("w", f"{TOY}:warn", {})])
+    assert results.load("w")["warnings"] == ["look here"]
+
+
+@pytest.mark.nightly
+def test_kill_9_loses_only_the_job_at_work_and_leaves_no_process(tmp_path):
+    begun = tmp_path / "begun"
+    script = (
+        "from pathlib import Path\n"
+        "from tests.jobs.test_running import *\n"
+        "if __name__ == '__main__':\n"
+        f"    slow = Job('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
+        f"    run_jobs(JobStore.open(Path({str(tmp_path / 'out')!r}), 'a test', {{}}), [square(2), slow])\n"
+    )
+    (tmp_path / "script.py").write_text(script)
+    paths = [str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    run = subprocess.Popen([sys.executable, tmp_path / "script.py"], env=environment)
+    _wait_until(lambda: begun.exists() and begun.read_text() != "")
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    worker = int(begun.read_text())
+    _wait_until(lambda: not _alive(worker))
+    results = JobStore.open(tmp_path / "out", "a test", {})
+    first = results.load("square/2")
+    assert not results.place("slow").exists()
+    assert run_jobs(results, [square(2), square(3)]) == 1
+    assert results.load("square/2") == first
+    assert not list((tmp_path / "out").glob("**/*.tmp"))
+
+
+def _alive(process: int) -> bool:
+    status = Path(f"/proc/{process}/status")
+    return status.exists() and "State:\tZ" not in status.read_text()
+
+
+def _wait_until(condition) -> None:
+    end = time.monotonic() + 600.0  # a guard against a hang
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.05)

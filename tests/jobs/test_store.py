@@ -1,0 +1,161 @@
+"""A folder of jobs: whole or not at all, one configuration, one process at a time."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from forcegp.atomic_files import write_json
+from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
+from forcegp.jobs import JobStore
+
+KIND = "forcegp reproduce"
+
+
+@pytest.fixture
+def results(tmp_path):
+    return JobStore.open(tmp_path / "out", KIND, {"preset": "smoke"})
+
+
+def store(results, name, digest, result):
+    with results.writing(name) as folder:
+        write_json(folder / "job.json", {"digest": digest, "code": "", "spec": {}, "result": result})
+
+
+def test_a_job_is_found_again(results):
+    store(results, "fits/a/n10", "10", {"mae": 0.5})
+    again = JobStore.open(results.folder, KIND, {"preset": "smoke"})
+    assert again.has("fits/a/n10", "10")
+    assert again.result("fits/a/n10") == {"mae": 0.5}
+    assert not again.has("fits/a/n20", "20")
+
+
+def test_a_job_that_fails_leaves_nothing(results):
+    def interrupted():
+        with results.writing("fits/a") as folder:
+            (folder / "part.txt").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [entry.name for entry in (results.folder / "jobs" / "fits").iterdir()] == []
+
+
+def test_a_job_of_another_digest_is_not_the_same(results):
+    store(results, "a", "10", {})
+    assert not results.has("a", "11")
+
+
+@pytest.mark.parametrize("content", ["", '{"spec": {}', '{"spec": {}}', "[1]"])
+def test_a_half_written_job_is_named_and_kept(results, content):
+    store(results, "a", "1", {})
+    file = results.place("a") / "job.json"
+    file.write_text(content)
+    with pytest.raises(FileFormatError, match="only this job is computed anew"):
+        results.has("a", "1")
+    assert file.read_text() == content
+
+
+def test_another_configuration_and_a_later_format_are_refused(results):
+    with pytest.raises(InvalidInput, match=r"another preset \('smoke', not 'paper'\); choose another --out\.$"):
+        JobStore.open(results.folder, KIND, {"preset": "paper"})
+    with pytest.raises(InvalidInput, match=r"another preset .*choose another --out, or add --overwrite"):
+        JobStore.open(results.folder, KIND, {"preset": "paper"}, overwrite=False)
+    with pytest.raises(InvalidInput, match=r"results with another points, preset \("):
+        JobStore.open(results.folder, KIND, {"preset": "paper", "points": list(range(100))})
+    description = results.folder / "jobs.json"
+    stored = json.loads(description.read_text())
+    description.write_text(json.dumps({**stored, "forcegp_version": "9.0", "format_version": 3}))
+    with pytest.raises(FileFormatError, match=r"holds results of forcegp 9\.0 \(format 3\)"):
+        JobStore.open(results.folder, KIND, {"preset": "smoke"})
+
+
+def test_overwrite_starts_anew(results):
+    store(results, "a", "10", {})
+    again = JobStore.open(results.folder, KIND, {"preset": "paper"}, overwrite=True)
+    assert not again.has("a", "10")
+    assert JobStore.open(results.folder, KIND, {"preset": "paper"}, overwrite=False) == again
+
+
+def test_results_of_before_are_not_used_and_one_sentence_says_so(tmp_path):
+    (tmp_path / "cells" / "a").mkdir(parents=True)
+    (tmp_path / "cells" / "a" / "cell.json").write_text("{}")
+    old = {"kind": KIND, "format_version": 1, "forcegp_version": "0.1.0", "preset": "smoke"}
+    (tmp_path / "reproduction.json").write_text(json.dumps(old))
+    with pytest.raises(InvalidInput, match=r"another preset \('smoke', not 'paper'\)"):
+        JobStore.open(tmp_path, KIND, {"preset": "paper"})
+    with pytest.warns(OutdatedWarning, match="computed anew, and the old results stay in .*cells"):
+        results = JobStore.open(tmp_path, KIND, {"preset": "smoke"})
+    assert not results.has("a", "10")
+    assert (tmp_path / "cells" / "a" / "cell.json").read_text() == "{}"
+    JobStore.open(tmp_path, KIND, {"preset": "smoke"})  # without a word
+
+
+def test_folders_of_something_else_are_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(InvalidInput, match="was not written by `forcegp reproduce`"):
+        JobStore.open(tmp_path, KIND, {"preset": "smoke"})
+    with pytest.raises(InvalidInput, match="was not written by"):
+        JobStore.open(tmp_path / "thesis.tex", KIND, {"preset": "smoke"})
+    (tmp_path / "empty").mkdir()
+    assert JobStore.open(tmp_path / "empty", KIND, {"preset": "smoke"}).folder.is_dir()
+
+
+def test_only_one_at_a_time(results):
+    with results.locked(), pytest.raises(InvalidInput, match="another `forcegp reproduce` is at work"):  # noqa: SIM117
+        with JobStore.open(results.folder, KIND, {"preset": "smoke"}).locked():
+            pass
+    with results.locked():
+        pass  # free again
+
+
+def test_leftovers_of_killed_runs_go(results):
+    store(results, "fits/a", "1", {})
+    leftover = results.folder / "jobs" / "fits" / ".b.0123456789ab.tmp"
+    leftover.mkdir()
+    results.remove_leftovers()
+    assert not leftover.exists()
+    assert results.has("fits/a", "1")
+
+
+def test_a_run_killed_before_its_description_does_not_block_the_folder(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / ".jobs.json.0123456789ab.tmp").write_text('{"kind"')
+    results = JobStore.open(folder, KIND, {"preset": "smoke"})
+    with results.locked():
+        results.remove_leftovers()
+    assert sorted(entry.name for entry in folder.iterdir()) == [".lock", "jobs", "jobs.json"]
+
+
+def test_a_job_takes_the_place_of_an_outdated_one_when_it_is_complete(results):
+    store(results, "a", "1", {"first": True})
+    with results.writing("a") as folder:
+        write_json(folder / "job.json", {"digest": "2", "code": "", "spec": {}, "result": {"first": False}})
+        assert results.result("a") == {"first": True}
+    assert results.result("a") == {"first": False}
+    assert not list(results.folder.glob("**/*.tmp"))
+
+
+def test_only_one_at_a_time_where_the_system_has_no_fcntl(tmp_path):
+    script = """
+import sys, warnings
+sys.modules["fcntl"] = None  # as on systems that are neither Unix nor Windows
+warnings.simplefilter("ignore")
+from pathlib import Path
+from forcegp.errors import InvalidInput
+from forcegp.jobs import JobStore
+store = JobStore.open(Path(sys.argv[1]), "a test", {})
+for _ in range(2):
+    with store.locked():
+        try:
+            with JobStore(store.folder, "another").locked():
+                print("both")
+        except InvalidInput as error:
+            print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=True)
+    told = done.stdout.splitlines()
+    assert len(told) == 2
+    assert all(line.startswith("another `another` is at work in") for line in told)

@@ -1,0 +1,55 @@
+"""Tasks that take no time, for tests of the machinery."""
+
+import os
+import time
+import warnings
+from pathlib import Path
+
+from forcegp.errors import FitError
+
+
+def square(results, spec, folder):
+    if "before" in spec:
+        return {"value": results.result(spec["before"])["value"] + 1}
+    (folder / "note.txt").write_text("beside the result")
+    return {"value": spec["number"] ** 2, "process": os.getpid()}
+
+
+def times(store, spec, folder, shared, factor):
+    return {"value": spec["number"] * shared["factor"] * factor}
+
+
+def fail(results, spec, folder):
+    (folder / "half.txt").write_text("never seen")
+    raise FitError("no luck")
+
+
+def break_down(results, spec, folder):
+    return {"value": 1 / 0}
+
+
+def not_a_number(results, spec, folder):
+    return {"value": float("nan")}
+
+
+def die_once(results, spec, folder):
+    try:
+        Path(spec["marker"]).touch(exist_ok=False)
+    except FileExistsError:
+        return {"survived": True}
+    os._exit(3)
+
+
+def die(results, spec, folder):
+    os._exit(3)
+
+
+def warn(results, spec, folder):
+    warnings.warn("look here", stacklevel=1)
+    return {}
+
+
+def sleep(results, spec, folder):
+    Path(spec["begun"]).write_text(str(os.getpid()))
+    time.sleep(spec["seconds"])
+    return {}

@@ -1,0 +1,247 @@
+"""Files and folders appear whole or not at all, whatever fails on the way."""
+
+import errno
+import json
+import os
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from forcegp import atomic_files
+from forcegp.atomic_files import atomic_file, atomic_folder, read_json, remove_leftovers, write_json, write_text
+from forcegp.errors import FileFormatError, InvalidInput
+
+FAILURES = [OSError(errno.ENOSPC, "no space"), KeyboardInterrupt()]
+
+
+def contents(folder) -> dict[str, str]:
+    return {str(file.relative_to(folder)): file.read_text() for file in folder.rglob("*") if file.is_file()}
+
+
+def names(folder) -> list[str]:
+    return [entry.name for entry in folder.iterdir()]
+
+
+def fail_after(error, step, *arguments, **more) -> None:
+    step(*arguments, **more)
+    raise error
+
+
+def mode(path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.fixture
+def umask():
+    """Set a umask for one test."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+def make_folder(path, **files: str) -> None:
+    path.mkdir()
+    for name, text in files.items():
+        (path / name).write_text(text)
+
+
+def break_renames_to(monkeypatch, target, error) -> None:
+    """Let renames to `target` fail, once."""
+    left = [error]
+    for name in ("rename", "replace"):
+        own = getattr(os, name)
+
+        def rename(source, to, own=own):
+            if str(to) == str(target) and left:
+                raise left.pop()
+            own(source, to)
+
+        monkeypatch.setattr(os, name, rename)
+
+
+class TestFiles:
+    def test_is_written_and_replaced(self, tmp_path):
+        for text in ("one\n", "two\r\n"):
+            write_text(tmp_path / "note.txt", text)
+            assert (tmp_path / "note.txt").read_bytes() == text.encode()
+        assert names(tmp_path) == ["note.txt"]
+
+    def test_the_temporary_name_lies_in_the_same_folder_and_is_hidden(self, tmp_path):
+        with atomic_file(tmp_path / "note.txt") as temporary:
+            temporary.write_text("new")
+            assert temporary.parent == tmp_path
+            assert temporary.name.startswith(".note.txt.")
+            assert not (tmp_path / "note.txt").exists()
+
+    @pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
+    @pytest.mark.parametrize("where", ["before anything is written", "while it is written"])
+    def test_a_failure_leaves_the_old_file_and_nothing_else(self, tmp_path, error, where):
+        write_text(tmp_path / "note.txt", "old")
+        with pytest.raises(type(error)), atomic_file(tmp_path / "note.txt") as temporary:
+            fail_after(error, temporary.write_text if where.startswith("while") else str, "ne")
+        assert contents(tmp_path) == {"note.txt": "old"}
+
+    @pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
+    def test_a_failing_rename_leaves_the_old_file_and_nothing_else(self, tmp_path, monkeypatch, error):
+        write_text(tmp_path / "note.txt", "old")
+        break_renames_to(monkeypatch, tmp_path / "note.txt", error)
+        with pytest.raises(type(error)):
+            write_text(tmp_path / "note.txt", "new")
+        assert contents(tmp_path) == {"note.txt": "old"}
+
+    @pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+    def test_permissions_are_those_that_the_umask_allows(self, tmp_path, umask, mask):
+        umask(mask)
+        write_text(tmp_path / "note.txt", "new")
+        assert mode(tmp_path / "note.txt") == 0o666 & ~mask
+
+    def test_the_contents_are_on_the_disk_before_the_rename(self, tmp_path, monkeypatch):
+        steps = []
+        fsync, replace = os.fsync, os.replace
+        monkeypatch.setattr(os, "fsync", lambda file: (steps.append(os.fstat(file).st_size), fsync(file)))
+        monkeypatch.setattr(os, "replace", lambda one, other: (steps.append("rename"), replace(one, other)))
+        write_text(tmp_path / "note.txt", "12345")
+        assert steps == [5, "rename"]
+
+    def test_a_link_stays_and_the_file_behind_it_is_replaced(self, tmp_path):
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "elsewhere" / "real.txt").write_text("old")
+        (tmp_path / "link.txt").symlink_to(tmp_path / "elsewhere" / "real.txt")
+        write_text(tmp_path / "link.txt", "new")
+        assert (tmp_path / "link.txt").is_symlink()
+        assert contents(tmp_path / "elsewhere") == {"real.txt": "new"}
+
+    def test_the_longest_names_are_written(self, tmp_path):
+        for name in ("n" * 255, "ü" * 127):
+            write_text(tmp_path / name, "new")
+            assert (tmp_path / name).read_text() == "new"
+
+    def test_places_that_cannot_be_written_are_refused(self, tmp_path):
+        with pytest.raises(InvalidInput, match=r"the folder .*missing does not exist; create it"):
+            write_text(tmp_path / "missing" / "note.txt", "new")
+        with pytest.raises(InvalidInput, match="it is a folder; give a file name"):
+            write_text(tmp_path, "new")
+        assert not list(tmp_path.iterdir())
+
+
+class TestJson:
+    def test_is_read_as_written(self, tmp_path):
+        write_json(tmp_path / "a.json", {"one": 1, "two": [None, "ü"]})
+        assert read_json(tmp_path / "a.json", "write it again") == {"one": 1, "two": [None, "ü"]}
+
+    def test_what_json_cannot_hold_changes_nothing(self, tmp_path):
+        write_json(tmp_path / "a.json", {"one": 1})
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            write_json(tmp_path / "a.json", {"one": float("nan")})
+        assert json.loads((tmp_path / "a.json").read_text()) == {"one": 1}
+        assert len(list(tmp_path.iterdir())) == 1
+
+    @pytest.mark.parametrize("text", ["", '{"one": ', "[1]", "\udcff"])
+    def test_damage_is_named_with_the_remedy(self, tmp_path, text):
+        (tmp_path / "a.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+        with pytest.raises(FileFormatError, match=r"a\.json is .*damaged.*; write it again\.$"):
+            read_json(tmp_path / "a.json", "write it again")
+
+
+class TestFolders:
+    def test_is_made_with_its_parents(self, tmp_path):
+        with atomic_folder(tmp_path / "deep" / "er" / "model") as temporary:
+            make_folder(temporary, one="1")
+            assert temporary.parent == tmp_path / "deep" / "er"
+        assert contents(tmp_path) == {"deep/er/model/one": "1"}
+
+    def test_takes_the_place_of_an_old_one_when_it_is_complete(self, tmp_path):
+        make_folder(tmp_path / "model", old="old", both="old")
+        with atomic_folder(tmp_path / "model") as temporary:
+            make_folder(temporary, both="new")
+            assert contents(tmp_path / "model") == {"old": "old", "both": "old"}
+        assert contents(tmp_path) == {"model/both": "new"}
+        assert names(tmp_path) == ["model"]
+
+    @pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
+    @pytest.mark.parametrize("where", ["before", "while"])
+    def test_a_failure_leaves_the_old_folder_and_nothing_else(self, tmp_path, error, where):
+        make_folder(tmp_path / "model", one="old")
+        with pytest.raises(type(error)), atomic_folder(tmp_path / "model") as temporary:
+            fail_after(error, make_folder if where == "while" else dict, *[temporary] * (where == "while"), one="ne")
+        assert contents(tmp_path) == {"model/one": "old"}
+        assert names(tmp_path) == ["model"]
+
+    @pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
+    def test_the_old_folder_is_put_back_if_the_second_rename_fails(self, tmp_path, monkeypatch, error):
+        make_folder(tmp_path / "model", one="old")
+        break_renames_to(monkeypatch, tmp_path / "model", error)
+        with pytest.raises(type(error)), atomic_folder(tmp_path / "model") as temporary:
+            make_folder(temporary, one="new")
+        assert contents(tmp_path) == {"model/one": "old"}
+        assert names(tmp_path) == ["model"]
+
+    def test_the_old_folder_is_kept_aside_if_it_cannot_be_put_back(self, tmp_path, monkeypatch):
+        make_folder(tmp_path / "model", one="old")
+        rename = os.rename
+
+        def broken(source, to):
+            if str(to) == str(tmp_path / "model"):
+                raise OSError(errno.EIO, "the disk is gone")
+            rename(source, to)
+
+        monkeypatch.setattr(os, "rename", broken)
+        with pytest.raises(OSError, match="the disk is gone"), atomic_folder(tmp_path / "model") as temporary:
+            make_folder(temporary, one="new")
+        (kept,) = tmp_path.iterdir()
+        assert kept.suffix == ".old"
+        assert contents(kept) == {"one": "old"}
+
+    def test_without_overwrite_a_folder_that_appears_meanwhile_stays(self, tmp_path):
+        def two_processes() -> None:
+            with atomic_folder(tmp_path / "model", overwrite=False) as temporary:
+                make_folder(temporary, one="mine")
+                make_folder(tmp_path / "model", one="of another process")
+
+        with pytest.raises(OSError, match=r"model"):
+            two_processes()
+        assert contents(tmp_path) == {"model/one": "of another process"}
+        assert names(tmp_path) == ["model"]
+
+    def test_without_overwrite_an_empty_folder_is_filled(self, tmp_path):
+        (tmp_path / "model").mkdir()
+        with atomic_folder(tmp_path / "model", overwrite=False) as temporary:
+            make_folder(temporary, one="new")
+        assert contents(tmp_path) == {"model/one": "new"}
+
+    def test_a_file_is_not_replaced(self, tmp_path):
+        (tmp_path / "model").write_text("precious")
+        with pytest.raises(InvalidInput, match="it is a file"), atomic_folder(tmp_path / "model"):
+            pass
+        assert contents(tmp_path) == {"model": "precious"}
+
+    def test_all_contents_are_on_the_disk_before_the_rename(self, tmp_path, monkeypatch):
+        steps, rename, flush = [], os.rename, atomic_files._flush
+        monkeypatch.setattr(atomic_files, "_flush", lambda path: (steps.append(path.name), flush(path)))
+        monkeypatch.setattr(os, "rename", lambda one, other: (steps.append("rename"), rename(one, other)))
+        with atomic_folder(tmp_path / "model") as temporary:
+            make_folder(temporary, one="1")
+            make_folder(temporary / "inner", two="2")
+        assert sorted(steps[:-1]) == sorted(["one", "inner", "two", temporary.name])
+        assert steps[-1] == "rename"
+
+
+def test_a_killed_process_leaves_only_what_remove_leftovers_deletes(tmp_path):
+    make_folder(tmp_path / "model", one="old")
+    script = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from forcegp.atomic_files import atomic_file, atomic_folder\n"
+        "folder = Path(sys.argv[1])\n"
+        "with atomic_folder(folder / 'model') as model, atomic_file(folder / 'note.txt') as note:\n"
+        "    model.mkdir(); (model / 'one').write_text('ne'); note.write_text('ne')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], check=False)
+    assert done.returncode < 0
+    assert len(list(tmp_path.iterdir())) == 3
+    assert contents(tmp_path / "model") == {"one": "old"}
+    remove_leftovers(tmp_path)
+    assert names(tmp_path) == ["model"]
