@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 Numbers = tuple[float, ...]
 PER = ("_per_joint", "_per_contact")
+Mean = TypeVar("Mean", float, float | None)
+
+
+class _Mean(Generic[Mean]):
+    """An attribute that is the mean of the numbers in a field, 0 of none; None where the field is None."""
+
+    def __init__(self, field: str) -> None:
+        self.field = field
+
+    def __get__(self, owner: Any, kind: type | None = None) -> Mean:
+        values = None if owner is None else getattr(owner, self.field)
+        mean: Any = None if values is None else sum(values) / len(values) if values else 0.0
+        return mean
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,95 +79,24 @@ class Evaluation:
     multiplier_coverage_95_per_contact: Numbers | None = None
     warnings: tuple[str, ...] = ()
 
-    @property
-    def mae(self) -> float:
-        """Mean of `mae_per_joint`."""
-        return _mean(self.mae_per_joint)
-
-    @property
-    def rmse(self) -> float:
-        """Mean of `rmse_per_joint`."""
-        return _mean(self.rmse_per_joint)
-
-    @property
-    def coverage_95(self) -> float:
-        """Mean of `coverage_95_per_joint`."""
-        return _mean(self.coverage_95_per_joint)
-
-    @property
-    def noise_std(self) -> float:
-        """Mean of `noise_std_per_joint`."""
-        return _mean(self.noise_std_per_joint)
-
-    @property
-    def known_physics_mae(self) -> float:
-        """Mean of `known_physics_mae_per_joint`."""
-        return _mean(self.known_physics_mae_per_joint)
-
-    @property
-    def constraint_error(self) -> float:
-        """Mean of `constraint_error_per_contact`."""
-        return _mean(self.constraint_error_per_contact)
-
-    @property
-    def noise_floor(self) -> float | None:
-        """Mean of `noise_floor_per_joint`."""
-        return _optional_mean(self.noise_floor_per_joint)
-
-    @property
-    def mae_noise_free(self) -> float | None:
-        """Mean of `mae_noise_free_per_joint`."""
-        return _optional_mean(self.mae_noise_free_per_joint)
-
-    @property
-    def rmse_noise_free(self) -> float | None:
-        """Mean of `rmse_noise_free_per_joint`."""
-        return _optional_mean(self.rmse_noise_free_per_joint)
-
-    @property
-    def coverage_95_noise_free(self) -> float | None:
-        """Mean of `coverage_95_noise_free_per_joint`."""
-        return _optional_mean(self.coverage_95_noise_free_per_joint)
-
-    @property
-    def known_physics_mae_noise_free(self) -> float | None:
-        """Mean of `known_physics_mae_noise_free_per_joint`."""
-        return _optional_mean(self.known_physics_mae_noise_free_per_joint)
-
-    @property
-    def force_mae(self) -> float | None:
-        """Mean of `force_mae_per_joint`."""
-        return _optional_mean(self.force_mae_per_joint)
-
-    @property
-    def unknown_force_mae(self) -> float | None:
-        """Mean of `unknown_force_mae_per_joint`."""
-        return _optional_mean(self.unknown_force_mae_per_joint)
-
-    @property
-    def unknown_force_rmse(self) -> float | None:
-        """Mean of `unknown_force_rmse_per_joint`."""
-        return _optional_mean(self.unknown_force_rmse_per_joint)
-
-    @property
-    def unknown_force_coverage_95(self) -> float | None:
-        """Mean of `unknown_force_coverage_95_per_joint`."""
-        return _optional_mean(self.unknown_force_coverage_95_per_joint)
-
-    @property
-    def multiplier_mae(self) -> float | None:
-        """Mean of `multiplier_mae_per_contact`."""
-        return _optional_mean(self.multiplier_mae_per_contact)
-
-    @property
-    def multiplier_rmse(self) -> float | None:
-        """Mean of `multiplier_rmse_per_contact`."""
-        return _optional_mean(self.multiplier_rmse_per_contact)
-
-    @property
-    def multiplier_coverage_95(self) -> float | None:
-        """Mean of `multiplier_coverage_95_per_contact`."""
-        return _optional_mean(self.multiplier_coverage_95_per_contact)
+    mae = _Mean[float]("mae_per_joint")
+    rmse = _Mean[float]("rmse_per_joint")
+    coverage_95 = _Mean[float]("coverage_95_per_joint")
+    noise_std = _Mean[float]("noise_std_per_joint")
+    known_physics_mae = _Mean[float]("known_physics_mae_per_joint")
+    constraint_error = _Mean[float]("constraint_error_per_contact")
+    noise_floor = _Mean[float | None]("noise_floor_per_joint")
+    mae_noise_free = _Mean[float | None]("mae_noise_free_per_joint")
+    rmse_noise_free = _Mean[float | None]("rmse_noise_free_per_joint")
+    coverage_95_noise_free = _Mean[float | None]("coverage_95_noise_free_per_joint")
+    known_physics_mae_noise_free = _Mean[float | None]("known_physics_mae_noise_free_per_joint")
+    force_mae = _Mean[float | None]("force_mae_per_joint")
+    unknown_force_mae = _Mean[float | None]("unknown_force_mae_per_joint")
+    unknown_force_rmse = _Mean[float | None]("unknown_force_rmse_per_joint")
+    unknown_force_coverage_95 = _Mean[float | None]("unknown_force_coverage_95_per_joint")
+    multiplier_mae = _Mean[float | None]("multiplier_mae_per_contact")
+    multiplier_rmse = _Mean[float | None]("multiplier_rmse_per_contact")
+    multiplier_coverage_95 = _Mean[float | None]("multiplier_coverage_95_per_contact")
 
     def to_dict(self) -> dict[str, Any]:
         """Every score, and every mean before what it is the mean of, as plain JSON values."""
@@ -166,14 +108,6 @@ class Evaluation:
             out.setdefault(score, _plain(getattr(self, score)))
             out[field.name] = _plain(getattr(self, field.name))
         return out
-
-
-def _mean(values: Numbers) -> float:
-    return sum(values) / len(values) if values else 0.0
-
-
-def _optional_mean(values: Numbers | None) -> float | None:
-    return None if values is None else _mean(values)
 
 
 def _plain(value: Any) -> Any:

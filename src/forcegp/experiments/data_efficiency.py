@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.plots.style import QUIET, SERIES, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
 from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments import published
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
@@ -64,8 +64,7 @@ class DataEfficiency(ForceExperiment):
         for axes in panels:
             plain_ticks(axes.xaxis)
             plain_ticks(axes.yaxis)
-        handles = panels[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=SMALL, frameon=False)
+        legend_below(figure, panels[0], columns=2)
         return {"data-efficiency": figure}
 
     @override

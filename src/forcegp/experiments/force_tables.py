@@ -31,11 +31,7 @@ def score_table(trials: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> 
     """One row per trial and test, medians and ranges over seeds."""
     head = ["model", "points", *(COLUMNS[name][0] for name in columns)]
     rows = [
-        [
-            trial["label"],
-            str(trial["points"]),
-            *(formatted(scores.get(name), COLUMNS[name][1]) for name in columns),
-        ]
+        [trial["label"], str(trial["points"]), *(formatted(scores.get(name), COLUMNS[name][1]) for name in columns)]
         for trial in trials
         for scores in trial["tests"].values()
     ]

@@ -11,23 +11,8 @@ from matplotlib.figure import Figure
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
 from forcegp.data import Dataset, Preparation, motion_spectrum
-from forcegp.evaluation.plots.prediction import legend_entries
+from forcegp.evaluation.plots import style
 from forcegp.evaluation.plots.spectrum import draw_cutoff, draw_time_steps
-from forcegp.evaluation.plots.style import (
-    KNOWN_PHYSICS,
-    LARGE,
-    MEASUREMENT,
-    NORMAL,
-    PREDICTION,
-    SERIES,
-    SMALL,
-    TRUTH,
-    joint_units,
-    new_figure,
-    quiet,
-    short_joint_names,
-    window,
-)
 
 COLUMNS = 3
 SECONDS = 5.0
@@ -43,11 +28,11 @@ def check_figure(report: CheckReport) -> Figure:
     nv = inputs.log.nv
     columns = min(nv, COLUMNS if nv != 4 else 2)
     grid = -(-nv // columns)
-    figure = new_figure(10.0, 1.75 * grid + 3.4)
+    figure = style.new_figure(10.0, 1.75 * grid + 3.4)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7))
     panels = halves[0].subplots(grid, columns, sharex=True, squeeze=False)
-    names = short_joint_names(inputs.names)
-    shown = window(inputs.log if inputs.compared is None else inputs.compared, 0.0, SECONDS)
+    names = style.short_joint_names(inputs.names)
+    shown = style.window(inputs.log if inputs.compared is None else inputs.compared, 0.0, SECONDS)
     shown = shown.rows(slice(None, None, max(1, len(shown) // MOST_ROWS)))
     drawn = [_draw_joint(panel, report, shown, joint) for joint, panel in zip(range(nv), panels.flat, strict=False)]
     for joint, panel in enumerate(panels.flat):
@@ -56,24 +41,12 @@ def check_figure(report: CheckReport) -> Figure:
             continue
         bottom = joint + columns >= nv
         panel.tick_params(labelbottom=bottom)
-        quiet(panel, title=_title(names[joint], report, joint), y=drawn[joint], x="time in s" if bottom else "")
-    handles, labels = legend_entries(*panels.flat[:nv])
-    halves[0].legend(
-        handles,
-        labels,
-        loc="outside upper left",
-        ncols=max(1, len(labels)),
-        fontsize=NORMAL,
-        frameon=False,
-        markerscale=4,
-        title=_heading(report),
-        title_fontproperties={"size": LARGE, "weight": "bold"},
-        alignment="left",
-    )
+        style.quiet(panel, title=_title(names[joint], report, joint), y=drawn[joint], x="time in s" if bottom else "")
+    style.legend_above(halves[0], _heading(report), *panels.flat[:nv], markerscale=4)
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]
     _draw_spectra(left, report, names)
     draw_time_steps(right, inputs.log)
-    quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
+    style.quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
     return figure
 
 
@@ -82,24 +55,23 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     axes.margins(x=0)
     log = report.comparison
     if log is None:
-        axes.plot(shown.time, shown.q[:, joint], color=TRUTH, linewidth=1.0, label="position")
-        return joint_units(shown, "q")[joint]
+        axes.plot(shown.time, shown.q[:, joint], color=style.TRUTH, linewidth=1.0, label="position")
+        return style.joint_units(shown, "q")[joint]
     rows = log.correction.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
     measured, fitted = rows.u[:, joint], log.fit.at(tau, rows)[:, joint]
     mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
     if mended:
-        axes.plot(rows.time, shown.u[:, joint], color=KNOWN_PHYSICS, linewidth=0.9, label="before the correction")
-    axes.plot(rows.time, measured, color=MEASUREMENT, linewidth=2.2, label="measured, filtered")
-    axes.plot(rows.time, tau[:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics")
-    style = (0, (4, 1.5))
+        axes.plot(rows.time, shown.u[:, joint], color=style.KNOWN_PHYSICS, linewidth=0.9, label="before the correction")
+    axes.plot(rows.time, measured, color=style.MEASUREMENT, linewidth=2.2, label="measured, filtered")
+    axes.plot(rows.time, tau[:, joint], color=style.TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics")
     label = "with factor, armature, friction"
-    axes.plot(rows.time, fitted, color=PREDICTION, linewidth=1.1, linestyle=style, label=label)
+    axes.plot(rows.time, fitted, color=style.PREDICTION, linewidth=1.1, linestyle=style.DASHED, label=label)
     drawn = [measured, fitted, *([shown.u[:, joint]] if mended else [])]
     low, high = min(values.min() for values in drawn), max(values.max() for values in drawn)
     space = 0.3 * max(float(high - low), 1e-9)
     axes.set_ylim(low - space, high + space)  # inverse dynamics alone may be far off: for example with a wrong unit
-    return joint_units(shown, "u")[joint]
+    return style.joint_units(shown, "u")[joint]
 
 
 def _heading(report: CheckReport) -> str:
@@ -122,15 +94,15 @@ def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     spectrum = motion_spectrum(inputs.even)
     for joint, name in enumerate(names):
         power = np.maximum(spectrum.acceleration_density[:, joint], 1e-300)
-        axes.loglog(spectrum.frequency, power, color=SERIES[joint % len(SERIES)], linewidth=0.9, label=name)
+        axes.loglog(spectrum.frequency, power, color=style.SERIES[joint % len(style.SERIES)], linewidth=0.9, label=name)
     shown = spectrum.acceleration_density[spectrum.acceleration_density > 0.0]
     if len(shown):
         axes.set_ylim(max(0.3 * float(shown.min()), 1e-12 * float(shown.max())), 5.0 * float(shown.max()))
     preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
     title = "Acceleration as logged: no filter"
     if preparation.cutoff is not None:
-        draw_cutoff(axes, float(preparation.cutoff), TRUTH)
+        draw_cutoff(axes, float(preparation.cutoff), style.TRUTH)
         title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
     axes.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
-    axes.legend(fontsize=SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
-    quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")
+    axes.legend(fontsize=style.SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
+    style.quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

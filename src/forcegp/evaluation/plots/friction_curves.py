@@ -16,16 +16,7 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.evaluation.force_errors import true_names
-from forcegp.evaluation.plots.prediction import legend_entries
-from forcegp.evaluation.plots.style import (
-    LARGE,
-    NORMAL,
-    PREDICTION,
-    TRUTH,
-    new_figure,
-    quiet,
-    short_joint_names,
-)
+from forcegp.evaluation.plots import style
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
@@ -92,7 +83,7 @@ def friction_curves_figure(
     chosen = panels[:LARGEST_GRID] if latents is None else [_panel(panels, name) for name in latents]
     columns = min(4 if len(chosen) > 6 else 3, len(chosen))
     rows = math.ceil(len(chosen) / columns)
-    figure = new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
+    figure = style.new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     titles = _titles(chosen, posterior)
     truth = {} if dataset is None else _truth(posterior, dataset, chosen)
@@ -100,29 +91,14 @@ def friction_curves_figure(
         curve = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
         what = {"Nm": "torque in Nm", "": "force / normal force"}.get(curve.unit, f"force in {curve.unit}")
         what = f"resisting {what}" if panel.resisting < 0 else what
-        quiet(axes, title=titles[number], x=_label(curve.feature_names[panel.feature]), y=what)
+        style.quiet(axes, title=titles[number], x=_label(curve.feature_names[panel.feature]), y=what)
     for axes in grid[len(chosen) :]:
         axes.set_visible(False)
-    handles, labels = legend_entries(*grid[: len(chosen)])
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncols=min(len(labels), 5 if columns > 2 else 3),
-        fontsize=NORMAL,
-        frameon=False,
-        markerscale=2,
-    )
+    below = {"columns": 5 if columns > 2 else 3, "size": style.NORMAL, "markerscale": 2}
+    style.legend_below(figure, *grid[: len(chosen)], **below)
     what = "Friction" if all("friction" in panel.component for panel in chosen) else "Forces"
-    left_out = len(panels) - len(chosen)
-    figure.suptitle(
-        f"{what} learned from {len(posterior.training)} points"
-        + (f" ({len(chosen)} of {len(panels)} curves)" if left_out else ""),
-        fontsize=LARGE,
-        fontweight="bold",
-        x=0.01,
-        ha="left",
-    )
+    shown = f" ({len(chosen)} of {len(panels)} curves)" if len(chosen) < len(panels) else ""
+    style.heading(figure, f"{what} learned from {len(posterior.training)} points{shown}")
     return figure
 
 
@@ -145,7 +121,7 @@ def _panel(panels: Sequence[CurvePanel], name: str) -> CurvePanel:
 def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:
     """What every panel shows: the component where there are several, and the joint or axis."""
     robot = posterior.model.system.robot
-    short = dict(zip(robot.joint_names, short_joint_names(robot.joint_names), strict=True))
+    short = dict(zip(robot.joint_names, style.short_joint_names(robot.joint_names), strict=True))
     several = len({panel.component for panel in panels}) > 1
     titles = []
     for panel in panels:
@@ -181,26 +157,23 @@ def _draw_curve(
     axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
     if start < 0.0:
         axes.axvline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
-    axes.plot(at[inside], mean[inside], color=PREDICTION, linewidth=1.5, label="learned")
-    axes.fill_between(
-        at,
-        mean - spread,
-        mean + spread,
-        where=inside.tolist(),
-        color=PREDICTION,
-        alpha=0.28,
-        linewidth=0,
-        label="95 % band",
-    )
-    axes.fill_between(at, mean - spread, mean + spread, color=PREDICTION, alpha=0.12, linewidth=0)
+    axes.plot(at[inside], mean[inside], color=style.PREDICTION, linewidth=1.5, label="learned")
+    style.draw_band(axes, at, mean, spread, alpha=0.28, where=inside.tolist(), label="95 % band")
+    style.draw_band(axes, at, mean, spread, alpha=0.12)
     axes.plot(
-        at, mean, color=PREDICTION, linewidth=1.2, linestyle=(0, (3, 2)), label="beyond the training data", zorder=1.9
+        at,
+        mean,
+        color=style.PREDICTION,
+        linewidth=1.2,
+        linestyle=(0, (3, 2)),
+        label="beyond the training data",
+        zorder=1.9,
     )
     axes.plot(
         visited,
         np.full(len(visited), 0.025),
         "|",
-        color=TRUTH,
+        color=style.TRUTH,
         markersize=5,
         markeredgewidth=0.6,
         alpha=0.5,

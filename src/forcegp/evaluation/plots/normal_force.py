@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -10,18 +12,7 @@ from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.plots.prediction import legend_entries
-from forcegp.evaluation.plots.style import (
-    KNOWN_PHYSICS,
-    LARGE,
-    NORMAL,
-    PREDICTION,
-    SMALL,
-    TRUTH,
-    new_figure,
-    quiet,
-    window,
-)
+from forcegp.evaluation.plots import style
 from forcegp.models.protocol import Posterior
 
 QUANTILE = 1.959963984540054
@@ -41,13 +32,13 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     """
     if not posterior.system.contacts or not posterior.predicts_forces:
         raise InvalidInput(
-            f"a model of {posterior.description} has no normal force to show; give one with contacts that speaks of "
+            f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
             "forces."
         )
-    rows = window(dataset, start, seconds)
+    rows = style.window(dataset, start, seconds)
     contacts = len(posterior.system.contacts)
     known = "lambda" in dataset.truth and dataset.truth["lambda"].shape[1] == contacts
-    figure = new_figure(11.0 if known else 8.0, 1.2 + 2.4 * contacts)
+    figure = style.new_figure(11.0 if known else 8.0, 1.2 + 2.4 * contacts)
     grid = figure.subplots(contacts, 2 if known else 1, squeeze=False, width_ratios=(2.4, 1.0) if known else None)
     forces = _normal_forces(posterior, rows)
     every = None
@@ -58,33 +49,23 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         name = f"{type(contact.surface).__name__.lower()} at {contact.frame}"
         title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
         _draw_force(grid[index, 0], rows, forces, index, known)
-        quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
+        style.quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
         if every is not None:
             _draw_errors(grid[index, 1], every, index)
-            quiet(grid[index, 1], title=_summary(every, index), x="error / standard deviation", y="density")
-    handles, labels = legend_entries(*grid.ravel())
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=NORMAL, frameon=False)
-    figure.suptitle(
-        f"Normal force after {len(posterior.training)} training points",
-        fontsize=LARGE,
-        fontweight="bold",
-        x=0.01,
-        ha="left",
-    )
+            style.quiet(grid[index, 1], title=_summary(every, index), x="error / standard deviation", y="density")
+    style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
+    style.heading(figure, f"Normal force after {len(posterior.training)} training points")
     return figure
 
 
+@dataclass(frozen=True, eq=False)
 class _Forces:
     """Normal forces (rows, m) in N: prediction, its standard deviation, the known forces alone, and the truth."""
 
-    def __init__(
-        self,
-        mean: Float[np.ndarray, "rows m"],
-        std: Float[np.ndarray, "rows m"],
-        nominal: Float[np.ndarray, "rows m"],
-        truth: Float[np.ndarray, "rows m"] | None,
-    ) -> None:
-        self.mean, self.std, self.nominal, self.truth = mean, std, nominal, truth
+    mean: Float[np.ndarray, "rows m"]
+    std: Float[np.ndarray, "rows m"]
+    nominal: Float[np.ndarray, "rows m"]
+    truth: Float[np.ndarray, "rows m"] | None
 
 
 def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
@@ -105,11 +86,11 @@ def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
 
 def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: bool) -> None:
     time, mean, spread = rows.time, forces.mean[:, index], QUANTILE * forces.std[:, index]
-    axes.plot(time, forces.nominal[:, index], color=KNOWN_PHYSICS, linewidth=1.1, label="known physics alone")
+    axes.plot(time, forces.nominal[:, index], color=style.KNOWN_PHYSICS, linewidth=1.1, label="known physics alone")
     if known and forces.truth is not None:
-        axes.plot(time, forces.truth[:, index], color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
-    axes.fill_between(time, mean - spread, mean + spread, color=PREDICTION, alpha=0.3, linewidth=0, label="95 % band")
-    axes.plot(time, mean, color=PREDICTION, linewidth=1.3, label="predicted")
+        axes.plot(time, forces.truth[:, index], color=style.TRUTH, linewidth=3.5, alpha=0.3, label="true")
+    style.draw_band(axes, time, mean, spread, alpha=0.3, label="95 % band")
+    axes.plot(time, mean, color=style.PREDICTION, linewidth=1.3, label="predicted")
     axes.margins(x=0)
 
 
@@ -119,9 +100,11 @@ def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
     bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
     # half a bin inside of the ends, so that the errors beyond them are seen
     kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
-    axes.hist(kept, bins=list(bins), density=True, color=PREDICTION, alpha=0.45, linewidth=0)
+    axes.hist(kept, bins=list(bins), density=True, color=style.PREDICTION, alpha=0.45, linewidth=0)
     at = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 201)
-    axes.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=TRUTH, linewidth=1.0, label="standard normal")
+    axes.plot(
+        at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=style.TRUTH, linewidth=1.0, label="standard normal"
+    )
     axes.set_xlim(-LARGEST_ERROR, LARGEST_ERROR)
     inside = float((np.abs(errors) <= QUANTILE).mean())
     axes.annotate(
@@ -130,8 +113,8 @@ def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
         xycoords="axes fraction",
         ha="right",
         va="top",
-        fontsize=SMALL,
-        color=TRUTH,
+        fontsize=style.SMALL,
+        color=style.TRUTH,
     )
 
 

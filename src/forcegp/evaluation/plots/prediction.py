@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
-from forcegp.evaluation.plots.style import (
-    LARGE,
-    MEASUREMENT,
-    NORMAL,
-    PREDICTION,
-    TRUTH,
-    joint_units,
-    new_figure,
-    quiet,
-    short_joint_names,
-    window,
-)
+from forcegp.evaluation.plots import style
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models.protocol import Posterior
 
@@ -29,45 +17,34 @@ def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 
 
     The dark band is 2 sigma of the acceleration, the light one adds the measurement noise.
     """
-    rows = window(dataset, start, seconds)
+    rows = style.window(dataset, start, seconds)
     predicted = predict_rows(posterior, rows)
-    figure = new_figure(11.0, 1.0 + 1.35 * rows.nv)
+    figure = style.new_figure(11.0, 1.0 + 1.35 * rows.nv)
     axes = figure.subplots(rows.nv, 2, sharex=True, squeeze=False, width_ratios=(1.25, 1.0))
-    names, units = short_joint_names(rows.joint_names), joint_units(rows, "a")
+    names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "a")
     for joint in range(rows.nv):
         draw_acceleration(axes[joint, 0], rows, predicted, joint)
         draw_error(axes[joint, 1], rows, predicted, joint)
-        quiet(axes[joint, 0], y=f"{names[joint]}\n{units[joint]}")
-        quiet(axes[joint, 1], y=units[joint])
+        style.quiet(axes[joint, 0], y=f"{names[joint]}\n{units[joint]}")
+        style.quiet(axes[joint, 1], y=units[joint])
     for column, title in enumerate(("Acceleration", "Error: prediction minus measurement (dots) or truth (line)")):
-        axes[0, column].set_title(title, fontsize=NORMAL, loc="left")
-        axes[-1, column].set_xlabel("time in s", fontsize=NORMAL)
+        axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
+        axes[-1, column].set_xlabel("time in s", fontsize=style.NORMAL)
     figure.align_ylabels(axes[:, 0])
     figure.align_ylabels(axes[:, 1])
-    handles, labels = legend_entries(axes[0, 0], axes[0, 1])
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper left",
-        ncols=len(labels),
-        fontsize=NORMAL,
-        frameon=False,
-        markerscale=4,
-        title=f"Prediction after {len(posterior.training)} training points",
-        title_fontproperties={"size": LARGE, "weight": "bold"},
-        alignment="left",
-    )
+    title = f"Prediction after {len(posterior.training)} training points"
+    style.legend_above(figure, title, axes[0, 0], axes[0, 1], markerscale=4)
     return figure
 
 
 def draw_acceleration(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) -> None:
     """Measurement, band, truth and mean of one joint over time."""
     time, mean, spread = rows.time, predicted.mean[:, joint], 2.0 * predicted.std[:, joint]
-    axes.plot(time, rows.a[:, joint], ".", color=MEASUREMENT, markersize=1.8, alpha=0.7, label="measured")
-    axes.fill_between(time, mean - spread, mean + spread, color=PREDICTION, alpha=0.35, linewidth=0, label="2σ")
+    axes.plot(time, rows.a[:, joint], ".", color=style.MEASUREMENT, markersize=1.8, alpha=0.7, label="measured")
+    style.draw_band(axes, time, mean, spread, alpha=0.35, label="2σ")
     if "a" in rows.truth:
-        axes.plot(time, rows.truth["a"][:, joint], color=TRUTH, linewidth=1.0, label="true")
-    axes.plot(time, mean, color=PREDICTION, linewidth=1.3, linestyle=(0, (4, 1.5)), label="predicted")
+        axes.plot(time, rows.truth["a"][:, joint], color=style.TRUTH, linewidth=1.0, label="true")
+    axes.plot(time, mean, color=style.PREDICTION, linewidth=1.3, linestyle=style.DASHED, label="predicted")
     axes.margins(x=0)
 
 
@@ -75,25 +52,13 @@ def draw_error(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) 
     """Errors of one joint over time, about the bands of 2 sigma without and with measurement noise."""
     time, mean = rows.time, predicted.mean[:, joint]
     inner, outer = 2.0 * predicted.std[:, joint], 2.0 * predicted.measurement_std[:, joint]
-    axes.fill_between(time, -outer, outer, color=PREDICTION, alpha=0.13, linewidth=0, label="2σ of a measurement")
-    axes.fill_between(time, -inner, inner, color=PREDICTION, alpha=0.35, linewidth=0)
-    axes.plot(time, mean - rows.a[:, joint], ".", color=MEASUREMENT, markersize=1.8, alpha=0.7)
+    style.draw_band(axes, time, np.zeros_like(mean), outer, alpha=0.13, label="2σ of a measurement")
+    style.draw_band(axes, time, np.zeros_like(mean), inner, alpha=0.35)
+    axes.plot(time, mean - rows.a[:, joint], ".", color=style.MEASUREMENT, markersize=1.8, alpha=0.7)
     if "a" in rows.truth:
-        axes.plot(time, mean - rows.truth["a"][:, joint], color=TRUTH, linewidth=1.0)
-    axes.axhline(0.0, color=PREDICTION, linewidth=0.8, linestyle=(0, (4, 1.5)))
+        axes.plot(time, mean - rows.truth["a"][:, joint], color=style.TRUTH, linewidth=1.0)
+    axes.axhline(0.0, color=style.PREDICTION, linewidth=0.8, linestyle=style.DASHED)
     axes.margins(x=0)
     limit = 2.0 * float(np.median(outer))
     if np.abs(mean - rows.a[:, joint]).max() < 1.5 * limit:  # equal scales where the model is right
         axes.set_ylim(-limit, limit)
-
-
-def legend_entries(*axes: Axes) -> tuple[list[Artist], list[str]]:
-    """Handles and labels of several axes, each label once."""
-    handles: list[Artist] = []
-    labels: list[str] = []
-    for source in axes:
-        for handle, label in zip(*source.get_legend_handles_labels(), strict=True):
-            if label not in labels:
-                handles.append(handle)
-                labels.append(label)
-    return handles, labels

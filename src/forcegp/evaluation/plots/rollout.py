@@ -10,17 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
-from forcegp.evaluation.plots.style import (
-    LARGE,
-    NORMAL,
-    PREDICTION,
-    SMALL,
-    TRUTH,
-    joint_units,
-    new_figure,
-    quiet,
-    short_joint_names,
-)
+from forcegp.evaluation.plots import style
 from forcegp.evaluation.recorded_segments import RecordedMotions
 from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors
 from forcegp.models.rollout import Rollout
@@ -36,51 +26,31 @@ def rollout_figure(
     """The first motion joint by joint, with the 95 % interval of the samples; below, the errors of all motions."""
     nv = rollout.q.shape[-1]
     grid_rows = -(-nv // COLUMNS)
-    figure = new_figure(11.0, 1.9 * grid_rows + 3.9)
+    figure = style.new_figure(11.0, 1.9 * grid_rows + 3.9)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.9 * grid_rows + 0.6, 3.3))
     above, below = halves
     axes: np.ndarray = above.subplots(grid_rows, COLUMNS, sharex=True, squeeze=False)
-    names, units = short_joint_names(dataset.joint_names), joint_units(dataset, "q")
-    band, count = None, 0
+    names, units = style.short_joint_names(dataset.joint_names), style.joint_units(dataset, "q")
+    mean = rollout.q[0].cpu().numpy()
+    band, label = None, ""
     if rollout.samples is not None:
-        band, count = rollout.quantiles(INTERVAL, "q").cpu().numpy()[:, 0], len(rollout.samples.q)
+        band = rollout.quantiles(INTERVAL, "q").cpu().numpy()[:, 0]
+        label = f"95 % of {len(rollout.samples.q)} samples"
     for joint, panel in enumerate(axes.flat):
         if joint >= nv:
             panel.set_visible(False)
             continue
         if band is not None:
-            panel.fill_between(
-                errors.time,
-                band[0, :, joint],
-                band[1, :, joint],
-                color=PREDICTION,
-                alpha=0.25,
-                linewidth=0,
-                label=f"95 % of {count} samples",
-            )
-        panel.plot(errors.time, recorded.q[0, :, joint], color=TRUTH, linewidth=1.4, label="recorded")
-        panel.plot(
-            errors.time,
-            rollout.q[0, :, joint].cpu().numpy(),
-            color=PREDICTION,
-            linewidth=1.4,
-            linestyle=(0, (4, 1.5)),
-            label="rollout of the mean",
-        )
+            low, high = band[..., joint]
+            panel.fill_between(errors.time, low, high, color=style.PREDICTION, alpha=0.25, linewidth=0, label=label)
+        panel.plot(errors.time, recorded.q[0, :, joint], color=style.TRUTH, linewidth=1.4, label="recorded")
+        dashed = {"linewidth": 1.4, "linestyle": style.DASHED, "label": "rollout of the mean"}
+        panel.plot(errors.time, mean[:, joint], color=style.PREDICTION, **dashed)
         panel.margins(x=0)
         last_of_column = joint + COLUMNS >= nv
         panel.tick_params(labelbottom=last_of_column)
-        quiet(panel, title=names[joint], y=units[joint], x="time in s" if last_of_column else "")
-    above.legend(
-        *axes[0, 0].get_legend_handles_labels(),
-        loc="outside upper left",
-        ncols=3,
-        fontsize=NORMAL,
-        frameon=False,
-        title=f"{title}; from row {recorded.rows[0]}",
-        title_fontproperties={"size": LARGE, "weight": "bold"},
-        alignment="left",
-    )
+        style.quiet(panel, title=names[joint], y=units[joint], x="time in s" if last_of_column else "")
+    style.legend_above(above, f"{title}; from row {recorded.rows[0]}", axes[0, 0])
     panels = [(_draw_joint_error, True), (_draw_tool, errors.tool is not None)]
     panels.append((_draw_constraint, errors.constraint is not None))
     drawn = [draw for draw, shown in panels if shown]
@@ -96,7 +66,12 @@ def _draw_joint_error(axes: Axes, rollout: Rollout, errors: RolloutErrors) -> No
     if errors.spread is not None:
         expected = _median(errors.spread.max(-1))
         axes.plot(
-            errors.time[1:], expected[1:], color=TRUTH, linewidth=1.2, linestyle=":", label="half the 95 % interval"
+            errors.time[1:],
+            expected[1:],
+            color=style.TRUTH,
+            linewidth=1.2,
+            linestyle=":",
+            label="half the 95 % interval",
         )
     _finish(axes, f"Largest joint error, {_of(errors)}", "")
 
@@ -116,11 +91,13 @@ def _draw_constraint(axes: Axes, rollout: Rollout, errors: RolloutErrors) -> Non
         if len(lasting):
             low, high = np.maximum(np.quantile(lasting, INTERVAL, axis=0), SMALLEST_SHOWN)
             axes.fill_between(
-                errors.time, low, high, color=PREDICTION, alpha=0.13, linewidth=0, label="95 % of samples"
+                errors.time, low, high, color=style.PREDICTION, alpha=0.13, linewidth=0, label="95 % of samples"
             )
     _draw_all(axes, errors.time, np.maximum(errors.constraint, SMALLEST_SHOWN), first=0)
     recorded = np.maximum(np.median(errors.recorded_constraint, axis=0), SMALLEST_SHOWN)
-    axes.plot(errors.time, recorded, color=TRUTH, linewidth=1.2, linestyle=(0, (1, 1.5)), label="recorded, median")
+    axes.plot(
+        errors.time, recorded, color=style.TRUTH, linewidth=1.2, linestyle=(0, (1, 1.5)), label="recorded, median"
+    )
     _finish(axes, "Distance of the tool from the surface |c|", "m")
     shown = np.fmin(recorded, np.where(np.isfinite(errors.constraint), errors.constraint, np.inf).max(0))
     axes.set_ylim(bottom=max(SMALLEST_SHOWN, 1e-2 * float(shown.min())))  # where c changes sign, |c| falls without end
@@ -131,10 +108,10 @@ def _draw_all(
 ) -> None:
     """Thin lines for all motions and a thick one for their median, where any is left; row 0 of an error is 0."""
     if len(values) > 1:
-        axes.plot(time[first:], values[:, first:].T, color=PREDICTION, linewidth=0.6, alpha=0.35)
+        axes.plot(time[first:], values[:, first:].T, color=style.PREDICTION, linewidth=0.6, alpha=0.35)
     median = _median(values)
     label = "median" if len(values) > 1 else "rollout"
-    axes.plot(time[first:], median[first:], color=PREDICTION, linewidth=1.8, label=label)
+    axes.plot(time[first:], median[first:], color=style.PREDICTION, linewidth=1.8, label=label)
 
 
 def _median(values: Float[np.ndarray, "motions rows"]) -> Float[np.ndarray, " rows"]:
@@ -148,8 +125,8 @@ def _median(values: Float[np.ndarray, "motions rows"]) -> Float[np.ndarray, " ro
 def _finish(axes: Axes, title: str, unit: str) -> None:
     axes.set_yscale("log")
     axes.margins(x=0)
-    quiet(axes, title=title, x="time in s", y=unit)
-    axes.legend(fontsize=SMALL, frameon=False, loc="lower right")
+    style.quiet(axes, title=title, x="time in s", y=unit)
+    axes.legend(fontsize=style.SMALL, frameon=False, loc="lower right")
 
 
 def _of(errors: RolloutErrors) -> str:

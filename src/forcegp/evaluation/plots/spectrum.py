@@ -17,18 +17,7 @@ from forcegp.data import (
     motion_spectrum,
     power_density,
 )
-from forcegp.evaluation.plots.style import (
-    KNOWN_PHYSICS,
-    LARGE,
-    MEASUREMENT,
-    NORMAL,
-    PREDICTION,
-    SMALL,
-    joint_units,
-    new_figure,
-    quiet,
-    short_joint_names,
-)
+from forcegp.evaluation.plots import style
 
 DECADES = 12.0
 """Most that an axis of powers shows below its top."""
@@ -41,62 +30,53 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
     """
     spectrum = motion_spectrum(dataset, preparation.differentiate)
     frequency, torque, _, step = power_density(dataset, dataset.u)
-    figure = new_figure(9.0, 1.3 + 1.6 * dataset.nv)
+    figure = style.new_figure(9.0, 1.3 + 1.6 * dataset.nv)
     axes: Any = figure.subplots(dataset.nv, 2, sharex=True, squeeze=False)
-    names = short_joint_names(dataset.joint_names)
-    units = {name: joint_units(dataset, name) for name in ("a", "u")}
+    names = style.short_joint_names(dataset.joint_names)
+    units = {name: style.joint_units(dataset, name) for name in ("a", "u")}
     for joint in range(dataset.nv):
         panel = axes[joint, 0]
         draw_acceleration_spectrum(panel, spectrum, joint, preparation)
-        quiet(panel, y=f"{names[joint]}\n({units['a'][joint]})² / Hz")
+        style.quiet(panel, y=f"{names[joint]}\n({units['a'][joint]})² / Hz")
         panel = axes[joint, 1]
-        _draw(panel, frequency, torque[:, joint], MEASUREMENT, "as logged")
+        _draw(panel, frequency, torque[:, joint], style.MEASUREMENT, "as logged")
         if preparation.cutoff is not None:
             gain = low_pass_gain(frequency, 1.0 / step, float(preparation.cutoff), preparation.order)
-            _draw(panel, frequency, torque[:, joint] * gain**2, PREDICTION, "after the filter")
+            _draw(panel, frequency, torque[:, joint] * gain**2, style.PREDICTION, "after the filter")
             draw_cutoff(panel, float(preparation.cutoff))
         _limits(panel, torque[:, joint])
-        quiet(panel, y=f"({units['u'][joint]})² / Hz")
+        style.quiet(panel, y=f"({units['u'][joint]})² / Hz")
     for column, title in enumerate(("Acceleration (positions differentiated)", "Torque")):
-        axes[0, column].set_title(title, fontsize=NORMAL, loc="left")
-        axes[-1, column].set_xlabel("frequency in Hz", fontsize=NORMAL)
+        axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
+        axes[-1, column].set_xlabel("frequency in Hz", fontsize=style.NORMAL)
     figure.align_ylabels(axes[:, 0])
     title = "Power spectra"
     if preparation.cutoff is not None:
         title += f" and the filter at {float(preparation.cutoff):.3g} Hz"
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper left",
-        ncols=len(labels),
-        fontsize=NORMAL,
-        frameon=False,
-        title=title,
-        title_fontproperties={"size": LARGE, "weight": "bold"},
-        alignment="left",
-    )
+    style.legend_above(figure, title, axes[0, 0])
     return figure
 
 
 def draw_acceleration_spectrum(axes: Axes, spectrum: MotionSpectrum, joint: int, preparation: Preparation) -> None:
     """The acceleration of one joint, its noise floor, and what the filter leaves."""
     power = spectrum.acceleration_density[:, joint]
-    _draw(axes, spectrum.frequency, power, MEASUREMENT, "as logged")
+    _draw(axes, spectrum.frequency, power, style.MEASUREMENT, "as logged")
     if np.isfinite(spectrum.floor[joint]):
         order = 4 if spectrum.source == "q" else 2
         floor = spectrum.floor[joint] * (2.0 * np.pi * spectrum.frequency) ** order
-        axes.plot(spectrum.frequency, floor, color=KNOWN_PHYSICS, linewidth=1.0, linestyle=":", label="noise floor")
+        axes.plot(
+            spectrum.frequency, floor, color=style.KNOWN_PHYSICS, linewidth=1.0, linestyle=":", label="noise floor"
+        )
     if preparation.cutoff is not None:
         gain = low_pass_gain(spectrum.frequency, 1.0 / spectrum.step, float(preparation.cutoff), preparation.order)
-        _draw(axes, spectrum.frequency, power * gain**2, PREDICTION, "after the filter")
+        _draw(axes, spectrum.frequency, power * gain**2, style.PREDICTION, "after the filter")
         draw_cutoff(axes, float(preparation.cutoff))
     _limits(axes, power)
 
 
-def draw_cutoff(axes: Axes, cutoff: float, color: str = PREDICTION) -> None:
+def draw_cutoff(axes: Axes, cutoff: float, color: str = style.PREDICTION) -> None:
     """A vertical line at the cut-off [Hz]."""
-    axes.axvline(cutoff, color=color, linewidth=1.0, linestyle=(0, (4, 1.5)), label="cut-off")
+    axes.axvline(cutoff, color=color, linewidth=1.0, linestyle=style.DASHED, label="cut-off")
 
 
 def _draw(axes: Axes, frequency: np.ndarray, power: np.ndarray, color: str, label: str) -> None:
@@ -119,14 +99,14 @@ def draw_time_steps(axes: Axes, dataset: Dataset) -> None:
     for _, rows, _ in episodes_in_order(dataset):
         time = rows.time - rows.time[0]
         own = 1e3 * np.diff(time)
-        axes.plot(elapsed + time[1:], own, ".", color=MEASUREMENT, markersize=1.5, rasterized=True)
+        axes.plot(elapsed + time[1:], own, ".", color=style.MEASUREMENT, markersize=1.5, rasterized=True)
         elapsed += float(time[-1])
         steps += own.tolist()
     if not steps:
         return
     median = float(np.median(steps))
     label = f"median {median:.4g} ms"
-    axes.axhline(median, color=PREDICTION, linewidth=1.0, linestyle=(0, (4, 1.5)), label=label)
+    axes.axhline(median, color=style.PREDICTION, linewidth=1.0, linestyle=style.DASHED, label=label)
     axes.set_ylim(0.0, 1.15 * max(steps))
     axes.margins(x=0)
-    axes.legend(fontsize=SMALL, frameon=False, loc="upper right")
+    axes.legend(fontsize=style.SMALL, frameon=False, loc="upper right")

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from PIL import Image
 
 from forcegp.atomic_files import atomic_file
@@ -25,6 +27,7 @@ MEASUREMENT = "#9A9A9A"
 QUIET = "#5F6670"
 SERIES = (PREDICTION, KNOWN_PHYSICS, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", TRUTH)
 
+DASHED = (0, (4, 1.5))
 SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
 RESOLUTION = 150  # dots per inch
 
@@ -52,6 +55,42 @@ def quiet(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
         axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH)
     axes.set_xlabel(x, fontsize=SMALL, color=QUIET)
     axes.set_ylabel(y, fontsize=SMALL, color=QUIET)
+
+
+def draw_band(
+    axes: Axes, x: np.ndarray, mean: np.ndarray, half: np.ndarray, *, color: str = PREDICTION, alpha: float, **more: Any
+) -> None:
+    """The band from `mean - half` to `mean + half`, without a line around it."""
+    axes.fill_between(x, mean - half, mean + half, color=color, alpha=alpha, linewidth=0, **more)
+
+
+def heading(figure: Figure, text: str, *, size: float = LARGE) -> None:
+    """A bold title above all panels, at the left."""
+    figure.suptitle(text, fontsize=size, fontweight="bold", x=0.01, ha="left")
+
+
+def legend_entries(*axes: Axes) -> tuple[list[Artist], list[str]]:
+    """Handles and labels of several axes, each label once."""
+    entries: dict[str, Artist] = {}
+    for source in axes:
+        for handle, label in zip(*source.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    return list(entries.values()), list(entries)
+
+
+def legend_above(figure: FigureBase, title: str, *axes: Axes, **more: Any) -> None:
+    """The entries of these axes in one row above all panels, under a bold title."""
+    handles, labels = legend_entries(*axes)
+    more |= {"title": title, "title_fontproperties": {"size": LARGE, "weight": "bold"}, "alignment": "left"}
+    columns = max(1, len(labels))
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, fontsize=NORMAL, frameon=False, **more)
+
+
+def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, size: float = SMALL, **more: Any) -> None:
+    """The entries of these axes below all panels, by default in one row."""
+    handles, labels = legend_entries(*axes)
+    columns = columns or max(1, len(labels))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=size, frameon=False, **more)
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:

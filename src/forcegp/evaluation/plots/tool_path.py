@@ -11,15 +11,7 @@ from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.plots.style import (
-    NORMAL,
-    QUIET,
-    SMALL,
-    TRUTH,
-    new_figure,
-    quiet,
-    speed_colors,
-)
+from forcegp.evaluation.plots.style import NORMAL, QUIET, SMALL, TRUTH, new_figure, quiet, speed_colors
 from forcegp.mechanics import MechanicalSystem, Plane
 from forcegp.models.protocol import Posterior
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from forcegp.evaluation.plots.style import QUIET, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import QUIET, legend_below, new_figure, quiet
 from forcegp.experiments import published
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.plots.learning_curves import COLORS
@@ -42,6 +42,5 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
         axes.set_xticks([0, 5, 10, 40, 100, 400], ["0", "5", "10", "40", "100", "400"])
         quiet(axes, title=title, x="iteration")
     panels[0].plot([], [], "x", color=QUIET, label="published (2021)")
-    entries = panels[0].get_legend_handles_labels()
-    figure.legend(*entries, loc="outside lower center", ncols=5, fontsize=SMALL, frameon=False)
+    legend_below(figure, panels[0], columns=5)
     return figure

@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from forcegp.evaluation.plots.style import QUIET, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import QUIET, legend_below, new_figure, quiet
 from forcegp.experiments.extrapolation_jobs import REGIONS
 from forcegp.experiments.model_names import MODELS, NETWORKS
 from forcegp.experiments.plots.learning_curves import COLORS
@@ -28,7 +28,7 @@ def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
         axes.tick_params(axis="y", length=0)
     panels[0].plot([], [], "o", color=QUIET, markerfacecolor="white", label="inside: where it was trained")
     panels[0].plot([], [], "o", color=QUIET, label="outside")
-    figure.legend(loc="outside lower center", ncols=2, fontsize=SMALL, frameon=False)
+    legend_below(figure, panels[0])
     return figure
 
 

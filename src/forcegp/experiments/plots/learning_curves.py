@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from forcegp.evaluation.plots.style import QUIET, SERIES, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
 from forcegp.experiments import published
 from forcegp.experiments.model_names import MODELS
 
@@ -47,9 +47,7 @@ def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
         "noise floor", (counts[0], summary["noise_floor"]), (0, -9), textcoords="offset points", fontsize=7, color=QUIET
     )
     panels[0].plot([], [], color=QUIET, linestyle="--", linewidth=1.0, label="published (2021)")
-    figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=SMALL, frameon=False
-    )
+    legend_below(figure, panels[0], columns=5)
     return figure
 
 

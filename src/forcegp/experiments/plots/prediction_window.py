@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from forcegp.evaluation.plots.style import MEASUREMENT, SMALL, TRUTH, new_figure, quiet
+from forcegp.evaluation.plots.style import MEASUREMENT, TRUTH, draw_band, legend_below, new_figure, quiet
 from forcegp.experiments.model_names import MODELS
 from forcegp.experiments.plots.learning_curves import COLORS
 
@@ -23,36 +23,18 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
         for row, joint in enumerate(SHOWN_JOINTS):
             axes = panels[row, column]
             time, mean, std = stored["time"], stored["mean"][:, joint], stored["std"][:, joint]
-            axes.plot(
-                time,
-                stored["measured"][:, joint],
-                ".",
-                color=MEASUREMENT,
-                markersize=1.5,
-                label="measured",
-                rasterized=True,
-            )
-            axes.fill_between(
-                time,
-                mean - INTERVAL * std,
-                mean + INTERVAL * std,
-                color=COLORS[model],
-                alpha=0.3,
-                linewidth=0,
-                label="95 % interval",
-            )
-            axes.plot(time, mean, color=COLORS[model], linewidth=1.2, label="prediction")
+            measured, color = stored["measured"][:, joint], COLORS[model]
+            axes.plot(time, measured, ".", color=MEASUREMENT, markersize=1.5, label="measured", rasterized=True)
+            draw_band(axes, time, mean, INTERVAL * std, color=color, alpha=0.3, label="95 % interval")
+            axes.plot(time, mean, color=color, linewidth=1.2, label="prediction")
             axes.plot(time, stored["truth"][:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="truth")
-            truth = stored["measured"][:, joint]
-            margin = 0.25 * (truth.max() - truth.min())
-            axes.set_ylim(truth.min() - margin, truth.max() + margin)
+            margin = 0.25 * (measured.max() - measured.min())
+            axes.set_ylim(measured.min() - margin, measured.max() + margin)
             quiet(
                 axes,
                 title=MODELS[model].label if row == 0 else "",
                 x="time [s]" if row == len(SHOWN_JOINTS) - 1 else "",
                 y=f"joint {joint + 1} [rad/s²]" if column == 0 else "",
             )
-    figure.legend(
-        *panels[0, -1].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=SMALL, frameon=False
-    )
+    legend_below(figure, panels[0, -1])
     return figure

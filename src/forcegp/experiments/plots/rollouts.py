@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from forcegp.evaluation.plots.style import LARGE, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import LARGE, legend_below, new_figure, quiet
 from forcegp.experiments.model_names import MODELS
 from forcegp.experiments.plots.learning_curves import COLORS
 
@@ -45,8 +45,7 @@ def rollouts_figure(arrays: Arrays, title: str) -> Figure:
         axes.set_yscale("log")
     panels[0, 0].set_ylim(1e-6, 1e1)
     panels[1, 0].set_ylim(1e-17, 1e0)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=SMALL, frameon=False)
+    legend_below(figure, panels[0, 0])
     return figure
 
 
