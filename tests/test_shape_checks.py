@@ -8,9 +8,9 @@ import sys
 def test_a_wrong_shape_is_refused_where_that_was_asked_for(repository):
     code = (
         "import tests.conftest, torch; from jaxtyping import TypeCheckError\n"
-        "from forcegp.mechanics.tangent_frame import tangent_frame\n"
-        "try: tangent_frame(torch.ones(4, dtype=torch.float64))\n"
-        "except TypeCheckError as error: print('tangent_frame' in str(error))\n"
+        "from forcegp.mechanics.tangent_frame import surface_axes\n"
+        "try: surface_axes(torch.ones(4, dtype=torch.float64))\n"
+        "except TypeCheckError as error: print('surface_axes' in str(error))\n"
     )
     paths = os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "FORCEGP_CHECK_SHAPES": "1", "PYTHONPATH": paths}
