@@ -41,7 +41,7 @@ bench: $(VENV)/.test  ## measure; benchmarks/README.md says what
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
 
 clean:  ## remove .venv, caches and builds; keeps what runs and demos wrote
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors .mutants
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 help:  ## list the targets
