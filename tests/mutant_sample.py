@@ -133,6 +133,8 @@ def mutants(package: str, count: int) -> list[Mutant]:
             for occurrence, (node, (start, end)) in enumerate(places):
                 if any(first <= start and end <= last for first, last in parts[module][0]):
                     continue
+                if name.startswith("ReplaceBinary") and node.parent.type in ("parameters", "lambdef"):
+                    continue  # `*` and `/` between parameters
                 if name == "RemoveDecorator" and any(word in node.get_code() for word in NO_BEHAVIOUR):
                     continue
                 text = texts[start[0] - 1]

@@ -86,6 +86,7 @@ def forked(work: Callable[[], object], seconds: float, log: Path) -> object:
     child = os.fork()
     if child == 0:
         os.setpgid(0, 0)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 5))
         resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))  # a wrong shape may ask for all there is
         descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -98,12 +99,14 @@ def forked(work: Callable[[], object], seconds: float, log: Path) -> object:
         finally:
             os._exit(0)
     deadline = time.monotonic() + 20 * seconds  # for one that sleeps; a busy machine does not reach it
-    while os.waitpid(child, os.WNOHANG) == (0, 0):
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-        time.sleep(0.02)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)  # processes that it started
+    try:
+        while os.waitpid(child, os.WNOHANG) == (0, 0) and time.monotonic() < deadline:
+            time.sleep(0.02)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)  # it and the processes that it started
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(child, 0)
     return json.loads(answer.read_text()) if answer.exists() else None
 
 
@@ -222,6 +225,7 @@ def main() -> int:
             print(mutant)
         return 0
     prepare(given.fresh)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # not without the forks
     explained = tomllib.loads(EXPLAINED.read_text()).get("mutant", []) if EXPLAINED.exists() else []
     reasons = {(each["module"], each["line"], each["mutant"]): each["why"] for each in explained}
     table: dict[str, Counter[str]] = {}

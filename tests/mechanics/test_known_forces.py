@@ -107,6 +107,12 @@ def test_friction_never_drives():
         assert float((known(force).dynamics(q, v, u).Q_K * v).max()) <= 0.0
 
 
+def test_friction_by_load_alone_is_none_without_load():
+    q, v, u = states(4, 5)
+    friction = known(LoadJointFriction(NUMBERS))  # c = 0 and w = 0.01, if nothing else is said
+    assert_close(friction.dynamics(q, v, u).Q_K, -TENSOR * u.abs() * (v / 0.01).tanh(), 1e-12)
+
+
 def test_dry_friction_saturates_at_its_coefficient():
     q, v, u = states(4, 50)
     friction = known(CoulombJointFriction(NUMBERS, 1e-9)).dynamics(q, v, u).Q_K

@@ -272,6 +272,7 @@ def test_stored_text_is_plain_json():
 
     stored = json.loads(complete().to_json(), parse_constant=pytest.fail)
     assert plain(stored)
+    assert stored["format"] == 1  # files of before are read; another layout is another number
     assert set(stored) == {"format", "urdf", "gravity", "armature", "locked", "contacts", "known_forces", "baumgarte"}
 
 
