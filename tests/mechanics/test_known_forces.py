@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import FrozenInstanceError, dataclass, fields
 
 import numpy as np
 import pytest
@@ -76,6 +76,14 @@ def test_each_against_its_formula(make_and_formula):
     expected = formula(q, v, u)
     assert_close(known(make()).dynamics(q, v, u).Q_K, expected, 1e-10)
     assert_close(make().bound_to(chain()).force(State.of(chain(), q, v, u)), expected, 1e-10)
+
+
+def test_none_can_be_changed():
+    numbers = [(force, field.name) for force in (make() for make, _ in FORMULAS.values()) for field in fields(force)]
+    assert len({type(force) for force, _ in numbers}) == len(FORMULAS) - 2  # actuation and bias have no numbers
+    for force, name in numbers:
+        with pytest.raises(FrozenInstanceError):
+            setattr(force, name, 0.0)
 
 
 def test_the_sum_is_what_is_listed_and_nothing_else():
