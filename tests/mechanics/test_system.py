@@ -25,6 +25,7 @@ from forcegp.mechanics import (
     Plane,
     RigidBodyBias,
     Sphere,
+    State,
     ViscousJointFriction,
 )
 from forcegp.robots import Robot
@@ -73,6 +74,12 @@ def test_it_cannot_be_changed():
         built.contacts = ()  # type: ignore[misc]
     assert isinstance(built.contacts, tuple)
     assert isinstance(MechanicalSystem(robot("iiwa"), list(built.contacts)).contacts, tuple)
+
+
+def test_states_are_compared_by_identity():
+    built = robot("chain")
+    one, other = (State.of(built, *states(4, 3)) for _ in range(2))
+    assert one != other  # equal numbers; comparing arrays would raise
 
 
 def test_arguments_are_left_alone():
