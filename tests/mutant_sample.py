@@ -122,7 +122,9 @@ def mutants(package: str, count: int) -> list[Mutant]:
 
     operators = {name: get_operator(f"core/{name}")() for name in OPERATORS}
     ranked: list[tuple[str, str, str, int, int]] = []
-    sources = {str(file.relative_to(REPOSITORY / "src")): file.read_text() for file in files(package)}
+    sources = {
+        str(file.relative_to(REPOSITORY / "src")): file.read_text() for file in python_files(f"src/forcegp/{package}")
+    }
     parts = {module: read(source) for module, source in sources.items()}
     for module, source in sources.items():
         texts, nodes = source.splitlines(), list(ast_nodes(get_ast(source)))
@@ -166,6 +168,6 @@ def compiles(source: str) -> bool:
             return False
 
 
-def files(package: str) -> list[Path]:
-    """The modules of a package."""
-    return sorted((REPOSITORY / "src" / "forcegp" / package).rglob("*.py"))
+def python_files(folder: str) -> list[Path]:
+    """All Python files below a folder of the repository."""
+    return sorted((REPOSITORY / folder).rglob("*.py"))

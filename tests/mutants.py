@@ -35,7 +35,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from tests.mutant_sample import REPOSITORY, Mutant, digest, files, mutants
+from tests.mutant_sample import REPOSITORY, Mutant, digest, mutants, python_files
 
 FOLDER = REPOSITORY / ".mutants"
 COPY = FOLDER / "src"
@@ -125,18 +125,21 @@ def tested(chosen: list[str]) -> object:
 PYTEST = ["--assert=plain", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly"]
 
 
-def executed_lines(package: str) -> dict:
-    """Seconds of every test that passes, and for every line of the package the tests that execute it."""
+def executed_lines(package: str, tests: list[str]) -> dict:
+    """Seconds of every test, those that fail, and for every line of the package the tests that execute it."""
     import coverage
     import pytest
 
     cover = coverage.Coverage(data_file=None, source=[str(COPY / "forcegp" / package)], config_file=False)
     cover.start()
     watch = Watch(coverage=cover)
-    pytest.main([f"tests/{package}", "-q", *PYTEST], plugins=[watch])
+    pytest.main([*tests, "-q", *PYTEST], plugins=[watch])
     cover.stop()
     data = cover.get_data()
-    lines = {str(Path(file).relative_to(COPY)): data.contexts_by_lineno(file) for file in data.measured_files()}
+    lines = {
+        str(Path(file).relative_to(COPY)): {str(line): names for line, names in data.contexts_by_lineno(file).items()}
+        for file in data.measured_files()
+    }
     return {"seconds": watch.seconds, "failed": watch.failed, "lines": lines}
 
 
@@ -151,10 +154,12 @@ def selected(mutant: Mutant, executed: dict, budget: float) -> list[str]:
         function = name.partition("[")[0]
         turns.append((order[function], seconds[name], name))
         order[function] += 1
-    chosen = [name for _, _, name in sorted(turns)]
-    total = list(itertools.accumulate(seconds[name] for name in chosen))
-    mirrored = f"test_{Path(mutant.module).stem}.py::"
-    return [name for name, sum_ in zip(chosen, total, strict=True) if sum_ <= budget or mirrored in name] or chosen[:1]
+    chosen, total = [], 0.0
+    for _, used, name in sorted(turns):
+        if total + used <= budget or f"test_{Path(mutant.module).stem}.py::" in name:
+            chosen.append(name)
+            total += used
+    return chosen or [name for _, _, name in sorted(turns)[:1]]
 
 
 def result(package: str, mutant: Mutant, budget: float) -> tuple[str, str]:
@@ -177,18 +182,36 @@ def result(package: str, mutant: Mutant, budget: float) -> tuple[str, str]:
 
 
 def lines_of(package: str) -> dict:
-    """The tests of a package, their seconds and the lines that each executes: stored, or by running all of them."""
-    if package not in LINES:
-        stored = FOLDER / f"lines-{package}.json"
-        key = digest(tests_digest(package, ""), *(file.read_text() for file in files(package)))
-        content = json.loads(stored.read_text()) if stored.exists() else {"key": ""}
-        if content["key"] != key:
-            executed = forked(lambda: executed_lines(package), 3600, FOLDER / f"lines-{package}.log")
-            if not isinstance(executed, dict):
-                raise SystemExit(f"The tests of {package} did not end; see .mutants/lines-{package}.log.")
-            content = {"key": key, **executed}
-            write(stored, json.dumps(content))
-        LINES[package] = content
+    """The tests of a package, their seconds and the lines that each executes; only files that changed run again."""
+    if package in LINES:
+        return LINES[package]
+    stored = FOLDER / f"lines-{package}.json"
+    texts = {str(file.relative_to(REPOSITORY)): file.read_text() for file in python_files(f"tests/{package}")}
+    tests = {file: digest(text) for file, text in texts.items() if Path(file).name.startswith("test_")}
+    source = [file.read_text() for file in python_files(f"src/forcegp/{package}")]
+    key = digest(*(text for file, text in texts.items() if file not in tests), *source)
+    known = json.loads(stored.read_text()) if stored.exists() else {}
+    if known.get("key") != key:
+        known = {"tests": {}, "seconds": {}, "failed": [], "lines": {}}
+    stale = [file for file in tests if known["tests"].get(file) != tests[file]]
+
+    def kept(name: str) -> bool:
+        file = name.partition("::")[0]
+        return file in tests and file not in stale
+
+    new: object = {"seconds": {}, "failed": [], "lines": {}}
+    if stale:
+        new = forked(lambda: executed_lines(package, stale), 3600, FOLDER / f"lines-{package}.log")
+    if not isinstance(new, dict):
+        raise SystemExit(f"The tests of {package} did not end; see .mutants/lines-{package}.log.")
+    for module, old in known["lines"].items():
+        here = new["lines"].setdefault(module, {})
+        for line, names in old.items():
+            here[line] = [*here.get(line, []), *filter(kept, names)]
+    seconds = {name: used for name, used in known["seconds"].items() if kept(name)} | new["seconds"]
+    failed = [*filter(kept, known["failed"]), *new["failed"]]
+    LINES[package] = {"key": key, "tests": tests, "seconds": seconds, "failed": failed, "lines": new["lines"]}
+    write(stored, json.dumps(LINES[package]))
     return LINES[package]
 
 
@@ -198,7 +221,7 @@ LINES: dict[str, dict] = {}
 def tests_digest(package: str, by: str) -> str:
     """Digest of the file of this test, or of all tests of the package."""
     file = REPOSITORY / by.partition("::")[0]
-    chosen = [file] if file.is_file() else sorted((REPOSITORY / "tests" / package).rglob("*.py"))
+    chosen = [file] if file.is_file() else python_files(f"tests/{package}")
     return digest(*(file.read_text() for file in chosen))
 
 
@@ -229,6 +252,7 @@ def main() -> int:
     explained = tomllib.loads(EXPLAINED.read_text()).get("mutant", []) if EXPLAINED.exists() else []
     reasons = {(each["module"], each["line"], each["mutant"]): each["why"] for each in explained}
     table: dict[str, Counter[str]] = {}
+    used = set()
     for package in given.packages:
         table[package] = Counter()
         killers = set()
@@ -236,6 +260,7 @@ def main() -> int:
             begin = time.monotonic()
             outcome, by = result(package, mutant, given.budget)
             reason = reasons.get((mutant.module, *mutant.change()))
+            used.add((mutant.module, *mutant.change()))
             if outcome == "survived" and reason:
                 outcome, by = "equivalent", reason
             table[package][outcome] += 1
@@ -245,6 +270,9 @@ def main() -> int:
         by = forked(lambda known=known: tested(known), 3600, FOLDER / f"control-{package}.log") if known else ""
         if by != "":
             raise SystemExit(f"{by} fails without a mutant, too, when run after others: its kills mean nothing.")
+    for module, line, change in reasons.keys() - used:
+        if module.split("/")[1] in given.packages:
+            print(f"explained, but not in the sample: {module}: {line}  ->  {change}")
     return printed(table)
 
 

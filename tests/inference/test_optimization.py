@@ -96,6 +96,12 @@ def test_progress_is_told_every_iteration():
     assert told == list(enumerate(result.history))[1:]
 
 
+def test_every_evaluation_counts():
+    calls = []
+    result = minimize_objective(lambda p: calls.append(1) or rosenbrock(p), start(), OptimizerOptions(adam_steps=3))
+    assert result.evaluations == len(calls)
+
+
 def test_iterations_are_limited():
     result = minimize_objective(rosenbrock, start(), OptimizerOptions(iterations=5))
     assert len(result.history) == 6
