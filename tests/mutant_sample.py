@@ -104,7 +104,8 @@ def read(source: str) -> tuple[list[tuple[Position, Position]], dict[int, frozen
                 where = in_functions  # runs at import: whatever uses the module may depend on it
             executed.update(dict.fromkeys(range(first, last + 1), where))
     for node in tree.body:
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.BinOp) and isinstance(node.value.op, ast.BitOr):
+        value = node.value if isinstance(node, ast.Assign) else None
+        if isinstance(value, ast.Subscript) or (isinstance(value, ast.BinOp) and isinstance(value.op, ast.BitOr)):
             skip(node)  # an alias of types
     return spans, executed
 
