@@ -93,6 +93,8 @@ def read(source: str) -> tuple[list[tuple[Position, Position]], dict[int, frozen
         for annotation in (getattr(node, name, None) for name in ("annotation", "returns")):
             if isinstance(annotation, ast.expr):
                 skip(annotation)
+        if isinstance(node, ast.keyword) and node.arg == "strict":
+            skip(node.value)  # of zip: a guard, as an assertion is
         if isinstance(node, ast.stmt):
             inner = [child.lineno for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
             last = max(min(inner, default=(node.end_lineno or 0) + 1) - 1, node.lineno)
