@@ -150,7 +150,7 @@ def selected(mutant: Mutant, executed: dict, budget: float) -> list[str]:
     touching = {name for line in mutant.lines for name in lines.get(str(line), []) if name in seconds}
     order: Counter[str] = Counter()
     turns = []
-    for name in sorted(touching or seconds, key=lambda name: (seconds[name], name)):
+    for name in sorted(touching if mutant.lines else seconds, key=lambda name: (seconds[name], name)):
         function = name.partition("[")[0]
         turns.append((order[function], seconds[name], name))
         order[function] += 1
@@ -170,6 +170,8 @@ def result(package: str, mutant: Mutant, budget: float) -> tuple[str, str]:
         if tests == tests_digest(package, by) and (outcome == "killed" or spent >= budget):
             return outcome, by
     chosen = selected(mutant, lines_of(package), budget)
+    if not chosen:
+        return "survived", "no test executes it"
     copy = COPY / mutant.module
     copy.write_text(mutant.mutated)
     usual = sum(lines_of(package)["seconds"][name] for name in chosen)

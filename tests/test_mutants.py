@@ -69,7 +69,6 @@ def test_tests_of_the_line_run_quick_ones_first_one_of_each_function_up_to_the_b
     fault = Mutant("m.py", "AddNot", frozenset({7}), "", "")
     assert selected(fault, executed, 10.0) == ["t.py::many[b]", "t.py::slow", "t.py::many[a]"]
     assert selected(fault, executed, 0.05) == ["t.py::many[b]"]
-    assert selected(Mutant("m.py", "AddNot", frozenset({8}), "", ""), executed, 0.3) == [
-        "t.py::else",
-        "t.py::many[b]",
-    ]
+    assert selected(Mutant("m.py", "AddNot", frozenset({8}), "", ""), executed, 10.0) == []
+    at_import = Mutant("m.py", "AddNot", frozenset(), "", "")  # of a module without functions
+    assert selected(at_import, executed, 0.3) == ["t.py::else", "t.py::many[b]"]
