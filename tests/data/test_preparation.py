@@ -123,6 +123,12 @@ def test_a_delay_is_found_to_a_fraction_of_a_sample(delay):
     np.testing.assert_allclose(prepared.dataset.u, _at(prepared.dataset, low_pass(arm_log(0.0), 20.0)).u, atol=0.2)
 
 
+def test_a_delay_is_common_to_episodes_of_different_length():
+    data = arm_log(0.02)
+    found = estimate_delay(replace(data, episode=(data.time > 5.0).astype(data.episode.dtype)))
+    assert found.common == pytest.approx(0.02, abs=4e-4)
+
+
 def _at(prepared: Dataset, whole: Dataset) -> Dataset:
     return whole.rows(np.isin(whole.time, prepared.time))
 
