@@ -80,7 +80,7 @@ def test_a_cutoff_beyond_half_the_sample_rate_is_refused(cutoff):
         zero_phase_low_pass(np.zeros((100, 1)), 100.0, cutoff)
 
 
-@pytest.mark.parametrize(("rate", "order"), [(0.0, 4), (np.nan, 4), (100.0, 0), (100.0, 13)])
+@pytest.mark.parametrize(("rate", "order"), [(0.0, 4), (np.nan, 4), (np.inf, 4), (100.0, 0), (100.0, 13)])
 def test_other_wrong_arguments_are_refused(rate, order):
     with pytest.raises(InvalidInput):
         zero_phase_low_pass(np.zeros((100, 1)), rate, 10.0, order)

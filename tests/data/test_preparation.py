@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.signal import butter
 from tests.data.samples import assert_equal, dataset
 from tests.models.arm import arm_system
 
@@ -65,6 +66,12 @@ def test_noise_floor_and_acceleration_noise_are_those_of_white_noise(seed):
     np.testing.assert_allclose(spectrum.floor, 2 * SIGMA**2 / RATE, rtol=0.25)  # one-sided density of white noise
     # (q[k+2] - 2 q[k] + q[k-2]) / (2 h)^2 of independent errors
     np.testing.assert_allclose(spectrum.acceleration_noise(), np.sqrt(6) / 4 * SIGMA * RATE**2, rtol=0.05)
+
+
+def test_acceleration_noise_from_velocities():
+    data, _ = noisy()
+    spectrum = motion_spectrum(replace(data, v=data.q), "v")  # (v[k+1] - v[k-1]) / (2 h)
+    np.testing.assert_allclose(spectrum.acceleration_noise(), SIGMA * RATE / np.sqrt(2), rtol=0.05)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -169,6 +176,7 @@ def test_the_default_changes_nothing():
     prepared = Preparation().apply(data)
     assert_equal(replace(prepared.dataset, metadata=data.metadata), data)
     assert prepared.report["rows"] == [80, 80]
+    assert prepared.report["differentiate"] is None  # nothing was
 
 
 def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
@@ -179,10 +187,20 @@ def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
         np.testing.assert_array_equal(getattr(prepared.dataset, name), getattr(expected, name)[: len(prepared.dataset)])
     assert len(prepared.dataset) == len(expected) == prepared.report["rows"][1]
     assert prepared.report["sample_rate"] == pytest.approx([500.0, 100.0])
+    assert prepared.report["differentiate"] == "q"
     assert json.loads(json.dumps(prepared.report)) == prepared.report
     assert prepared.dataset.metadata["preparation"]["cutoff"] == 12.0
     again = Preparation(every=2).apply(prepared.dataset)
     assert again.report["earlier"]["cutoff"] == 12.0
+
+
+@pytest.mark.parametrize(("cutoff", "order"), [(12.0, 1), (12.0, 4), (3.0, 7)])
+def test_the_halo_ends_where_the_slowest_mode_of_the_filter_has_decayed(cutoff, order):
+    _, poles, _ = butter(order, 2.0 * np.pi * cutoff, analog=True, output="zpk")
+    decay = np.abs(poles.real).min()
+    halo = Preparation(cutoff=cutoff, order=order, delay=(0.03, -0.05)).halo
+    assert np.exp(-decay * (halo - 0.05)) == pytest.approx(1e-12)
+    assert Preparation(delay=-0.02).halo == 0.02
 
 
 def test_velocities_can_be_the_source():
