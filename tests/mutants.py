@@ -175,7 +175,7 @@ def result(package: str, mutant: Mutant, budget: float) -> tuple[str, str]:
     copy = COPY / mutant.module
     copy.write_text(mutant.mutated)
     usual = sum(lines_of(package)["seconds"][name] for name in chosen)
-    by = forked(lambda: tested(chosen), 30 + 5 * usual, FOLDER / "last.log")
+    by = forked(lambda: tested(chosen), 15 + 3 * usual, FOLDER / "last.log")
     copy.write_text(mutant.original)
     outcome = "timeout" if by is None else "killed" if by else "survived"
     content = json.dumps([outcome, by or "", tests_digest(package, str(by or "")), budget])
