@@ -239,7 +239,7 @@ def main() -> int:
     """Run what is not known yet and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("packages", nargs="*", default=PACKAGES, metavar="PACKAGE", help=f"of {', '.join(PACKAGES)}")
-    parser.add_argument("--count", type=int, default=55, help="mutants of each package (default: 55)")
+    parser.add_argument("--count", type=int, default=50, help="mutants of each package (default: 50)")
     parser.add_argument("--budget", type=float, default=20.0, help="CPU seconds of tests for a mutant (default: 20)")
     parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
     parser.add_argument("--fresh", action="store_true", help="forget the results of before")
