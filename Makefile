@@ -12,7 +12,7 @@ ARGS ?=
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: demo test test-all test-processors check format bench clean help
+.PHONY: demo test test-all test-processors mutants check format bench clean help
 
 demo: $(VENV)/.demo  ## simulate, learn and evaluate; prints the table and writes the pictures
 	$(BIN)/forcegp demo $(ARGS)
@@ -26,6 +26,9 @@ test-all: $(VENV)/.test  ## run all tests, the slow ones too, and check annotate
 
 test-processors: $(VENV)/.test  ## run the tests as other processors and a busy machine do; goes on where it ended
 	$(BIN)/python tests/processors.py $(ARGS)
+
+mutants: $(VENV)/.mutants  ## put faults into the source, one at a time, and see whether the tests notice; goes on where it ended
+	$(BIN)/python -m tests.mutants $(ARGS)
 
 check: $(VENV)/.check  ## lint, format, types and the rule of imports
 	$(BIN)/ruff check .
@@ -41,7 +44,7 @@ bench: $(VENV)/.test  ## measure; benchmarks/README.md says what
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
 
 clean:  ## remove .venv, caches and builds; keeps what runs and demos wrote
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors .mutants
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 help:  ## list the targets
@@ -54,9 +57,11 @@ $(VENV)/.test: EXTRAS := sim,test,scale,logs
 $(VENV)/.test: STAMPS := $(VENV)/.demo $(VENV)/.test
 $(VENV)/.check: EXTRAS := sim,test,scale,logs,dev
 $(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
+$(VENV)/.mutants: EXTRAS := sim,test,scale,logs,mutants
+$(VENV)/.mutants: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.mutants
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
-$(VENV)/.demo $(VENV)/.test $(VENV)/.check: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+$(VENV)/.demo $(VENV)/.test $(VENV)/.check $(VENV)/.mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing forcegp[$(EXTRAS)] in $(VENV): one to two minutes the first time."
 	$(BIN)/python -m pip install --quiet --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'

@@ -5,7 +5,7 @@ import pytest
 
 from forcegp.data import Dataset, contact_rows, rows_in_contact
 from forcegp.errors import ContactError
-from forcegp.mechanics import Contact, Plane
+from forcegp.mechanics import Contact, ImplicitSurface, Plane
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 pytest.importorskip("pybullet")
@@ -36,6 +36,14 @@ def test_truth_is_not_looked_at(hopping):
 def test_an_ideal_contact_keeps_its_rows(surface):
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=10.0, seed=6, surface=surface))
     assert contact_rows(data).mean() > 0.999
+
+
+def test_the_length_of_the_gradient_does_not_matter(hopping):
+    """Any function that vanishes on the surface describes it; a factor changes neither distances nor directions."""
+    (contact,) = hopping.system.contacts
+    scaled = Contact(contact.frame, contact.point, ImplicitSurface(lambda p: 100.0 * contact.surface.value(p)))
+    data = dataclasses.replace(hopping, system=hopping.system.with_contacts([scaled]), truth={})
+    assert (contact_rows(data) == contact_rows(hopping)).mean() > 0.999
 
 
 def test_a_surface_in_the_wrong_place_is_told(hopping):

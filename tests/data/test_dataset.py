@@ -252,6 +252,11 @@ def test_noise_that_differs_between_rows_goes_with_its_rows():
     np.testing.assert_array_equal(complete().noise_level, complete().noise_std)
 
 
+def test_rows_are_counted_from_either_end():
+    data = dataset()
+    np.testing.assert_array_equal(data.rows([-40, -1]).time, data.time[[0, 39]])
+
+
 def test_rows_out_of_order_are_marked_and_may_be_sorted_again():
     data = dataset()
     sample = data.rows([11, 2, 30])

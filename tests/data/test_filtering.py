@@ -80,10 +80,25 @@ def test_a_cutoff_beyond_half_the_sample_rate_is_refused(cutoff):
         zero_phase_low_pass(np.zeros((100, 1)), 100.0, cutoff)
 
 
-@pytest.mark.parametrize(("rate", "order"), [(0.0, 4), (np.nan, 4), (100.0, 0), (100.0, 13)])
+@pytest.mark.parametrize(("rate", "order"), [(0.0, 4), (np.nan, 4), (np.inf, 4), (100.0, 0), (100.0, 13)])
 def test_other_wrong_arguments_are_refused(rate, order):
     with pytest.raises(InvalidInput):
         zero_phase_low_pass(np.zeros((100, 1)), rate, 10.0, order)
+
+
+@pytest.mark.parametrize("order", [1, 12])
+def test_orders_from_one_to_twelve_are_filters(order):
+    values = zero_phase_low_pass(np.ones((400, 1)), 100.0, 20.0, order)
+    np.testing.assert_allclose(values, 1.0, rtol=1e-9)
+
+
+def test_the_transient_must_be_shorter_than_the_log():
+    with pytest.raises(DatasetError, match=r"more than (\d+) are needed") as raised:
+        zero_phase_low_pass(np.zeros((100, 1)), 1000.0, 10.0, 2)
+    padding = int(str(raised.value).split("more than ")[1].split()[0])
+    zero_phase_low_pass(np.zeros((padding + 1, 1)), 1000.0, 10.0, 2)
+    with pytest.raises(DatasetError, match=f"{padding} rows are too few"):
+        zero_phase_low_pass(np.zeros((padding, 1)), 1000.0, 10.0, 2)
 
 
 def test_too_few_rows_are_refused():
@@ -214,6 +229,10 @@ def test_uniform_step():
     assert uniform_step(TIME + jitter) == pytest.approx(1 / RATE, rel=1e-5)
     with pytest.raises(DatasetError, match="this recording is not sampled uniformly"):
         uniform_step(np.array([0.0, 1.0, 2.0, 3.1]))
+    late = np.array([0.0, 0.01, 0.02, 0.03, 0.0402])  # the last step is 2 % longer
+    with pytest.raises(DatasetError, match="step after row 3"):
+        uniform_step(late)
+    assert uniform_step(np.array([0.0, 0.5])) == 0.5
     with pytest.raises(DatasetError, match="at least 2"):
         uniform_step(np.zeros(1))
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.signal import butter
 from tests.data.samples import assert_equal, dataset
 from tests.models.arm import arm_system
 
@@ -67,6 +68,12 @@ def test_noise_floor_and_acceleration_noise_are_those_of_white_noise(seed):
     np.testing.assert_allclose(spectrum.acceleration_noise(), np.sqrt(6) / 4 * SIGMA * RATE**2, rtol=0.05)
 
 
+def test_acceleration_noise_from_velocities():
+    data, _ = noisy()
+    spectrum = motion_spectrum(replace(data, v=data.q), "v")  # (v[k+1] - v[k-1]) / (2 h)
+    np.testing.assert_allclose(spectrum.acceleration_noise(), SIGMA * RATE / np.sqrt(2), rtol=0.05)
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
     data, exact = noisy(seed=seed, sigma=1e-3)
@@ -123,6 +130,12 @@ def test_a_delay_is_found_to_a_fraction_of_a_sample(delay):
     np.testing.assert_allclose(prepared.dataset.u, _at(prepared.dataset, low_pass(arm_log(0.0), 20.0)).u, atol=0.2)
 
 
+def test_a_delay_is_common_to_episodes_of_different_length():
+    data = arm_log(0.02)
+    found = estimate_delay(replace(data, episode=(data.time > 5.0).astype(data.episode.dtype)))
+    assert found.common == pytest.approx(0.02, abs=4e-4)
+
+
 def _at(prepared: Dataset, whole: Dataset) -> Dataset:
     return whole.rows(np.isin(whole.time, prepared.time))
 
@@ -163,6 +176,7 @@ def test_the_default_changes_nothing():
     prepared = Preparation().apply(data)
     assert_equal(replace(prepared.dataset, metadata=data.metadata), data)
     assert prepared.report["rows"] == [80, 80]
+    assert prepared.report["differentiate"] is None  # nothing was
 
 
 def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
@@ -173,10 +187,20 @@ def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
         np.testing.assert_array_equal(getattr(prepared.dataset, name), getattr(expected, name)[: len(prepared.dataset)])
     assert len(prepared.dataset) == len(expected) == prepared.report["rows"][1]
     assert prepared.report["sample_rate"] == pytest.approx([500.0, 100.0])
+    assert prepared.report["differentiate"] == "q"
     assert json.loads(json.dumps(prepared.report)) == prepared.report
     assert prepared.dataset.metadata["preparation"]["cutoff"] == 12.0
     again = Preparation(every=2).apply(prepared.dataset)
     assert again.report["earlier"]["cutoff"] == 12.0
+
+
+@pytest.mark.parametrize(("cutoff", "order"), [(12.0, 1), (12.0, 4), (3.0, 7)])
+def test_the_halo_ends_where_the_slowest_mode_of_the_filter_has_decayed(cutoff, order):
+    _, poles, _ = butter(order, 2.0 * np.pi * cutoff, analog=True, output="zpk")
+    decay = np.abs(poles.real).min()
+    halo = Preparation(cutoff=cutoff, order=order, delay=(0.03, -0.05)).halo
+    assert np.exp(-decay * (halo - 0.05)) == pytest.approx(1e-12)
+    assert Preparation(delay=-0.02).halo == 0.02
 
 
 def test_velocities_can_be_the_source():

@@ -131,6 +131,10 @@ def test_one_node_for_every_row_keeps_the_rows():
         (lambda: WeakForm(0.0), "seconds is 0.0; it must be positive"),
         (lambda: WeakForm(0.1, nodes=0), "nodes is 0; it must be a whole number from 1"),
         (lambda: WeakForm(order=1), "order is 1; on q it must be a whole number from 2"),
+        (lambda: WeakForm(order=17), "order is 17; on q it must be a whole number from 2 to 16"),
+        (lambda: WeakForm(order=True), "order is True"),
+        (lambda: WeakForm(nodes=True), "nodes is True"),
+        (lambda: WeakForm(nodes=2.0), "nodes is 2.0"),
         (lambda: WeakForm(signal="a"), "signal is 'a'; allowed: 'q'"),
         (lambda: WeakForm(0.01).windows(sine(0.002 * np.arange(100))), "has 6 rows at steps of 0.002 s; at least 8"),
         (lambda: WeakForm(0.02).windows(sine(0.002 * np.arange(100)), 99), "points=99 is not between 2 and the 9"),
@@ -140,6 +144,14 @@ def test_one_node_for_every_row_keeps_the_rows():
 def test_arguments_out_of_range_say_what_is_allowed(make, message):
     with pytest.raises(InvalidInput, match=message):
         make()
+
+
+def test_bounds_themselves_are_allowed():
+    assert WeakForm(order=2).order == 2
+    assert WeakForm(order=16, nodes=1).order == 16
+    assert WeakForm(signal="v", order=1).order == 1
+    log = sine(0.002 * np.arange(100))
+    assert len(WeakForm(0.014, nodes=2).windows(log).nodes.q) > 0  # 8 rows
 
 
 def test_logs_that_cannot_be_cut_into_windows_are_refused():

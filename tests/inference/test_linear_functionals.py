@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from tests.inference.dense import dense_covariance
 from tests.inference.problems import Problem, normal, problem
 
-from forcegp.errors import InvalidInput
-from forcegp.inference import ExactPosterior, FunctionalPosterior, Terms, exact, negative_log_likelihood
-from forcegp.inference.linear_functionals import functional_negative_log_likelihood
+from forcegp.errors import InvalidInput, NotEnoughMemory
+from forcegp.inference import ExactPosterior, FunctionalPosterior, Terms, exact, memory, negative_log_likelihood
+from forcegp.inference.linear_functionals import functional_negative_log_likelihood, require_memory_for_functionals
 from forcegp.inference.pathwise import draw_functions
 
 SHAPES = {
@@ -164,3 +164,14 @@ def test_what_needs_single_rows_says_so():
     )
     with pytest.raises(InvalidInput, match=r"FunctionalPosterior .*accelerations"):
         exact(posterior, "leaving rows out")
+
+
+def test_memory_is_that_of_the_kernel_matrices_and_the_covariances(monkeypatch):
+    """20 windows of 3 nodes: three matrices of all states and two from states to outputs for each latent, four of S."""
+    needed = 8 * (5 * 3 * 60 * 60 + 5 * 2 * 60 * 80 + 4 * 80 * 80)
+    weights = torch.ones(20, 3, dtype=torch.float64)
+    monkeypatch.setattr(memory, "free_memory", lambda device: math.ceil(needed / memory.USABLE))
+    require_memory_for_functionals(weights, outputs=4, latents=5)
+    monkeypatch.setattr(memory, "free_memory", lambda device: math.floor(needed / memory.USABLE) - 1)
+    with pytest.raises(NotEnoughMemory, match="20 windows of 3 nodes"):
+        require_memory_for_functionals(weights, outputs=4, latents=5)

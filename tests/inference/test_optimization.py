@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from forcegp.errors import FitError, InvalidInput, NumericalError
 from forcegp.inference import OptimizerOptions, best_of, minimize_objective
+from forcegp.inference.optimization import _Search
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -93,6 +94,12 @@ def test_progress_is_told_every_iteration():
         progress=lambda iteration, value: told.append((iteration, value)),
     )
     assert told == list(enumerate(result.history))[1:]
+
+
+def test_every_evaluation_counts():
+    calls = []
+    result = minimize_objective(lambda p: calls.append(1) or rosenbrock(p), start(), OptimizerOptions(adam_steps=3))
+    assert result.evaluations == len(calls)
 
 
 def test_iterations_are_limited():
@@ -218,6 +225,17 @@ def test_failures_shorten_the_step_and_do_not_end_the_search(objective, begin):
     assert result.value == pytest.approx(1e3 * len(begin))
     assert all(math.isfinite(value) for value in result.history)
     assert falling(result.history)
+
+
+def test_a_parabola_stands_in_that_rises_as_much_as_the_objective_was_to_fall():
+    """Its slope belongs to its value, c |step|^2, so the line search shortens the step by what it was told."""
+    search = _Search(lambda p: p["x"].square().sum() / (p["x"].max() < 3.0), {"x": tensor(1.0, 2.0)})
+    value, slope = search(np.array([1.0, 2.0]))
+    step = np.array([2.5, 3.5])
+    stand_in, rising = search(np.array([1.0, 2.0]) + step)
+    assert search.failures == 1
+    assert stand_in == pytest.approx(value + slope @ step, rel=1e-14)
+    np.testing.assert_allclose(rising, 2.0 * (slope @ step) * step / (step @ step), rtol=1e-14)
 
 
 def test_failures_are_counted_and_named():

@@ -8,6 +8,7 @@ from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 
 from forcegp.errors import InvalidInput
 from forcegp.inference import ExactPosterior, LatentKernels
+from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
 from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
 from forcegp.priors.kernels import kernel_of
 
@@ -175,3 +176,15 @@ def test_drawing_composed_functions_leaves_the_global_random_states_alone():
     draw_functions(latent, 2, seed=0)
     assert torch.equal(torch.get_rng_state(), before)
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
+
+
+def test_a_drawn_function_is_a_cosine_and_a_sine_of_its_own_weight():
+    kernel = ScaleKernel(RBFKernel()).double()
+    kernel.outputscale, kernel.base_kernel.lengthscale = 4.0, 0.5
+    kernel.requires_grad_(False)
+    (term,) = kernel_terms(kernel)
+    a, b, omega = (torch.tensor(numbers, dtype=torch.float64).reshape(1, 1, 2) for numbers in ([1, 2], [3, -1], [2, 5]))
+    z = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64)[:, None]
+    phase = z * omega[0] / 0.5
+    expected = 2.0 * (phase.cos() * a[0] + phase.sin() * b[0]).sum(-1)  # sqrt(s) = 2
+    torch.testing.assert_close(DrawnTerm(term, (omega,), (a, b))(z), expected[None], rtol=1e-13, atol=1e-13)

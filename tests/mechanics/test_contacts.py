@@ -96,6 +96,10 @@ def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, z
     )
 
 
+def test_baumgarte_is_critically_damped_by_itself():
+    assert Baumgarte(10.0) == Baumgarte(10.0, zeta=1.0)
+
+
 def test_baumgarte_brings_a_drifted_tool_back_to_the_surface():
     """From 2 cm off, released at rest with critical damping: no overshoot, e-folds away."""
     built = robot("chain")

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import FrozenInstanceError, dataclass, fields
 
 import numpy as np
 import pytest
@@ -78,6 +78,14 @@ def test_each_against_its_formula(make_and_formula):
     assert_close(make().bound_to(chain()).force(State.of(chain(), q, v, u)), expected, 1e-10)
 
 
+def test_none_can_be_changed():
+    numbers = [(force, field.name) for force in (make() for make, _ in FORMULAS.values()) for field in fields(force)]
+    assert len({type(force) for force, _ in numbers}) == len(FORMULAS) - 2  # actuation and bias have no numbers
+    for force, name in numbers:
+        with pytest.raises(FrozenInstanceError):
+            setattr(force, name, 0.0)
+
+
 def test_the_sum_is_what_is_listed_and_nothing_else():
     q, v, u = states(4, 6)
     parts = [make() for make, _ in FORMULAS.values()]
@@ -105,6 +113,12 @@ def test_friction_never_drives():
     q, v, u = states(4, 50)
     for force in (ViscousJointFriction(NUMBERS), CoulombJointFriction(NUMBERS)):
         assert float((known(force).dynamics(q, v, u).Q_K * v).max()) <= 0.0
+
+
+def test_friction_by_load_alone_is_none_without_load():
+    q, v, u = states(4, 5)
+    friction = known(LoadJointFriction(NUMBERS))  # c = 0 and w = 0.01, if nothing else is said
+    assert_close(friction.dynamics(q, v, u).Q_K, -TENSOR * u.abs() * (v / 0.01).tanh(), 1e-12)
 
 
 def test_dry_friction_saturates_at_its_coefficient():

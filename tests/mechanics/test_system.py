@@ -25,6 +25,7 @@ from forcegp.mechanics import (
     Plane,
     RigidBodyBias,
     Sphere,
+    State,
     ViscousJointFriction,
 )
 from forcegp.robots import Robot
@@ -73,6 +74,12 @@ def test_it_cannot_be_changed():
         built.contacts = ()  # type: ignore[misc]
     assert isinstance(built.contacts, tuple)
     assert isinstance(MechanicalSystem(robot("iiwa"), list(built.contacts)).contacts, tuple)
+
+
+def test_states_are_compared_by_identity():
+    built = robot("chain")
+    one, other = (State.of(built, *states(4, 3)) for _ in range(2))
+    assert one != other  # equal numbers; comparing arrays would raise
 
 
 def test_arguments_are_left_alone():
@@ -220,6 +227,20 @@ def test_contradictory_contacts_are_named():
         held.check_states(*states(7, 3))
 
 
+def test_contacts_contradict_each_other_from_a_millionth_on():
+    """At rest b = -omega^2 s, and the acceleration lies between the two: half of omega^2 times the gap is missing."""
+    tool, point = FRAMES["iiwa"], torch.tensor([0.0, 0.0, 0.1, 1.0], dtype=torch.float64)
+    q, _, u = states(7, 1)
+    height = float((robot("iiwa").frame_pose(q[0], tool) @ point)[2])
+    for gap, fits in ((1.6e-8, True), (2.6e-8, False)):
+        floors = [Plane((0.0, 0.0, 1.0), height + sign * gap / 2) for sign in (-1, 1)]
+        held = MechanicalSystem(
+            robot("iiwa"), [Contact(tool, (0.0, 0.0, 0.1), floor) for floor in floors], baumgarte=Baumgarte(10.0)
+        )
+        with contextlib.nullcontext() if fits else pytest.raises(ContactError, match="contradict"):
+            held.check_states(q, torch.zeros_like(q), u)
+
+
 def test_states_that_are_not_finite_are_refused():
     for position in range(2):
         arguments = states(7, 4)
@@ -272,6 +293,7 @@ def test_stored_text_is_plain_json():
 
     stored = json.loads(complete().to_json(), parse_constant=pytest.fail)
     assert plain(stored)
+    assert stored["format"] == 1  # files of before are read; another layout is another number
     assert set(stored) == {"format", "urdf", "gravity", "armature", "locked", "contacts", "known_forces", "baumgarte"}
 
 

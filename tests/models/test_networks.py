@@ -219,6 +219,20 @@ def test_what_makes_no_sense_is_refused(train, make, message):
         make(train.system)
 
 
+def test_bounds_themselves_are_allowed(train):
+    for beta in (0.0, 1.0):
+        assert NetworkEnsemble(train.system, beta=beta, weight_decay=0.0, held_out=0.49).beta == beta
+
+
+def test_defaults_are_those_of_the_papers(train):
+    """Rath et al. (2021), section 5; the ensemble is what docs/validation.md compares with."""
+    network, ensemble = NeuralNetwork(train.system), NetworkEnsemble(train.system)
+    assert (network.width, network.steps, network.batch, network.rate) == (80, 5000, 1000, 0.01)
+    assert (ensemble.members, ensemble.width, ensemble.depth, ensemble.beta) == (5, 128, 3, 0.5)
+    assert (ensemble.steps, ensemble.batch, ensemble.rate) == (3000, 256, 3e-3)
+    assert (ensemble.weight_decay, ensemble.held_out) == (1e-3, 0.1)
+
+
 def test_a_loss_that_is_not_finite_is_named(train):
     huge = dataclasses.replace(train, a=np.full_like(train.a, 1e200), truth={})
     with pytest.raises(FitError, match="not finite at step"):

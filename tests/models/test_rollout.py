@@ -124,6 +124,7 @@ def test_samples_are_functions_that_obey_the_constraint(posterior, start):
     other = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=4)
     assert (other.samples.q - drawn.q).abs().max() > 1e-9
     torch.testing.assert_close(rollout.std("v"), drawn.v.std(0))
+    torch.testing.assert_close(rollout.quantiles(), rollout.quantiles((0.025, 0.5, 0.975), "q"))
     low, high = rollout.quantiles((0.0, 1.0), "q")
     mean = drawn.q.mean(0)
     rounding = 8 * torch.finfo(mean.dtype).eps * mean.abs()  # of 5 numbers added; at the start all five are one number

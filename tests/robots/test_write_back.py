@@ -8,8 +8,9 @@ import torch
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS, TREE
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, UnknownJoint
 from forcegp.robots import Robot
+from forcegp.robots.urdf_writer import replace_dynamics
 
 
 def perturbed(robot: Robot, *links: str) -> dict[str, torch.Tensor]:
@@ -81,6 +82,31 @@ def test_link_without_inertial_gains_one(element, newline):
     )
     twice = heavier.with_inertials({"tool": payload})
     assert twice.urdf_text == heavier.urdf_text
+
+
+JOINT = """<robot name="r"><link name="a"/><link name="b"/>
+  <joint name="other" type="fixed"><dynamics damping="9"/></joint>
+  <joint name="one" type="revolute">%s
+    <parent link="a"/>
+  </joint>
+</robot>
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("", '\n    <dynamics damping="0.1" friction="0.25"/>'),
+        ('<dynamics friction="1"/>', '<dynamics damping="0.1" friction="0.25"/>'),
+        ('<dynamics damping = \'3\' friction="1" x="7"/>', '<dynamics damping="0.1" friction="0.25" x="7"/>'),
+    ],
+)
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_dynamics_of_a_joint_are_replaced_or_added_and_nothing_else_changes(before, after, newline):
+    text, expected = ((JOINT % element).replace("\n", newline) for element in (before, after))
+    assert replace_dynamics(text, "one", {"damping": 0.1, "friction": 0.25}, source="a test") == expected
+    with pytest.raises(UnknownJoint, match="a test: no joint 'two'"):
+        replace_dynamics(text, "two", {"damping": 0.1}, source="a test")
 
 
 def test_the_original_robot_and_the_parameters_stay_as_they_are():
