@@ -28,7 +28,7 @@ def test_all_figures_tables_and_the_page_are_there(reproduced):
             with (root / "reproduction" / f"{name}.csv").open() as file:
                 assert list(csv.DictReader(file))
             reproduced.check_pictures(root, document["figures"])
-        assert "Its numbers say nothing about the models" in page
+        assert "Its numbers mean nothing for the models" in page
         assert "nan" not in page.lower().replace("covariance", "")
 
 

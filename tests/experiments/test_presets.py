@@ -1,5 +1,6 @@
 """The presets, and the page that the documentation shows."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from forcegp.experiments.force_scenarios import SCENARIOS
 from forcegp.experiments.pages import TRIAL_PRESETS, page_of
 from forcegp.experiments.presets import PRESETS, experiments_of
 from forcegp.experiments.report import report
-from forcegp.experiments.reproduction import as_csv, read_document
+from forcegp.experiments.reproduction import as_csv
 from forcegp.jobs import Job
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -57,7 +58,9 @@ def test_unknown_names_list_the_known():
 def test_the_committed_page_is_made_of_the_committed_numbers(preset):
     name = page_of(preset).name
     folder, experiments = DOCS / name, PRESETS[preset]
-    documents = {experiment.name: read_document(folder / f"{experiment.name}.json") for experiment in experiments}
+    documents = {
+        experiment.name: json.loads((folder / f"{experiment.name}.json").read_text()) for experiment in experiments
+    }
     assert {document["preset"] for document in documents.values()} == {preset}
     assert (DOCS / f"{name}.md").read_text() == report(experiments, documents)
     for experiment in experiments:

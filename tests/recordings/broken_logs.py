@@ -286,7 +286,7 @@ BROKEN = {
     "unknown unit": Broken(GOOD, "q has no unit 'degrees'; did you mean", f"{FLAGS} --unit q=degrees"),
     "unit of another": Broken(GOOD, "u has no unit 'deg'", f"{FLAGS} --unit u=deg"),
     "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
-    "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Say --unit q=deg if it is in degrees"),
+    "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in degrees"),
     "degrees beyond limits": Broken(
         with_urdf(scaled(57.3, "q_shoulder", "q_elbow"), "shoulder", "elbow"), "Then add --unit q=deg", ROBOT
     ),

@@ -25,6 +25,7 @@ from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 from forcegp.recordings.episode_rows import EpisodeRows
+from forcegp.recordings.formats import open_source
 from forcegp.recordings.spool import Spool
 from forcegp.recordings.time_stamps import Stretch
 
@@ -113,8 +114,9 @@ def test_reading_in_small_pieces_changes_nothing(tmp_path, monkeypatch):
 def test_pieces_of_an_episode_are_those_of_the_whole(tmp_path, rows, logged):
     data = uneven()
     signals = np.hstack([data[name] for name in logged])
+    source = open_source(write_text(tmp_path / "log.csv", table(data)))
     recording = reading.RawRecording(
-        "log", None, 0, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), np.zeros(4), np.zeros(4), ()
+        "log", source, 0, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), np.zeros(4), np.zeros(4), ()
     )
     episode = EpisodeRows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), logged, 2, STEP)
     with Spool(tmp_path, signals.shape[1]) as spool:

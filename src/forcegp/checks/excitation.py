@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from forcegp.analytical.identifiability import base_parameters, excitation
@@ -69,13 +71,12 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
     return [*found, *_held(inputs, still), *_base_parameters(inputs)]
 
 
-def _held(inputs: CheckInput, still: list[str]) -> list[Finding]:
+def _held(inputs: CheckInput, still: list[str]) -> Iterator[Finding]:
     """Joints that stand still in whole stretches although they move in others."""
     assert inputs.prepared is not None
     rows = inputs.prepared.dataset
-    found = []
     if len(rows.episodes) < 2:
-        return []
+        return
     spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
     for joint, name in enumerate(inputs.names):
         held = np.flatnonzero(
@@ -86,20 +87,17 @@ def _held(inputs: CheckInput, still: list[str]) -> list[Finding]:
         first = int(held[0])
         unit = "rad" if inputs.rotates[joint] else "m"
         begin = float(rows.time[rows.episode == rows.episodes[first]][0])
-        found.append(
-            Finding(
-                severity="look",
-                subject="held joint",
-                seen=f"{name} stays within {spans[first, joint]:.2g} {unit} in {len(held)} of {len(spans)} stretches "
-                f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
-                f"moves {spans[:, joint].max():.2g}.",
-                remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
-                "(--lock).",
-                joints=(name,),
-                numbers={"stretches": held.tolist(), "range": float(spans[first, joint])},
-            )
+        yield Finding(
+            severity="look",
+            subject="held joint",
+            seen=f"{name} stays within {spans[first, joint]:.2g} {unit} in {len(held)} of {len(spans)} stretches "
+            f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
+            f"moves {spans[:, joint].max():.2g}.",
+            remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
+            "(--lock).",
+            joints=(name,),
+            numbers={"stretches": held.tolist(), "range": float(spans[first, joint])},
         )
-    return found
 
 
 def _base_parameters(inputs: CheckInput) -> list[Finding]:

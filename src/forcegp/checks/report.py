@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +30,6 @@ class CheckReport:
     `inputs` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
     with the errors corrected that were found (None without a robot, or with contacts).
     """
-
-    __no_type_check__: ClassVar[bool] = True  # made by `check` alone
 
     findings: tuple[Finding, ...]
     inputs: CheckInput

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput, consecutive
@@ -33,8 +35,7 @@ def signal_findings(inputs: CheckInput) -> list[Finding]:
     return [*found, *_limits(inputs), *_resolution(inputs)]
 
 
-def _leaps(inputs: CheckInput) -> list[Finding]:
-    found = []
+def _leaps(inputs: CheckInput) -> Iterator[Finding]:
     for places, how, remedy in (
         (inputs.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
         (inputs.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
@@ -43,22 +44,18 @@ def _leaps(inputs: CheckInput) -> list[Finding]:
         if places.any():
             row, joint = (int(index) for index in np.argwhere(places)[0])
             name = inputs.names[joint]
-            found.append(
-                Finding(
-                    severity="wrong",
-                    subject="jumps",
-                    seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
-                    f"({int(places.sum())} times in all).",
-                    remedy=remedy,
-                    joints=tuple(inputs.names[k] for k in np.flatnonzero(places.any(axis=0))),
-                    numbers={"row": row, "count": int(places.sum())},
-                )
+            yield Finding(
+                severity="wrong",
+                subject="jumps",
+                seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
+                f"({int(places.sum())} times in all).",
+                remedy=remedy,
+                joints=tuple(inputs.names[k] for k in np.flatnonzero(places.any(axis=0))),
+                numbers={"row": row, "count": int(places.sum())},
             )
-    return found
 
 
-def _constant(inputs: CheckInput) -> list[Finding]:
-    found = []
+def _constant(inputs: CheckInput) -> Iterator[Finding]:
     log = inputs.log
     for name, quantity in QUANTITY.items():
         values = getattr(log, name)
@@ -78,17 +75,14 @@ def _constant(inputs: CheckInput) -> list[Finding]:
             else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         )
         passive = name == "u" and not values[:, dead].any()
-        found.append(
-            Finding(
-                severity="look" if passive or len(dead) == log.nv else "wrong",
-                subject="constant channel",
-                seen=seen,
-                remedy=remedy,
-                joints=names,
-                numbers={"quantity": name},
-            )
+        yield Finding(
+            severity="look" if passive or len(dead) == log.nv else "wrong",
+            subject="constant channel",
+            seen=seen,
+            remedy=remedy,
+            joints=names,
+            numbers={"quantity": name},
         )
-    return found
 
 
 def _runs(same: np.ndarray) -> tuple[int, int]:
@@ -138,15 +132,14 @@ def _is_extreme(values: np.ndarray, value: float) -> bool:
     return bool(value in (values.min(), values.max()))
 
 
-def _clipped(inputs: CheckInput, joint: int) -> list[Finding]:
+def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
     log = inputs.log
     speed = np.abs(log.v[:, joint])
     u = log.u[speed > MOVES * np.sqrt(np.square(speed).mean()), joint]
     if len(u) < CLIPPED_ROWS or np.ptp(log.u[:, joint]) == 0.0:
-        return []
+        return
     width = np.ptp(u) / 1000.0
-    found = []
     for sign, side in ((1.0, "largest"), (-1.0, "smallest")):
         extreme = float((sign * log.u[:, joint]).max())
         below = extreme - sign * u
@@ -154,27 +147,24 @@ def _clipped(inputs: CheckInput, joint: int) -> list[Finding]:
         near = int(((below > 1e-9 * np.ptp(u)) & (below <= 1e-9 * np.ptp(u) + width)).sum())
         start, length = _runs(np.abs(log.u[:, joint] - sign * extreme) <= 1e-9 * np.ptp(u))
         if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
-            found.append(
-                Finding(
-                    severity="wrong",
-                    subject="saturation",
-                    seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
-                    f"{at} "
-                    f"rows of motion; the longest stretch, {length} rows, begins at row {start} at "
-                    f"{log.time[start]:.3f} s.",
-                    remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
-                    "these stretches out, or move more gently.",
-                    joints=(inputs.names[joint],),
-                    numbers={"value": sign * extreme, "rows": at, "row": start},
-                )
+            yield Finding(
+                severity="wrong",
+                subject="saturation",
+                seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
+                f"{at} "
+                f"rows of motion; the longest stretch, {length} rows, begins at row {start} at "
+                f"{log.time[start]:.3f} s.",
+                remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
+                "these stretches out, or move more gently.",
+                joints=(inputs.names[joint],),
+                numbers={"value": sign * extreme, "rows": at, "row": start},
             )
-    return found
 
 
-def _limits(inputs: CheckInput) -> list[Finding]:
+def _limits(inputs: CheckInput) -> Iterator[Finding]:
     """Positions, velocities and torques beyond the limits of the URDF, the worst joint of each first."""
     if inputs.robot is None:
-        return []
+        return
     log, joints = inputs.log, inputs.robot.joints
     lower = np.array([-np.inf if joint.type == "continuous" else joint.lower for joint in joints])
     upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
@@ -185,7 +175,6 @@ def _limits(inputs: CheckInput) -> list[Finding]:
     ):
         size = np.array([value if value > 0.0 else np.inf for value in limit])  # a limit of 0 is a placeholder
         bounds[name] = (-size, size)
-    found = []
     for name, (low, high) in bounds.items():
         values = getattr(log, name)
         span = np.where(np.isfinite(high - low), high - low, 1.0)
@@ -196,25 +185,21 @@ def _limits(inputs: CheckInput) -> list[Finding]:
         beyond = tuple(inputs.names[k] for k in np.flatnonzero((excess > 0.0).any(axis=0)))
         others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
         unit = log.units[name] if isinstance(log.units[name], str) else log.units[name][joint]
-        found.append(
-            Finding(
-                severity="look",
-                subject="limits",
-                seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
-                f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
-                f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
-                remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
-                "is not that of your robot, which does no harm here.",
-                joints=beyond,
-                numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
-            )
+        yield Finding(
+            severity="look",
+            subject="limits",
+            seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
+            f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
+            f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
+            remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
+            "is not that of your robot, which does no harm here.",
+            joints=beyond,
+            numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
         )
-    return found
 
 
-def _resolution(inputs: CheckInput) -> list[Finding]:
+def _resolution(inputs: CheckInput) -> Iterator[Finding]:
     """Channels with few different values, and how coarse they are against their range."""
-    found = []
     for name, quantity in QUANTITY.items():
         quantized, joints, quanta = [], [], {}
         for joint, label in enumerate(inputs.names):
@@ -229,14 +214,11 @@ def _resolution(inputs: CheckInput) -> list[Finding]:
             joints.append(label)
             quanta[label] = quantum
         if quantized:
-            found.append(
-                Finding(
-                    severity="look",
-                    subject="resolution",
-                    seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
-                    remedy="Log more digits, or expect noise from this.",
-                    joints=tuple(joints),
-                    numbers={"quantity": name, "quantum": quanta},
-                )
+            yield Finding(
+                severity="look",
+                subject="resolution",
+                seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
+                remedy="Log more digits, or expect noise from this.",
+                joints=tuple(joints),
+                numbers={"quantity": name, "quantum": quanta},
             )
-    return found

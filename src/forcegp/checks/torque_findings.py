@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -83,27 +84,23 @@ def _factors(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
     ]
 
 
-def _passive(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     """Joints whose torque is zero throughout although the motion needs one."""
-    found = []
     for joint, name in enumerate(inputs.names):
         u, tau = log.rows.u[:, joint], log.tau[:, joint]
         if np.ptp(inputs.log.u[:, joint]) > 0.0 or not inputs.log.u.any():
             continue
         others = [np.std(log.tau[:, other]) for other in range(len(inputs.names)) if np.ptp(log.rows.u[:, other]) > 0]
         if np.std(tau) > 0.1 * max(others, default=np.inf):
-            found.append(
-                Finding(
-                    severity="wrong",
-                    subject="dead torque",
-                    seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
-                    f"{np.std(tau):.3g} {_unit(inputs, joint)} rms.",
-                    remedy="The channel is dead, unless the joint has no motor and the URDF is wrong.",
-                    joints=(name,),
-                    numbers={"needed": float(np.std(tau))},
-                )
+            yield Finding(
+                severity="wrong",
+                subject="dead torque",
+                seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
+                f"{np.std(tau):.3g} {_unit(inputs, joint)} rms.",
+                remedy="The channel is dead, unless the joint has no motor and the URDF is wrong.",
+                joints=(name,),
+                numbers={"needed": float(np.std(tau))},
             )
-    return found
 
 
 def _unexplained(inputs: CheckInput, log: Hypothesis) -> list[Finding]:

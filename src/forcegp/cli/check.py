@@ -13,9 +13,9 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json
-from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.output_folders import plots_folder, require_free_folder
 from forcegp.cli.preparation_options import CutoffOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns
@@ -66,7 +66,9 @@ class Check(CutoffOptions, RobotOptions):
             report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
-            self._draw(terminal, report, content)
+            with plots_folder(terminal, self.plots, KIND, {"data": str(self.data)}) as folder:
+                forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
+                write_json(folder / "check.json", content)
         terminal.show(*_shown(self.data, report))
         wrong = [finding for finding in report.findings if finding.severity == "wrong"]
         if self.strict and wrong:
@@ -75,15 +77,6 @@ class Check(CutoffOptions, RobotOptions):
                 f"{self.data}: {len(wrong)} findings are wrong ({what}); without --strict this is no error."
             )
         return content
-
-    def _draw(self, terminal: Terminal, report: forcegp.CheckReport, content: Mapping[str, Any]) -> None:
-        assert self.plots is not None
-        with atomic_folder(self.plots) as folder:
-            folder.mkdir()
-            forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
-            write_json(folder / "check.json", content)
-            write_config(folder, KIND, {"data": str(self.data)})
-        terminal.note(f"plots: {self.plots}")
 
 
 def _shown(data: Path, report: forcegp.CheckReport) -> list[Any]:

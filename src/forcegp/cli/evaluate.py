@@ -12,10 +12,10 @@ from tyro.conf import Positional, UseAppendAction, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
 from forcegp.cli.contact_syntax import parse_contacts
-from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.output_folders import plots_folder, require_free_folder
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import (
     NORMAL_FORCES,
@@ -90,13 +90,10 @@ class Evaluate(Command):
             "normal_force_rests_on_prior": rests_on_prior,
         }
         if self.plots is not None:
-            with atomic_folder(self.plots) as folder:
-                folder.mkdir()
+            options = {name: scores[name] for name in ("run", "data", "every", "system", "contact")}
+            with plots_folder(terminal, self.plots, KIND, {"options": options}) as folder:
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
-                options = ("run", "data", "every", "system", "contact")
-                write_config(folder, KIND, {"options": {name: scores[name] for name in options}})
-            terminal.note(f"plots: {self.plots}")
 
         learned = NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
         forces_table = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from typing import Any, cast
@@ -11,7 +10,7 @@ from rich.text import Text
 
 import forcegp
 import forcegp.analytical
-from forcegp.atomic_files import atomic_folder
+from forcegp.atomic_files import atomic_folder, write_json
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.identify_options import IdentifyOptions
 from forcegp.cli.output_folders import require_free_folder, write_config
@@ -60,7 +59,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     content["robot"] = "no" if identified is None else "yes"
     with atomic_folder(command.out) as folder:
         folder.mkdir()
-        (folder / "identification.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
             (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))

@@ -128,16 +128,8 @@ class Import(PreparationOptions, RobotOptions):
         if self.write_mapping is not None:
             require_free_file(self.write_mapping, overwrite=self.overwrite)
         mapping = self._mapping(terminal)
-        options = forcegp.ImportOptions(
-            gap=self.gap,
-            resample=self.resample,
-            rate=self.rate,
-            start=self.start,
-            end=self.end,
-            unwrap=self.unwrap,
-            beyond_limits=self.beyond_limits,
-            most_rows=self.max_rows,
-        )
+        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
+        options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
         system, preparation = self._system(), self._preparation()
         with atomic_file(self.out) as temporary, terminal.progress("importing") as report:
             done = forcegp.import_recordings(
@@ -156,10 +148,7 @@ class Import(PreparationOptions, RobotOptions):
         if found is not None:
             return found
         robot = self.chosen_robot()
-        if robot is None:
-            return None
-
-        return forcegp.MechanicalSystem(robot)
+        return None if robot is None else forcegp.MechanicalSystem(robot)
 
     def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""

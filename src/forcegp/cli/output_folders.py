@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from forcegp.atomic_files import write_json
+from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
 CONFIG = "config.json"
@@ -39,6 +41,16 @@ def require_free_folder(path: Path, *, kind: str, overwrite: bool) -> None:
         )
     if not overwrite:
         raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
+
+
+@contextmanager
+def plots_folder(terminal: Terminal, path: Path, kind: str, content: Mapping[str, Any]) -> Iterator[Path]:
+    """A new folder to draw into, with its `config.json`, reported on stderr; there once all is in it."""
+    with atomic_folder(path) as folder:
+        folder.mkdir()
+        yield folder
+        write_config(folder, kind, content)
+    terminal.note(f"plots: {path}")
 
 
 def holds_only_own_files(path: Path, kind: str) -> bool:

@@ -13,9 +13,8 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.data
 import forcegp.evaluation
-from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import DATASET, Debug, Json
-from forcegp.cli.output_folders import require_free_file, require_free_folder, write_config
+from forcegp.cli.output_folders import plots_folder, require_free_file, require_free_folder
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns, facts
@@ -65,19 +64,12 @@ class Prepare(PreparationOptions, RobotOptions):
             prepared = preparation.apply(dataset)
         prepared.dataset.save(self.out)
         if self.plots is not None:
-            self._draw(terminal, dataset, prepared)
+            content = {"data": str(self.data), "preparation": prepared.report}
+            with plots_folder(terminal, self.plots, KIND, content) as folder:
+                figure = forcegp.evaluation.preparation_figure(dataset, prepared.preparation)
+                forcegp.evaluation.save_figure(figure, folder / "spectra.png")
         terminal.show(*_report(self.out, dataset, prepared))
         return {"out": str(self.out), "data": str(self.data), **prepared.report}
-
-    def _draw(self, terminal: Terminal, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> None:
-        assert self.plots is not None
-        with atomic_folder(self.plots) as folder:
-            folder.mkdir()
-            forcegp.evaluation.save_figure(
-                forcegp.evaluation.preparation_figure(dataset, prepared.preparation), folder / "spectra.png"
-            )
-            write_config(folder, KIND, {"data": str(self.data), "preparation": prepared.report})
-        terminal.note(f"plots: {self.plots}")
 
 
 def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> list[Any]:

@@ -38,7 +38,7 @@ class Reproduce(BackendOptions):
     """Which figure, or all."""
     preset: Annotated[str, arg(metavar="smoke|paper|forces|forces-smoke")] = "smoke"
     """smoke: small, in a few minutes, to see that everything works. paper: the full experiments, CPU-hours.
-    forces: what priors that know what a force is are worth; forces-smoke: the same, small."""
+    forces: what priors on forces are worth; forces-smoke: the same, small."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reproduction-PRESET)")] = None
     """The folder of results; an unfinished one is gone on with."""
     docs: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: only into --out)")] = None

@@ -129,13 +129,13 @@ class _PlainProgress:
         self.terminal = terminal
         self.what = what
         self.may_end_early = may_end_early
-        self.start = self.spoke = time.monotonic()
+        self.start = self.reported = time.monotonic()
 
     def report(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
-        if now - self.spoke < PLAIN_SECONDS or done >= total:
+        if now - self.reported < PLAIN_SECONDS or done >= total:
             return
-        self.spoke = now
+        self.reported = now
         parts = [f"{done / total:.0%}", _remaining(now - self.start, done, total, self.may_end_early), note]
         self.terminal.note(f"{self.what}: {', '.join(part for part in parts if part)}")
 

@@ -24,6 +24,9 @@ from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
+SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")
+"""Options that have the names of fields of `forcegp.Comparison`."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Validate(BackendOptions, PreparationOptions, RobotOptions):
@@ -129,16 +132,9 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             recording,
             system,
             forcegp.split_named(self.split, rows, self.guard),
-            points=self.points,
             horizons=horizons,
-            starts=self.starts,
-            integrator=self.integrator,
-            identification=self.identification,
-            restarts=self.restarts,
-            iterations=self.iterations,
-            force_noise=self.force_noise,
-            measured_torque=self.measured_torque,
             friction=friction_laws(self.friction),
+            **{name: getattr(self, name) for name in SAME},
         )
 
     def _warn_of_memory(self, terminal: Terminal, cutoff: Any, order: int) -> None:

@@ -12,7 +12,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -78,8 +77,6 @@ class Program:
 
 class Tape:
     """Operations recorded so far; the operands of a node have smaller numbers."""
-
-    __no_type_check__: ClassVar[bool] = True  # called for every scalar, where checks would take most of the time
 
     def __init__(self, inputs: int) -> None:
         self._nodes: list[tuple] = []

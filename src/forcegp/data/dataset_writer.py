@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import h5py
 import numpy as np
@@ -40,8 +40,6 @@ class DatasetWriter:
     The file appears under its name when `finish` was called and the context ends without error. `joint_names` and
     `units` are those of a Dataset; with a `system`, its robot's.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -38,8 +37,6 @@ class Delay:
     and at the joint's own best one; `remains` what the common delay leaves of what was unexplained, as the geometric
     mean over the joints.
     """
-
-    __no_type_check__: ClassVar[bool] = True  # nothing but arrays that this module makes
 
     common: float
     common_std: float

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -52,8 +52,6 @@ class MotionSpectrum:
     [Hz], `floor` (nv,) [unit^2/Hz] and `cutoff` (nv,) [Hz] are NaN for a joint whose spectrum shows no noise floor:
     it does not move, was filtered already, or has hardly any noise.
     """
-
-    __no_type_check__: ClassVar[bool] = True  # nothing but arrays that this module makes
 
     source: Literal["q", "v"]
     step: float

@@ -166,7 +166,6 @@ class WeakForm(WindowObservation):
     middle of a window only, and need longer ones.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "weak-form"
     seconds: float = 0.1
     nodes: int = 6
@@ -213,7 +212,6 @@ class WeakForm(WindowObservation):
 class VelocityIncrements(WindowObservation):
     """phi = 1/T: the change of the velocity over a window, by its length."""
 
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "increments"
     seconds: float = 0.1
     nodes: int = 6

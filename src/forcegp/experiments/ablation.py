@@ -6,10 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
+from forcegp.evaluation.summary_statistics import (
+    formatted,
+    in_columns,
+    markdown_table,
+    medians,
+    number,
+)
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
@@ -17,6 +22,7 @@ from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
 from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
 from forcegp.jobs import Job, JobStore
 
+TASKS = "forcegp.experiments.ablation_jobs"
 OURS = "ours"
 FILTERED_MODELS = ("s-gp-mean",)
 OVERLAP_MODELS = ("gp", "s-gp-mean")
@@ -56,44 +62,18 @@ class Ablation(Experiment):
                 for schedule in SCHEDULES:
                     spec = {**base, "model": model, "schedule": schedule, "steps": self.steps}
                     cost = fit_cost(model, self.largest, {"restarts": 4, "iterations": self.settings.iterations})
-                    out.append(
-                        Job(
-                            _schedule_name(model, schedule, seed),
-                            "forcegp.experiments.ablation_jobs:search",
-                            spec,
-                            (data.name,),
-                            cost,
-                        )
-                    )
+                    out.append(Job(_schedule_name(model, schedule, seed), f"{TASKS}:search", spec, (data.name,), cost))
             for model in FILTERED_MODELS:
                 for cutoff in (None, *self.cutoffs):
                     spec = {**base, "model": model, "cutoff": cutoff, "train_seconds": self.data.train_seconds}
                     cost = 15.0 + fit_cost(model, self.largest, {"restarts": 1, "iterations": self.settings.iterations})
-                    out.append(
-                        Job(
-                            _filter_name(model, cutoff, seed),
-                            "forcegp.experiments.ablation_jobs:filtered",
-                            spec,
-                            (data.name,),
-                            cost,
-                        )
-                    )
+                    out.append(Job(_filter_name(model, cutoff, seed), f"{TASKS}:filtered", spec, (data.name,), cost))
             for model in OVERLAP_MODELS:
                 fit = fit_name(model, self.largest, seed)
                 spec = {"fit": fit, "data": data.name, "seed": seed, "train_seconds": self.data.train_seconds}
-                out.append(
-                    Job(
-                        f"ablation/overlap/{model}/seed{seed}",
-                        "forcegp.experiments.ablation_jobs:overlap",
-                        spec,
-                        (fit,),
-                        20.0,
-                    )
-                )
+                out.append(Job(_overlap_name(model, seed), f"{TASKS}:overlap", spec, (fit,), 20.0))
         spec = {**shared, "data": self.data.job(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
-        out.append(
-            Job("ablation/dense", "forcegp.experiments.ablation_jobs:dense", spec, (spec["data"],), 0.5 * self.steps)
-        )
+        out.append(Job("ablation/dense", f"{TASKS}:dense", spec, (spec["data"],), 0.5 * self.steps))
         return out
 
     @override
@@ -115,26 +95,19 @@ class Ablation(Experiment):
         }
         overlap = {}
         for model in OVERLAP_MODELS:
-            jobs = [results.result(f"ablation/overlap/{model}/seed{seed}") for seed in self.seeds]
-            other = [results.result(fit_name(model, self.largest, seed))["evaluation"] for seed in self.seeds]
-            overlap[model] = {
-                name: median_and_range(job[name] for job in jobs) for name in ("mae", "mae_noise_free", "shared")
-            }
-            overlap[model]["mae_other"] = median_and_range(job["mae"] for job in other)
-            overlap[model]["mae_noise_free_other"] = median_and_range(job["mae_noise_free"] for job in other)
+            jobs = [results.result(_overlap_name(model, seed)) for seed in self.seeds]
+            fits = [results.result(fit_name(model, self.largest, seed))["evaluation"] for seed in self.seeds]
+            other = medians(fits, ("mae", "mae_noise_free"))
+            overlap[model] = medians(jobs, ("mae", "mae_noise_free", "shared"))
+            overlap[model] |= {f"{name}_other": each for name, each in other.items()}
         summary = {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
         return summary | {"dense": results.result("ablation/dense")}
 
     @staticmethod
     def _scores(jobs: list[dict[str, Any]]) -> dict[str, Any]:
         evaluations = [job["evaluation"] for job in jobs]
-        scores = {
-            name: median_and_range(each[name] for each in evaluations)
-            for name in ("mae", "mae_noise_free", "coverage_95")
-        }
-        scores["nll"] = median_and_range(job["nll"] for job in jobs) if "nll" in jobs[0] else None
-        scores["noise_std"] = median_and_range(each["noise_std"] for each in evaluations)
-        return scores
+        scores = medians(evaluations, ("mae", "mae_noise_free", "coverage_95"))
+        return scores | medians(jobs, ("nll",)) | medians(evaluations, ("noise_std",))
 
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
@@ -143,26 +116,13 @@ class Ablation(Experiment):
             for model, variants in summary[kind].items():
                 for variant, scores in variants.items():
                     row: Row = {"what": kind, "model": MODELS[model].label, "variant": variant}
-                    for name, value in scores.items():
-                        row |= {f"{name}_{part}": value[part] for part in ("median", "min", "max")} if value else {}
-                    out.append(row)
+                    out.append(row | in_columns({name: value for name, value in scores.items() if value}))
         return out
 
     @override
-    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        return {}
-
-    @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        return "\n\n".join(
-            [
-                self._search_text(summary),
-                self._dense_text(summary),
-                self._filter_text(summary),
-                self._overlap_text(summary),
-                self._floor_text(summary),
-            ]
-        )
+        parts = (self._search_text, self._dense_text, self._filter_text, self._overlap_text, self._floor_text)
+        return "\n\n".join(part(summary) for part in parts)
 
     def _search_text(self, summary: Mapping[str, Any]) -> str:
         columns = {OURS: "ours", **SCHEDULES}
@@ -247,6 +207,10 @@ class Ablation(Experiment):
 
 def _schedule_name(model: str, schedule: str, seed: int) -> str:
     return f"ablation/search/{schedule}/{model}/seed{seed}"
+
+
+def _overlap_name(model: str, seed: int) -> str:
+    return f"ablation/overlap/{model}/seed{seed}"
 
 
 def _filter_name(model: str, cutoff: float | None, seed: int) -> str:

@@ -25,13 +25,7 @@ def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float,
     A model that is trained on N points takes the first N rows, as in the paper. The test trajectory is kept whole (for
     roll-outs); `every` sets which of its rows are scored.
     """
-    spec = {
-        "seed": seed,
-        "train_seconds": train_seconds,
-        "rows": rows,
-        "test_seconds": test_seconds,
-        "every": every,
-    }
+    spec = {"seed": seed, "train_seconds": train_seconds, "rows": rows, "test_seconds": test_seconds, "every": every}
     cost = SIMULATION_COST * (train_seconds + test_seconds) + 2e-5 * rows * train_seconds
     return Job(f"data/seed{seed}", "forcegp.experiments.data:simulate", spec, cost=cost)
 

@@ -75,9 +75,9 @@ class Experiment(ABC):
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
         """The summary as a flat table, for CSV."""
 
-    @abstractmethod
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        """File name without ending -> figure."""
+        """File name without ending -> figure; none by default."""
+        return {}
 
     @abstractmethod
     def section(self, summary: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range
+from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.fits import FitSettings, fit_cost
@@ -17,6 +17,7 @@ from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODE
 from forcegp.experiments.plots.extrapolation import extrapolation_figure
 from forcegp.jobs import Job, JobStore
 
+TASKS = "forcegp.experiments.extrapolation_jobs"
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
 TARGETS = {
     "acceleration": "the acceleration a, which the GP learns [rad/s²]",
@@ -45,29 +46,15 @@ class Extrapolation(Experiment):
         for seed in self.seeds:
             data = self.data.job(seed)
             out.append(data)
-            out.append(
-                Job(
-                    _scale_name(seed),
-                    "forcegp.experiments.extrapolation_jobs:scale",
-                    {"data": data.name},
-                    (data.name,),
-                    3.0,
-                )
-            )
+            out.append(Job(_scale_name(seed), f"{TASKS}:scale", {"data": data.name}, (data.name,), 3.0))
             for region in REGIONS:
                 for model in self.models:
                     points = None if model in NETWORKS else self.points
                     settings = self.settings.of_network() if model in NETWORKS else self.settings.of(self.points)
                     spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
                     cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
-                    job = Job(
-                        _fit_name(model, region, seed),
-                        "forcegp.experiments.extrapolation_jobs:fit",
-                        spec | settings,
-                        (data.name,),
-                        cost,
-                    )
-                    out.append(job)
+                    name = _fit_name(model, region, seed)
+                    out.append(Job(name, f"{TASKS}:fit", spec | settings, (data.name,), cost))
         return out
 
     @override
@@ -77,23 +64,16 @@ class Extrapolation(Experiment):
             regions[region] = {}
             for model in self.models:
                 found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
-                regions[region][model] = {
-                    side: {score: median_and_range(job[side][score] for job in found) for score in SCORES}
-                    for side in SIDES
-                } | {"points": median_and_range(job["points"] for job in found)}
+                scores = {side: medians([job[side] for job in found], SCORES) for side in SIDES}
+                regions[region][model] = scores | medians(found, ("points",))
         scales = [results.result(_scale_name(seed)) for seed in self.seeds]
-        scale = {name: median_and_range(each[name] for each in scales) for name in (*TARGETS, "largest_H")}
-        return {"points": self.points, "regions": regions, "scale": scale}
+        return {"points": self.points, "regions": regions, "scale": medians(scales, (*TARGETS, "largest_H"))}
 
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
         return [
             {"region": region, "model": MODELS[model].label, "points": scores["points"]["median"], "tested": side}
-            | {
-                f"{score}_{part}": None if value is None else value[part]
-                for score, value in scores[side].items()
-                for part in ("median", "min", "max")
-            }
+            | in_columns(scores[side])
             for region, models in summary["regions"].items()
             for model, scores in models.items()
             for side in SIDES
@@ -128,9 +108,8 @@ class Extrapolation(Experiment):
             "zero away from its data, so this is the size that its errors can reach there; a force error reaches the "
             f"acceleration through H, whose largest entry on these data is {formatted(scale['largest_H'], 0)} /(kg m²)."
         )
-        parts.append(
-            markdown_table(["what", "size"], [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()])
-        )
+        sizes = [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()]
+        parts.append(markdown_table(["what", "size"], sizes))
         return "\n\n".join(parts)
 
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range
+from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
@@ -60,14 +60,6 @@ class Fig2b(Experiment):
             out += [fit_to_all(model, data[seed].name, seed, self.settings) for seed in self.seeds_many_points]
         return out
 
-    def _search_words(self) -> list[str]:
-        """Starts and tolerance by number of points."""
-        by_points = {count: self.settings.of(count) for count in self.points}
-        return [
-            f"N = {count}: {each['restarts']} starts, tolerance {each['tolerance']:g}"
-            for count, each in by_points.items()
-        ]
-
     @override
     def summary(self, results: JobStore) -> dict[str, Any]:
         curves: dict[str, Any] = {}
@@ -76,16 +68,13 @@ class Fig2b(Experiment):
             for count in self.points:
                 found = [results.result(fit_name(model, count, seed)) for seed in self.seeds_of(count)]
                 scores = [{**job["evaluation"], "cpu_seconds": job["search"]["cpu_seconds"]} for job in found]
-                curves[model][str(count)] = {
-                    name: median_and_range(score[name] for score in scores) for name in SCORES
-                } | {
-                    "converged": sum(job["search"]["converged"] for job in found),
-                    "seeds": len(found),
-                }
+                converged = sum(job["search"]["converged"] for job in found)
+                counted = {"converged": converged, "seeds": len(found)}
+                curves[model][str(count)] = medians(scores, SCORES) | counted
         many = {}
         for model in self.on_all_rows:
             found = [results.result(all_name(model, seed))["evaluation"] for seed in self.seeds_many_points]
-            many[model] = {name: median_and_range(score[name] for score in found) for name in SCORES[:-1]}
+            many[model] = medians(found, SCORES[:-1])
         floor = results.result(fit_name(self.models[0], self.points[0], self.seeds[0]))["evaluation"]["noise_floor"]
         return {"curves": curves, "all_rows": {"rows": self.data.rows, "models": many}, "noise_floor": floor}
 
@@ -97,10 +86,7 @@ class Fig2b(Experiment):
                 paper = dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[model], strict=True)).get(int(count))
                 row: Row = {"model": MODELS[model].label, "points": int(count), "seeds": scores["seeds"]}
                 row |= {"paper_mae": paper, "converged": scores["converged"]}
-                for name in SCORES:
-                    for part in ("median", "min", "max"):
-                        row[f"{name}_{part}"] = scores[name][part]
-                out.append(row)
+                out.append(row | in_columns({name: scores[name] for name in SCORES}))
         return out
 
     @override
@@ -109,11 +95,16 @@ class Fig2b(Experiment):
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
+        by_points = {count: self.settings.of(count) for count in self.points}
+        searches = [
+            f"N = {count}: {each['restarts']} starts, tolerance {each['tolerance']:g}"
+            for count, each in by_points.items()
+        ]
         parts = [
             f"Medians over seeds (least–largest), {len(self.seeds)} seeds up to N = {self.few_points}, "
             f"{len(self.seeds_many_points)} above. Training and test rows come from different trajectories. The floor "
             f"of the MAE against noisy accelerations is {summary['noise_floor']:.4f}. Searches: "
-            + "; ".join(self._search_words())
+            + "; ".join(searches)
             + ". From the second number of points on, the first start is where the fit to fewer points ended."
         ]
         for score in SCORES:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import markdown_table, median_and_range, number
+from forcegp.evaluation.summary_statistics import in_columns, markdown_table, median_and_range, number
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
@@ -109,8 +109,7 @@ class Fig4(Experiment):
             row: Row = {"control": control, "stabilisation": VARIANTS[variant], "model": MODELS[model].label}
             for second in self.seconds:
                 score = scores[f"{second:g}"]
-                for name in ("joint_error", "constraint"):
-                    row |= {f"{name}_{second:g}s_{part}": score[name][part] for part in ("median", "min", "max")}
+                row |= in_columns({f"{name}_{second:g}s": score[name] for name in ("joint_error", "constraint")})
                 row[f"constraint_largest_{second:g}s"] = score["constraint_largest"]
             out.append(row | {"diverged": scores["diverged"]})
         return out

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.evaluation.summary_statistics import in_columns, median_and_range, medians
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.experiments.force_scenarios import SCENARIOS
@@ -69,10 +68,7 @@ class ForceExperiment(Experiment):
                 spec = {
                     "train": train.name,
                     "tests": {label: job.name for label, job in tests.items()},
-                    "prior": trial.prior,
-                    "mean": trial.mean,
-                    "points": trial.points,
-                    "region": trial.region,
+                    **{name: getattr(trial, name) for name in ("prior", "mean", "points", "region")},
                     "seed": seed,
                     **self.settings.of(trial.points),
                 }
@@ -91,14 +87,10 @@ class ForceExperiment(Experiment):
         tests = {}
         for label in self._tests(trial):
             names = dict.fromkeys(name for job in found for name in job["tests"][label])
-            tests[label] = {name: median_and_range(job["tests"][label].get(name) for job in found) for name in names}
+            tests[label] = medians([job["tests"][label] for job in found], names)
         coverages = [curve["coverage"] for job in found for curve in job["curves"].values()]
         return {
-            "label": trial.label,
-            "scenario": trial.scenario,
-            "prior": trial.prior,
-            "points": trial.points,
-            "region": trial.region,
+            **{name: getattr(trial, name) for name in ("label", "scenario", "prior", "points", "region")},
             "tests": tests,
             "curve_coverage": median_and_range(coverages),
             "curve_coverage_of_seeds": median_and_range(
@@ -113,18 +105,10 @@ class ForceExperiment(Experiment):
         return [
             {key: trial[key] for key in ("label", "scenario", "prior", "points")}
             | {"extrapolation": int(trial["region"]), "tested_on": label}
-            | {
-                f"{name}_{part}": None if value is None else value[part]
-                for name, value in scores.items()
-                for part in ("median", "min", "max")
-            }
+            | in_columns(scores)
             for trial in summary["trials"]
             for label, scores in trial["tests"].items()
         ]
-
-    @override
-    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        return {}
 
     def _tests(self, trial: Trial) -> Mapping[str, str]:
         return trial.tests or {trial.scenario: trial.scenario}

@@ -13,7 +13,7 @@ figures are written by
 and never by hand; the numbers lie beside it as JSON and CSV. Every pair of training and test trajectory has its own \
 way-points and noise, so no test row is a training row. Medians over seeds come with the least and the largest value."""
 
-FORCES_INTRODUCTION = """What priors that know what a force is are worth: data efficiency, friction as it is, other \
+FORCES_INTRODUCTION = """What priors on forces are worth: data efficiency, friction as it is, other \
 contacts, and the parts of the posterior. [forces.md](forces.md) explains the priors. This page, its tables and its \
 figures are written by
 
@@ -38,7 +38,7 @@ PAPER = Page("reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
 FORCES = Page("force-priors", "Force priors: results", FORCES_INTRODUCTION)
 
 TRIAL_PRESETS = ("smoke", "forces-smoke")
-"""Presets that test the machinery; their numbers say nothing about the models."""
+"""Presets that test the machinery; their numbers mean nothing for the models."""
 
 
 def page_of(preset: str) -> Page:

@@ -18,7 +18,7 @@ def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[st
     parts = [f"# {page.title}"]
     parts.append(page.introduction.format(command=documents[experiments[0].name]["command"]))
     if preset in TRIAL_PRESETS:
-        parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers say nothing about the models.**")
+        parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers mean nothing for the models.**")
     for experiment in experiments:
         document = documents[experiment.name]
         parts.append(f"## {experiment.title}")

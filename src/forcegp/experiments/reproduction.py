@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from matplotlib.figure import Figure
 
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import InvalidInput
 from forcegp.evaluation import save_figure
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.pages import page_of
@@ -100,17 +99,6 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
-
-
-def read_document(file: Path) -> dict[str, Any]:
-    """A `<name>.json` that `reproduce` wrote. Raises FileFormatError for anything else."""
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FileFormatError(f"{file} cannot be read: {error}") from None
-    if not isinstance(document, dict) or document.get("kind") != KIND:
-        raise FileFormatError(f"{file} was not written by `{KIND}`.")
-    return document
 
 
 def as_csv(rows: Sequence[Row]) -> str:

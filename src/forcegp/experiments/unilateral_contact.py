@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, median_and_range
+from forcegp.evaluation.summary_statistics import formatted, medians
 from forcegp.experiments.force_experiment import ForceExperiment, Trial
 from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS
 from forcegp.experiments.force_tables import score_table
@@ -38,10 +38,7 @@ class UnilateralContact(ForceExperiment):
     @override
     def summary(self, results: JobStore) -> dict[str, Any]:
         found = [results.result(self.data_job("bullet", seed, training=True).name) for seed in self.seeds]
-        shares = {
-            name: median_and_range(job[name] for job in found) for name in ("in_contact_truth", "in_contact_detected")
-        }
-        return super().summary(results) | shares
+        return super().summary(results) | medians(found, ("in_contact_truth", "in_contact_detected"))
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:

@@ -108,7 +108,6 @@ class Engine(ABC):
 class Exact(Engine):
     """The factorised covariance of all rows (the default up to 1500 rows): the only engine that can leave rows out."""
 
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "exact"
     remedy: ClassVar[str] = "use engine='iterative' or engine='inducing', or fewer points"
 
@@ -137,7 +136,6 @@ class Iterative(Engine):
     what is free). `solve_covariance`: see `IterativePosterior`.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "iterative"
     remedy: ClassVar[str] = "give Iterative fewer points, use engine='inducing', or fewer rows"
     points: int | None = None
@@ -200,7 +198,6 @@ class Inducing(Engine):
     leave out no more than `tolerance`: elsewhere the bound prefers what few points can describe.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "inducing"
     remedy: ClassVar[str] = "give Inducing fewer points, or fewer rows"
     points: int = 500
@@ -233,7 +230,6 @@ class Stochastic(Engine):
     variational one at the parameters that were found, from one pass over all rows.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "stochastic"
     remedy: ClassVar[str] = "give Stochastic fewer points or smaller batches, or fewer rows"
     points: int = 200

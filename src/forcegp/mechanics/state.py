@@ -11,6 +11,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.robots import Kinematics, Robot
+from forcegp.robots.arguments import Inertials, JointValues
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +30,7 @@ class State:
 
     @classmethod
     def of(
-        cls,
-        robot: Robot,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        u: Float[Tensor, "*#batch nv"],
-        inertials: Mapping[str, Tensor] | None = None,
+        cls, robot: Robot, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
     ) -> State:
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
         for name, value in (("q", q), ("v", v), ("u", u)):

@@ -25,6 +25,7 @@ from forcegp.mechanics.known_forces import (
 from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
+from forcegp.robots.arguments import Inertials, JointValues
 
 FORMAT_VERSION = 1
 STORED_PARTS = {"urdf": str, "gravity": list, "armature": list, "locked": dict, "contacts": list, "known_forces": list}
@@ -64,11 +65,7 @@ class MechanicalSystem:
                 )
 
     def dynamics(
-        self,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        u: Float[Tensor, "*#batch nv"],
-        inertials: Mapping[str, Tensor] | None = None,
+        self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
     ) -> ConstrainedDynamics:
         """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
 

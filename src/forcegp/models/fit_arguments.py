@@ -11,7 +11,20 @@ from torch import Tensor
 
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
 from forcegp.errors import InvalidInput
+from forcegp.mechanics import MechanicalSystem
 from forcegp.models.noise import Noise
+
+
+def check_system_and_noise(model: Any) -> None:
+    """What every constructor asks: `system` is a MechanicalSystem, and a bare number as `noise` becomes a `Noise`.
+
+    Raises InvalidInput for another system.
+    """
+    if not isinstance(model.system, MechanicalSystem):
+        given = type(model.system).__name__
+        raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
+    if model.noise is not None and not isinstance(model.noise, Noise):
+        object.__setattr__(model, "noise", Noise(model.noise))
 
 
 def checked_rows(joint_names: Sequence[str], dataset: Dataset) -> Dataset:

@@ -48,6 +48,14 @@ class Prediction(Gaussian):
     unknown_force: Gaussian | None
     noise_covariance: Float[Tensor, "*batch nv nv"]
 
+    @classmethod
+    def of_accelerations(
+        cls, mean: Float[Tensor, "*b nv"], variance: Float[Tensor, "*b nv"] | None, noise: Float[Tensor, "*b nv"]
+    ) -> Prediction:
+        """Of a model of independent joints without forces; `noise` is the variance of a measurement about it."""
+        covariance = None if variance is None else torch.diag_embed(variance)
+        return cls(mean, covariance, None, None, None, torch.diag_embed(noise))
+
     @property
     def acceleration(self) -> Gaussian:
         """`mean` and `covariance` under their full name."""

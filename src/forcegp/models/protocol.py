@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -310,6 +310,9 @@ class Posterior(ABC):
 
 class Model(ABC):
     """A model of the forward dynamics of one `system`. `fit` may take more keywords than those named here."""
+
+    # Constructors check their arguments, with messages for people; run-time checks of annotations must not come before.
+    __no_type_check__: ClassVar[bool] = True
 
     system: MechanicalSystem
 

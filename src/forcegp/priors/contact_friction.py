@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -57,9 +56,6 @@ class ContactFriction(ExpressedKernels):
         friction with a learned velocity scale, see `JointFriction`) where the velocity is the only input and the
         friction not viscous, and for "squared-exponential" elsewhere.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     contact: int = 0
     axes: str = "isotropic"

@@ -33,6 +33,9 @@ class ForcePrior(ABC):
     the unknown force is the sum of what the two describe.
     """
 
+    # Constructors check their arguments, with messages for people; run-time checks of annotations must not come before.
+    __no_type_check__: ClassVar[bool] = True
+
     @abstractmethod
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
         """One readable name per latent function."""
@@ -102,9 +105,6 @@ class SumPrior(ForcePrior):
     for afterwards. Sums among the terms are taken apart. Raises InvalidInput for fewer than two terms and for two
     equal ones, which no data could separate.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     terms: tuple[ForcePrior, ...]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -30,9 +30,6 @@ class JointForces(ExpressedKernels):
     that turns enters as its sine and cosine, so that a full turn changes nothing and +pi is beside -pi. `kernel` is an
     expression of `forcegp.priors.kernel_of`; the default has one length scale per feature.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     inputs: tuple[str, ...] = INPUTS
     kernel: str = "squared-exponential"

@@ -27,8 +27,6 @@ class JointFriction(PerJointPrior, ExpressedKernels):
     only scaled, never shifted, so that zero stays zero. `joints` restricts the prior to some joints, by name.
     """
 
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
     depends_on: ClassVar[Literal["q", "v"]] = "v"
 
     joints: tuple[str, ...] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from gpytorch.kernels import Kernel
@@ -29,9 +29,6 @@ class Payload(ForcePrior):
     parameters of the link (`StructuredGP.identify`). With `moments=False` the load
     is a point mass at the origin of the frame.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     frame: str
     moments: bool = True

@@ -34,8 +34,6 @@ class PeriodicJointForces(PerJointPrior):
     2 pi / 12, behind a gear of ratio 100 it is 2 pi / 1200. `joints` restricts the prior to some joints, by name.
     """
 
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
     depends_on: ClassVar[Literal["q", "v"]] = "q"
 
     period: float = 2.0 * math.pi

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -55,9 +54,6 @@ class ToolForces(ExpressedKernels):
     Velocities are only scaled, never shifted, so that a linear kernel is viscous friction. Forces along "surface" axes
     vanish where the constraint does not have the contact.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     frame: str | None = None
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -25,8 +24,6 @@ class ArrayFile(Source):
     episode is read as one table per episode. An array by itself is then `[0] ... [k-1]`.
     Subclasses list the arrays (`shapes`) and give them in pieces (`blocks`).
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, path: Path, *, within: str | None = None) -> None:
         super().__init__(path)

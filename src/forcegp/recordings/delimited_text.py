@@ -6,7 +6,6 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -43,8 +42,6 @@ class DelimitedText(Source):
     delimiter: ",", ";", tab, another single letter, or "blanks" for any run of them. Default: detected from the
         first lines.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, path: Path, *, headerless: int | None = None, delimiter: str | None = None) -> None:
         super().__init__(path)

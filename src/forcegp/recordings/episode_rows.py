@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -29,8 +28,6 @@ class EpisodeRows:
     Parameters: `kept` as in `Stamps`; `logged` signals in the order of the spool's columns, `nv` of each; `step` [s]
     between even times, or None for the times of the log.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     stretch: Stretch
     kept: np.ndarray

@@ -24,7 +24,6 @@ class HDF5Arrays(ArrayFile):
     With `transposed`, arrays are stored column by column, as MATLAB does in its files of version 7.3.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     transposed: ClassVar[bool] = False
 
     @cached_property

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import override
 
@@ -27,7 +27,6 @@ class LeRobotFolder(Source):
     Raises FileFormatError if the files do not hold what `info.json` states.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     suggested_time = "timestamp"
     suggested_episode = "episode_index"
 

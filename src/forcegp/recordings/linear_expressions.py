@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -32,8 +31,6 @@ class LinearExpression:
 
     `weights` maps column names to their weights, none of them twice.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     weights: Mapping[str, float]
     constant: float = 0.0

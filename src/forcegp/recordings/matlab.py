@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -57,8 +56,6 @@ class MatlabFile(ArrayFile):
     Vectors may lie either way. scipy reads whole variables, so what these hold must fit into memory.
     Raises FileFormatError for cells, which have no columns.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -33,8 +33,6 @@ class MessageLayout:
     `places` maps columns to (offset, type); type "stamp" is seconds and nanoseconds, read as nanoseconds. `fixed` lists
     the offsets of the bytes that decide the layout: lengths, and the names of joints.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     template: bytes
     places: dict[str, tuple[int, str]] = field(default_factory=dict)

@@ -6,7 +6,6 @@ import math
 import zipfile
 from collections.abc import Iterator
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from numpy.lib import format as npy
@@ -23,8 +22,6 @@ _ERRORS = (zipfile.BadZipFile, NotImplementedError)
 
 class NumpyArchive(ArrayFile):
     """The arrays of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
-
-    __no_type_check__: ClassVar[bool] = True
 
     @cached_property
     def _arrays(self) -> dict[str, tuple[str, tuple[int, ...], bool, np.dtype]]:

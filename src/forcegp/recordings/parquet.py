@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pyarrow
@@ -31,8 +30,6 @@ class ParquetFile(Source):
     Lists are of fixed size, or as long as in the first row. `names` gives elements of a list column names of their own:
     `observation.state.elbow` instead of `observation.state[0]`.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, path: Path, *, names: Mapping[str, Sequence[str]] | None = None) -> None:
         super().__init__(path)

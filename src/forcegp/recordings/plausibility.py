@@ -46,7 +46,7 @@ def require_plausible_positions(
             )
         if degrees and not stated and not np.isfinite(upper - lower):
             raise DatasetError(
-                f"{where}, more than two turns. Say --unit q=deg if it is in degrees, --unit q=rad if not."
+                f"{where}, more than two turns. Give --unit q=deg if it is in degrees, --unit q=rad if not."
             )
 
 

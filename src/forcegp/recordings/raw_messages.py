@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +25,6 @@ BEFORE_MESSAGE = 22
 @dataclass(frozen=True)
 class RawMessages:
     """Messages in one buffer (bytes,), in the order of time: where each begins, how long it is, its log time in ns."""
-
-    __no_type_check__: ClassVar[bool] = True
 
     buffer: np.ndarray
     begins: np.ndarray

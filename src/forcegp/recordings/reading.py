@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -33,8 +32,6 @@ class RawRecording:
     lowest, highest: (signals,) of each signal of the plan, in SI.
     jumps: rows before which a turning joint moves by more than half a turn, with the signal.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     label: str
     source: Source

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from typing_extensions import override
@@ -37,7 +37,6 @@ class RosBag(Source):
     Raises MissingExtra without `rosbags`.
     """
 
-    __no_type_check__: ClassVar[bool] = True
     row_word = "message"
 
     def __init__(self, path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -19,8 +18,6 @@ class SideBySide(Source):
 
     A stem by itself stands for all columns of its file. Raises InvalidInput for two files of one stem.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, sources: Sequence[Source]) -> None:
         super().__init__(Path(", ".join(str(source.path) for source in sources)))

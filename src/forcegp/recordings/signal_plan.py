@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from forcegp.recordings.source import Columns, Source
 class JointSignal:
     """One signal of one joint: `factor * unit(expression) + offset`, in SI."""
 
-    __no_type_check__: ClassVar[bool] = True
-
     signal: str
     joint: str
     expression: LinearExpression
@@ -44,8 +42,6 @@ class JointSignal:
 @dataclass(frozen=True)
 class SignalPlan:
     """Everything that is read from a table. `signals` stand signal by signal, each in the order of `joints`."""
-
-    __no_type_check__: ClassVar[bool] = True
 
     joints: tuple[str, ...]
     units: Mapping[str, Any]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 from pathlib import Path
-from typing import ClassVar
 
 from typing_extensions import override
 
@@ -30,8 +29,6 @@ def require_plausible_size(path: Path, what: str, declared: int, stored: int) ->
 
 class CountedStream(io.RawIOBase):
     """What is read from a decompressor, refused as soon as it is implausibly more than the compressed file."""
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, path: Path, stream: io.BufferedIOBase) -> None:
         self.path = path

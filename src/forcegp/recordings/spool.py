@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -20,8 +19,6 @@ class Spool:
 
     Rows are appended in blocks and read back by number; memory holds only what is read.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, folder: Path, width: int) -> None:
         self.width = width

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import override
 
@@ -51,8 +51,6 @@ def _require_text(path: Path, first: bytes) -> None:
 
 class CleanLines(io.RawIOBase):
     """A stream without comment lines and, if `blanks`, with one tab between the words of a line."""
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, stream: io.BufferedReader, *, blanks: bool) -> None:
         self.stream = stream

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Bool
@@ -45,8 +44,6 @@ class Stamps:
     `kept` (rows,) are the rows that are used; `step` is the median of the steps between them [s]; `worst` the largest
     relative deviation of a step within a stretch from it.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     stretches: tuple[Stretch, ...]
     kept: Bool[np.ndarray, " rows"]

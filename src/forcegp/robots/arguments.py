@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
 
 Vector = Sequence[float | int] | np.ndarray | Tensor
 Inertials = Mapping[str, Tensor]
+JointValues = Float[Tensor, "*#batch nv"]
+"""One value per joint, float64 (..., nv); the batch dimensions of several arguments broadcast."""
 
 
 def check_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from torch import Tensor
 from forcegp.codegen.native_code import require_plain
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
-from forcegp.robots.arguments import Inertials, broadcast_batch
+from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch
 from forcegp.robots.compiled_programs import CompiledProgram, compiled_program, default_folder
 from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, INERTIA_ENTRIES, Request
 from forcegp.robots.structure import RobotStructure
@@ -39,8 +39,6 @@ class CompiledRobot:
 
     Raises :class:`~forcegp.errors.CompilerError` where something must be compiled and no C compiler is there.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     def __init__(self, robot: RobotStructure, folder: str | Path | None = None) -> None:
         if robot.device.type != "cpu":
@@ -78,47 +76,35 @@ class CompiledRobot:
 
     # ------------------------------------------------------------------ dynamics
 
-    def mass_matrix(
-        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
         return self._evaluate("mass_matrix", inertials, q=q)[0]
 
     def bias_forces(
-        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.bias_forces <forcegp.robots.Robot.bias_forces>`."""
         return self._evaluate("bias_forces", inertials, q=q, v=v)[0]
 
     def mass_matrix_and_bias(
-        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """As :meth:`Robot.mass_matrix_and_bias <forcegp.robots.Robot.mass_matrix_and_bias>`."""
         mass, bias = self._evaluate("mass_matrix_and_bias", inertials, q=q, v=v)
         return mass, bias
 
-    def gravity_forces(
-        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.gravity_forces <forcegp.robots.Robot.gravity_forces>`."""
         return self._evaluate("gravity_forces", inertials, q=q)[0]
 
     def inverse_dynamics(
-        self,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        a: Float[Tensor, "*#batch nv"],
-        inertials: Inertials | None = None,
+        self, q: JointValues, v: JointValues, a: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.inverse_dynamics <forcegp.robots.Robot.inverse_dynamics>`."""
         return self._evaluate("inverse_dynamics", inertials, q=q, v=v, a=a)[0]
 
     def forward_dynamics(
-        self,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        tau: Float[Tensor, "*#batch nv"],
-        inertials: Inertials | None = None,
+        self, q: JointValues, v: JointValues, tau: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
         return self._evaluate("forward_dynamics", inertials, q=q, v=v, tau=tau)[0]

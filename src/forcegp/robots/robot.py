@@ -13,6 +13,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.robots.arguments import (
     Inertials,
+    JointValues,
     Vector,
     armature_values,
     broadcast_batch,
@@ -145,7 +146,7 @@ class Robot(RobotStructure):
 
     # ------------------------------------------------------------------ dynamics
 
-    def kinematics(self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"] | None = None) -> Kinematics:
+    def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:
         """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""
         self.check_input("q", q)
         if v is None:
@@ -156,46 +157,34 @@ class Robot(RobotStructure):
             q, v = q.expand(*batch, -1), v.expand(*batch, -1)
         return Kinematics.of(self, q, v)
 
-    def mass_matrix(
-        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         return self.kinematics(q).mass_matrix(inertials)
 
     def bias_forces(
-        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
         return self.kinematics(q, v).bias_forces(inertials)
 
     def mass_matrix_and_bias(
-        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
+        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """:meth:`mass_matrix` and :meth:`bias_forces` from one kinematics pass."""
         return self.kinematics(q, v).mass_matrix_and_bias(inertials)
 
-    def gravity_forces(
-        self, q: Float[Tensor, "*#batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
         return self.kinematics(q).gravity_forces(inertials)
 
     def inverse_dynamics(
-        self,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        a: Float[Tensor, "*#batch nv"],
-        inertials: Inertials | None = None,
+        self, q: JointValues, v: JointValues, a: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
         return self.kinematics(q, v).inverse_dynamics(a, inertials)
 
     def forward_dynamics(
-        self,
-        q: Float[Tensor, "*#batch nv"],
-        v: Float[Tensor, "*#batch nv"],
-        tau: Float[Tensor, "*#batch nv"],
-        inertials: Inertials | None = None,
+        self, q: JointValues, v: JointValues, tau: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``, by Cholesky.
 
@@ -209,14 +198,12 @@ class Robot(RobotStructure):
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
         return self.kinematics(q).frame_pose(frame)
 
-    def frame_jacobian(
-        self, q: Float[Tensor, "*#batch nv"], frame: str, point: Vector | None = None
-    ) -> Float[Tensor, "... 6 nv"]:
+    def frame_jacobian(self, q: JointValues, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
 
     def frame_bias_acceleration(
-        self, q: Float[Tensor, "*#batch nv"], v: Float[Tensor, "*#batch nv"], frame: str, point: Vector | None = None
+        self, q: JointValues, v: JointValues, frame: str, point: Vector | None = None
     ) -> Float[Tensor, "... 6"]:
         """Acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``, classical, without gravity.
 

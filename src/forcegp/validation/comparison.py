@@ -38,8 +38,8 @@ class Comparison:
     identification: what `@identified` and the mass matrix of force errors take, a key of `IDENTIFICATIONS`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
-    measured_torque: whether predictions know that their u is as noisy (`Noise`); needs `force_noise`, or models that
-        rest on an identification that knows its noise.
+    measured_torque: whether predictions account for a u that is as noisy (`Noise`); needs `force_noise`, or models that
+        rest on an identification that estimates its noise.
     friction: laws that identifications estimate, as in `forcegp.analytical.identify_analytical`.
 
     Raises InvalidInput for parts that do not fit, and DatasetError for splits whose sides overlap.

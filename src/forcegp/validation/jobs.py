@@ -116,7 +116,7 @@ def compute(
                 result = _score(store, comparison, spec, work)
         except ForceGPError as problem:
             error = " ".join(str(problem).split())
-        except Exception as problem:  # a model of somebody else may fail in any way; its row will say how
+        except Exception as problem:  # a model of somebody else may fail in any way; its row names the error
             error = " ".join(f"{type(problem).__name__}: {problem}".split())
     split = comparison.splits[spec["split"]].name
     return {**{key: spec[key] for key in ("kind", "name", "seed")}, "split": split, "result": result, "error": error}
@@ -185,11 +185,11 @@ def reference_mass(
     """The mass matrices that turn errors of every model into forces, and whose they are, as part of a sentence.
 
     One and the same for all models and seeds of a split: of the system identified with the first seed, because a URDF
-    seldom knows rotor inertias; of the system as given where that identification failed.
+    seldom holds rotor inertias; of the system as given where that identification failed.
     """
     found = kept(store, name)
     if found["result"] is None:
-        told = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
-        return mass_matrices(comparison.system, test), told
+        whose = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
+        return mass_matrices(comparison.system, test), whose
     system = MechanicalSystem.from_dict(found["result"]["system"])
     return mass_matrices(system, test), f"the system identified with seed 0 by {found['result']['how']}"

@@ -59,7 +59,7 @@ def validate(
     """Fit every model for every split and seed, score it on the rows held out, and write one page about all of them.
 
     Every finished piece is kept in `folder/jobs` at once; the same call goes on after an interruption, and one with
-    more models or seeds computes only these. A model that fails is a row that says why.
+    more models or seeds computes only these. A model that fails is a row that names the error.
 
     Parameters
     ----------

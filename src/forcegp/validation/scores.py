@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from forcegp.checks.findings import plain
 from forcegp.data import Dataset, time_blocks
 from forcegp.evaluation import metrics
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
@@ -109,8 +110,3 @@ def over_joints(score: str, values: Sequence[float | None]) -> float | None:
     if not known:
         return None
     return float(np.sqrt(np.square(known).mean())) if score.startswith("force") else float(np.mean(known))
-
-
-def plain(values: Float[np.ndarray, " k"]) -> list[float | None]:
-    """As JSON numbers, None for what is not finite."""
-    return [float(value) if np.isfinite(value) else None for value in values]

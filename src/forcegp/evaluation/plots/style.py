@@ -1,4 +1,4 @@
-"""What all figures share: colours that everyone can tell apart, quiet axes, names, units, and whole PNG files."""
+"""What all figures share: colours that everyone can distinguish, quiet axes, names, units, and whole PNG files."""
 
 from __future__ import annotations
 

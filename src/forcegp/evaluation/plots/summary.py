@@ -65,9 +65,9 @@ def summary_figure(
 
 
 def _what(posterior: Posterior) -> str:
-    return (
-        "the force that nobody modelled" if posterior.predicts_forces else f"the {posterior.description} all it knows"
-    )
+    if posterior.predicts_forces:
+        return "the force that nobody modelled"
+    return f"the {posterior.description} all it has learned"
 
 
 def _draw_acceleration(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) -> None:

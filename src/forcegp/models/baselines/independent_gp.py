@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from forcegp.models.baselines.independent_posterior import (
 )
 from forcegp.models.fit_arguments import (
     check_search_numbers,
+    check_system_and_noise,
     described_rows,
     first_start,
     resolved_noise,
@@ -53,20 +54,13 @@ class IndependentGP(Model):
     noise: as in `StructuredGP`, of the acceleration only: without a mass matrix there is no noise of forces.
     """
 
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
-
     system: MechanicalSystem
     inputs: tuple[str, ...] = ("q", "v", "u")
     noise: Noise | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, MechanicalSystem):
-            given = type(self.system).__name__
-            raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
+        check_system_and_noise(self)
         object.__setattr__(self, "inputs", JointForces(self.inputs).inputs)
-        if self.noise is not None and not isinstance(self.noise, Noise):
-            object.__setattr__(self, "noise", Noise(self.noise))
         if self.noise is not None and self.noise.force is not None:
             raise InvalidInput(
                 "an IndependentGP has no noise of forces, for it has no mass matrix; give Noise(acceleration) alone."

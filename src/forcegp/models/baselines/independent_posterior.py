@@ -204,12 +204,4 @@ class IndependentPosterior(Posterior):
         variance = None
         if covariance:
             variance = torch.cat([latent.covariance(z)[..., 0] for latent in self.latents], dim=-1)
-        noise = self.noise_std.square().expand_as(mean)
-        return Prediction(
-            mean,
-            None if variance is None else torch.diag_embed(variance),
-            multiplier=None,
-            contact_force=None,
-            unknown_force=None,
-            noise_covariance=torch.diag_embed(noise),
-        )
+        return Prediction.of_accelerations(mean, variance, self.noise_std.square().expand_as(mean))

@@ -17,8 +17,13 @@ from typing_extensions import override
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import Engine, OptimizationResult
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models.fit_arguments import check_search_numbers, described_rows, resolved_noise, training_rows
+from forcegp.models.fit_arguments import (
+    check_search_numbers,
+    check_system_and_noise,
+    described_rows,
+    resolved_noise,
+    training_rows,
+)
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Prediction
 from forcegp.models.protocol import Model, Posterior
@@ -32,19 +37,12 @@ class NetworkModel(Model):
     mean square over the training rows.
     """
 
-    # These constructors are the checks, with messages for people; checks of annotations must not come before them.
-    __no_type_check__: ClassVar[bool] = True
-
     noise: Noise | None
     name: ClassVar[str]
     objective: ClassVar[str]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, MechanicalSystem):
-            given = type(self.system).__name__
-            raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
-        if self.noise is not None and not isinstance(self.noise, Noise):
-            object.__setattr__(self, "noise", Noise(self.noise))
+        check_system_and_noise(self)
         if self.noise is not None and (self.noise.learn or self.noise.force is not None):
             raise InvalidInput(
                 "a network takes known noise of the acceleration only; without it, it estimates noise from residuals"
@@ -158,14 +156,7 @@ class NetworkPosterior(Posterior):
         if self._known_variance is not None:
             variance = variance + (scatter - self._known_variance).clamp_min(0.0)
             noise = self._known_variance.expand_as(mean)
-        return Prediction(
-            mean,
-            torch.diag_embed(variance) if covariance else None,
-            multiplier=None,
-            contact_force=None,
-            unknown_force=None,
-            noise_covariance=torch.diag_embed(noise),
-        )
+        return Prediction.of_accelerations(mean, variance if covariance else None, noise)
 
     def _moments(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         shift, scale = self.standardization.shift[0], self.standardization.scale[0]

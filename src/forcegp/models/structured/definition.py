@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar, get_args
+from typing import get_args
 
 from torch import Tensor
 from typing_extensions import override
@@ -11,6 +11,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.inference import ProblemSize
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models.fit_arguments import check_system_and_noise
 from forcegp.models.noise import Noise
 from forcegp.models.protocol import Model
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, Mean
@@ -22,21 +23,15 @@ from forcegp.priors import ForcePrior, JointForces
 class StructuredModel(Model):
     """The fields of a `StructuredGP`, checked, and the likelihood that they define."""
 
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
-
     system: MechanicalSystem
     prior: ForcePrior = field(default_factory=JointForces)
     mean: Mean = "analytical"
     noise: Noise | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in (("system", MechanicalSystem), ("prior", ForcePrior)):
-            if not isinstance(getattr(self, name), kind):
-                given = type(getattr(self, name)).__name__
-                raise InvalidInput(f"{name} is a {given}; give a {kind.__name__}, for example system=dataset.system")
-        if self.noise is not None and not isinstance(self.noise, Noise):
-            object.__setattr__(self, "noise", Noise(self.noise))
+        check_system_and_noise(self)
+        if not isinstance(self.prior, ForcePrior):
+            raise InvalidInput(f"prior is a {type(self.prior).__name__}; give a ForcePrior, for example JointForces()")
         if self.mean not in get_args(Mean):
             raise InvalidInput(f"mean is {self.mean!r}; allowed: {', '.join(map(repr, get_args(Mean)))}")
         self.prior.check(self.system)
