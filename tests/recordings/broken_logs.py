@@ -326,7 +326,7 @@ BROKEN = {
         "map columns of one topic",
         "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --joints shoulder,elbow",
     ),
-    "fewer frames": Broken(lerobot(lambda info: info.update(total_frames=7)), "says 7 frames", LEROBOT),
+    "fewer frames": Broken(lerobot(lambda info: info.update(total_frames=7)), "has 7 frames", LEROBOT),
     "another version": Broken(lerobot(lambda info: info.update(codebase_version="v1.6")), "'v1.6'", LEROBOT),
     "another shape": Broken(
         lerobot(lambda info: info["features"]["observation.effort"].update(shape=[3])), "has the shape [3]", LEROBOT
