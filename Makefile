@@ -34,6 +34,7 @@ check: $(VENV)/.check  ## lint, format, types and the rule of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+	$(BIN)/pyright -p pyright-public.json
 	$(BIN)/python -m pytest -q tests/test_architecture.py
 
 format: $(VENV)/.check  ## mend what ruff can mend by itself

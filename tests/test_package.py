@@ -147,3 +147,11 @@ def test_other_files_of_the_repository_parse_and_agree(repository):
 def test_no_picture_is_there_twice(repository):
     pictures = {path.relative_to(repository) for path in (repository / "docs").rglob("*.svg")}
     assert not {path for path in pictures if (repository / path).with_suffix(".png").exists()}
+
+
+def test_every_module_of_a_public_name_is_checked_strictly(repository):
+    text = (repository / "pyright-public.json").read_text()
+    checked = set(re.findall(r'"(src/forcegp/[^"]+)"', text))
+    public = {getattr(forcegp, name).__module__ for name in forcegp.__all__}
+    assert checked == {f"src/{module.replace('.', '/')}.py" for module in public}
+    assert '"typeCheckingMode": "strict"' in text

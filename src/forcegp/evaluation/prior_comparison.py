@@ -202,8 +202,8 @@ def compare_priors(
         )
     models = {name: _named(name, partial(StructuredGP, known, prior, mean, noise)) for name, prior in priors.items()}
     _require_memory([_named(name, partial(_checked_size, model, rows)) for name, model in models.items()], known)
-    how = {"restarts": restarts, "seed": seed, "backend": workers, "hyperprior": hyperprior, "options": options}
-    how["engine"] = "exact"  # whatever the number of rows: no other can leave rows out
+    how: dict[str, Any] = {"restarts": restarts, "seed": seed, "backend": workers, "hyperprior": hyperprior}
+    how |= {"options": options, "engine": "exact"}  # whatever the number of rows: no other engine can leave rows out
     posteriors = {}
     for name, model in models.items():
         note = None if progress is None else _note(progress, name)
