@@ -8,10 +8,11 @@ import pytest
 import torch
 from tests.models.arm import arm_data
 
-from forcegp import JointFriction, NoForces, StructuredGP, load_posterior, save_posterior
+from forcegp import JointAccelerations, JointFriction, NoForces, StructuredGP, load_posterior, save_posterior
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalError, NumericalWarning
 from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, ProblemSize, Stochastic, choose_engine
 from forcegp.inference import memory as memory_module
+from forcegp.models.structured.refinement import _moved_to
 
 QUICK = OptimizerOptions(iterations=5)
 
@@ -218,6 +219,18 @@ def test_mini_batches_that_make_it_worse_change_nothing_and_say_so(data, rate, s
         assert torch.equal(tried.parameters[name], value)
 
 
+def test_mini_batches_at_the_optimum_may_end_less_than_a_nat_above_it(data):
+    """They change nothing then, and there is nothing to warn of: warnings are errors here."""
+    tried = fit(data, Stochastic(points=60, steps=5, batch=10, rate=0.01, seed=0))
+    assert tried.settings["refined"].startswith("unchanged: 5 steps on 10 rows each would raise")
+
+
+def test_the_time_of_refining_is_added(data):
+    posterior = fit(data, points=15)
+    result = replace(posterior.result, parameters={}, cpu_seconds=3.0)
+    assert _moved_to(posterior, result).result.cpu_seconds == posterior.result.cpu_seconds + 3.0
+
+
 def test_far_rows_beyond_the_learning_rows_are_said(data):
     lifted = replace(data, q=np.where(np.arange(60)[:, None] < 50, data.q + 0.3, data.q))
     near = lifted.rows(np.arange(59, -1, -1))  # the ten near ones first
@@ -240,3 +253,13 @@ def test_many_rows_of_many_features_take_mini_batches():
     chosen = choose_engine(ProblemSize(60_000, 7, 6, 7, 21), torch.device("cpu"))
     assert chosen.engine == Stochastic()
     assert "hours" in chosen.reason
+
+
+def test_a_description_names_what_is_learned(data):
+    def described(prior):
+        return fit(data, prior=prior, points=10).description
+
+    assert described(JointAccelerations()).startswith("unconstrained accelerations, ")
+    assert described(NoForces()) == "analytical model"
+    assert described(None).endswith(" mean")
+    assert "unconstrained" not in described(None)

@@ -19,6 +19,7 @@ from forcegp.mechanics import (
 from forcegp.models import Coefficients, StructuredGP
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.models.search import with_steps_before
+from forcegp.models.structured.physical_start import _slopes
 from forcegp.priors import NoForces
 from forcegp.robots import LinkInertia
 
@@ -218,3 +219,12 @@ def test_a_link_has_three_parts(parts):
         system().robot.link("hand").inertial(*parts)
     assert system().robot.link("hand").inertial("center_of_mass").parts == ("com",)
     assert system().robot.link("hand").inertial().parts == ("mass", "com", "inertia")
+
+
+def test_slopes_of_the_start_are_derivatives():
+    s = torch.tensor([0.3, -0.7], dtype=torch.float64)
+    mean, covariance = _slopes(lambda s: (torch.stack([s[0] ** 2, s[0] * s[1], s[1].exp()]), torch.diag(s.sin())), s)
+    x, y = s
+    expected = torch.stack([torch.stack([2 * x, y, 0 * x]), torch.stack([0 * x, x, y.exp()])])
+    torch.testing.assert_close(mean, expected, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(covariance, torch.stack([torch.diag(row * s.cos()) for row in torch.eye(2).double()]))

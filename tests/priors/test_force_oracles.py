@@ -134,8 +134,8 @@ class TestToolForces:
             count = len(prior.latent_names(system.robot))
             assert torch.equal(prior.mixing(free), torch.zeros(ROWS, system.robot.nv, count).double())
             assert torch.equal(prior.point_force(free), torch.zeros(ROWS, 3, count).double())
-            widths = [z.shape[-1] for z in prior.features(system.dynamics(*rows))]
-            assert [z.shape[-1] for z in prior.features(free)] == widths
+            shapes = [z.shape for z in prior.features(system.dynamics(*rows))]
+            assert [z.shape for z in prior.features(free)] == shapes
         assert bool((ToolForces(FRAME, axes="world").mixing(free) != 0.0).any())
 
 
@@ -238,6 +238,13 @@ def test_periodic_forces_repeat(dynamics):
             torch.testing.assert_close(K, kernel(z[c], z[c]).to_dense(), rtol=1e-9, atol=1e-9)
             torch.testing.assert_close(K.diagonal(), (c + 1.0) * torch.ones(ROWS).double(), rtol=1e-9, atol=0.0)
             assert float(kernel(z[c], half[c]).to_dense().diagonal().max()) < 0.5 * (c + 1.0)
+
+
+def test_a_periodic_kernel_starts_at_the_median_of_its_prior(dynamics):
+    robot = dynamics.state.robot
+    for kernel in PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()):
+        assert kernel.base_kernel.lengthscale.item() == pytest.approx(1.0)
+        assert kernel.base_kernel.period_length.item() == pytest.approx(0.3)
 
 
 def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
