@@ -76,7 +76,7 @@ def test_results_of_other_code_are_computed_anew_with_one_sentence(reproduced, i
     for file in (tmp_path / "out" / "jobs" / "fits").glob("analytical/**/job.json"):
         stored = json.loads(file.read_text())
         file.write_text(json.dumps({**stored, "digest": "0", "code": "0", "result": {}}))
-    done = installed("reproduce", "all", "--out", "out", folder=tmp_path, timeout=600.0)
+    done = installed("reproduce", "all", "--out", "out", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert re.findall("warning: .* were computed by other code; they are computed anew", done.stderr)
     assert reproduced.text(tmp_path / "out") == reproduced.text()

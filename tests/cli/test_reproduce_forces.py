@@ -62,7 +62,7 @@ def test_one_experiment_has_a_page_of_its_own(reproduced, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("all", "--preset", "forces", "--out", "out"), "holds results of preset 'forces-smoke', not 'forces'"),
+        (("all", "--preset", "forces", "--out", "out"), "results with another preset ('forces-smoke', not 'forces')"),
     ],
 )
 def test_refusals_are_one_line_and_leave_everything(reproduced, arguments, message):
