@@ -34,6 +34,7 @@ from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from tests.mutant_sample import REPOSITORY, Mutant, digest, mutants, python_files
 
@@ -50,7 +51,7 @@ IMPORTED_ONCE += ("hypothesis.strategies", "jaxtyping", "h5py", "safetensors.tor
 class Watch:
     """Plugin of pytest: runs the named tests in the given order, and records seconds, outcomes and lines."""
 
-    def __init__(self, chosen: list[str] | None = None, coverage: object = None) -> None:
+    def __init__(self, chosen: list[str] | None = None, coverage: Any = None) -> None:
         self.chosen, self.coverage = chosen, coverage
         self.seconds: dict[str, float] = {}
         self.failed: list[str] = []
@@ -65,16 +66,16 @@ class Watch:
         """Lines from here on are this test's."""
         self.begin = time.process_time()
         if self.coverage is not None:
-            self.coverage.switch_context(nodeid)  # type: ignore[attr-defined]
+            self.coverage.switch_context(nodeid)
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
         """So long it took."""
         self.seconds[nodeid] = time.process_time() - self.begin
 
-    def pytest_runtest_logreport(self, report: object) -> None:
+    def pytest_runtest_logreport(self, report: Any) -> None:
         """Remember what failed."""
-        if report.failed:  # type: ignore[attr-defined]
-            self.failed.append(report.nodeid)  # type: ignore[attr-defined]
+        if report.failed:
+            self.failed.append(report.nodeid)
 
     pytest_collectreport = pytest_runtest_logreport
 

@@ -73,3 +73,12 @@ def test_other_models_refuse_windows(forcegp, folder):
     refused = forcegp(*words, folder=folder)
     assert refused.returncode == 2
     assert "--learn-from means nothing to --model independent-gp" in refused.stderr
+
+
+def test_known_physics_alone_is_scored_on_windows_too(forcegp, folder):
+    words = ("fit", "raw.h5", "--model", "analytical", "--points", 6, "--iterations", 2, "--learn-from", "weak-form")
+    done = forcegp(*words, "--out", "physics", folder=folder)
+    assert done.returncode == 0, done.stderr
+    posterior = load_posterior(folder / "physics")
+    assert posterior.training.weights is not None
+    assert float(posterior.noise_std.max()) < 100.0  # the column `a`, which holds 1000, was not looked at

@@ -103,9 +103,9 @@ def test_folders_of_something_else_are_refused(tmp_path):
 
 
 def test_only_one_at_a_time(results):
-    with results.locked(), pytest.raises(InvalidInput, match="another `forcegp reproduce` is at work"):  # noqa: SIM117
-        with JobStore.open(results.folder, KIND, {"preset": "smoke"}).locked():
-            pass
+    other = JobStore.open(results.folder, KIND, {"preset": "smoke"})
+    with results.locked(), pytest.raises(InvalidInput, match="another `forcegp reproduce` is at work"), other.locked():
+        pass
     with results.locked():
         pass  # free again
 

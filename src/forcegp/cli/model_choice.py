@@ -74,9 +74,8 @@ def make_model(
     if command.model in NETWORKS:
         noise = _known_noise(command.noise, dataset)
         steps = {} if command.iterations is None else {"steps": command.iterations}
-        return (forcegp.NeuralNetwork if command.model == "neural-network" else forcegp.NetworkEnsemble)(
-            system, noise, **steps
-        )
+        network = forcegp.NeuralNetwork if command.model == "neural-network" else forcegp.NetworkEnsemble
+        return network(system, noise, **steps)
     windows = command.learn_from != "accelerations"
     noise = (noise_of_windows if windows else resolved_noise)(command.noise, dataset, command.force_noise)
     if command.measured_torque:
@@ -97,8 +96,8 @@ def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
     if command.model in NETWORKS:
         return {"seed": command.seed}
     assert command.iterations is not None, "a resolved command has iterations"
-    engine = {"engine": command.engine, "learning_points": command.learning_points}
     observe = window_observation(command.learn_from, command.window)
+    rows: dict[str, Any] = {}
     if observe is not None:
         if command.engine not in ("auto", "exact") or command.learning_points is not None:
             raise InvalidInput(
@@ -106,11 +105,13 @@ def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
                 "conditioned on exactly, and all are learned from; leave both out, and give fewer --points if it takes "
                 "too long."
             )
-        engine = {"observe": observe}
+        rows = {"observe": observe}
+    elif command.model in MEANT_FOR["engine"]:
+        rows = {"engine": command.engine, "learning_points": command.learning_points}
     options = forcegp.models.default_options(points)
     return {
         "seed": command.seed,
-        **(engine if command.model in MEANT_FOR["engine"] else {}),
+        **rows,
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,
@@ -122,19 +123,15 @@ def window_observation(learn_from: LearnFrom, seconds: float | None) -> forcegp.
     """What to observe of windows of that length; None for accelerations. Raises InvalidInput for no length."""
     if learn_from == "accelerations":
         return None
-
-    return (forcegp.WeakForm if learn_from == "weak-form" else forcegp.VelocityIncrements)(
-        WINDOW if seconds is None else seconds
-    )
+    kind = forcegp.WeakForm if learn_from == "weak-form" else forcegp.VelocityIncrements
+    return kind(WINDOW if seconds is None else seconds)
 
 
 def noise_of_windows(given: str, dataset: forcegp.Dataset, force: float | None = None) -> forcegp.Noise | None:
     """`resolved_noise` of windows, which no dataset states: it is learned unless it is a number."""
-    return (
-        resolved_noise(given, dataset, force)
-        if given not in ("dataset", "learned")
-        else forcegp.Noise(None, force, True)
-    )
+    if given in ("dataset", "learned"):
+        return forcegp.Noise(None, force, learn=True)
+    return resolved_noise(given, dataset, force)
 
 
 def of_measured_torque(noise: forcegp.Noise | None) -> forcegp.Noise:

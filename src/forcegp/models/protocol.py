@@ -305,7 +305,7 @@ class Posterior(ABC):
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""
-        return replace(self, settings={**self.settings, **settings})  # type: ignore[type-var]  # see the class
+        return replace(self, settings={**self.settings, **settings})  # type: ignore[type-var]  # every posterior is a dataclass
 
 
 class Model(ABC):

@@ -229,9 +229,8 @@ class StructuredGP(StructuredModel):
         chosen = engine_of(engine)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:
-            chosen.require_memory(
-                self.problem_size(len(all_rows)), self.system.robot.device
-            )  # now, not after the search
+            # now, not after the search
+            chosen.require_memory(self.problem_size(len(all_rows)), self.system.robot.device)
         if learn is not None and learning_points is None:
             learning_points = len(all_rows)
         rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
@@ -277,7 +276,9 @@ class StructuredGP(StructuredModel):
         unknown = moved.keys() - MOVED
         if unknown:
             raise TypeError(f"StructuredGP.fit() got an unexpected keyword argument {min(unknown)!r}")
-        now = "identify(dataset, learn, ...)" if moved.get("learn") else "fit_windows(dataset, observe, ...)"
+        now = "identify(dataset, learn, ...)"
+        if moved.get("learn") is None:
+            now = "fit(dataset)" if moved.get("observe") is None else "fit_windows(dataset, observe, ...)"
         message = f"fit({'=..., '.join(moved)}=...) is deprecated and will be removed; call {now}"
         warnings.warn(message, DeprecationWarning, stacklevel=3)
         learning = moved.get("learn"), moved.get("prior_strength", 0.0)
