@@ -69,7 +69,9 @@ def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
     z = posterior.likelihood.standardization(prior.features(on_a_table.system.dynamics(*states)))[2]
     prior_variance = list(posterior.latent.kernels)[2](z, diag=True)
     torch.testing.assert_close(force.mean[:, 2], torch.zeros(12).double(), rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(force.variance[:, 2], prior_variance.detach(), rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(
+        force.variance[:, 2], posterior.widening**2 * prior_variance.detach(), rtol=1e-6, atol=0.0
+    )
 
 
 def test_along_the_surface_nothing_is_hidden(on_a_table):

@@ -33,7 +33,8 @@ def at_once(posterior, data):
     first = posterior.training
     whole = type(first).of(data, torch.device("cpu"))
     whole = dataclasses.replace(whole, reference=first)
-    return posterior.model.condition(whole, posterior.parameters, posterior.result, {})
+    settings = {"widening": posterior.widening}
+    return posterior.model.condition(whole, posterior.parameters, posterior.result, settings)
 
 
 def assert_same(one, other, data, tolerance=1e-8):

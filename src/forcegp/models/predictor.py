@@ -66,6 +66,7 @@ class Predictor:
     tape: TapedTerms | EagerTerms
     kind: str
     compressed: CompressedCovariance | None
+    widening: float
     prepare_seconds: float
 
     @property
@@ -118,9 +119,9 @@ class Predictor:
         if not terms.W.shape[-1]:
             return terms.W.new_zeros(len(terms.W), 0, 0)
         if self.compressed is None:
-            return self.latent.covariance(terms.features)
+            return self.widening**2 * self.latent.covariance(terms.features)
         P = self.prepared.ordered(self.compressed.roots(cross))
-        return torch.diag_embed(self.prepared.diagonal(terms.inputs)) - P @ P.mT
+        return self.widening**2 * (torch.diag_embed(self.prepared.diagonal(terms.inputs)) - P @ P.mT)
 
     def _linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         terms, slopes = self.tape.with_jacobians(x)

@@ -34,6 +34,7 @@ from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_prior
 from forcegp.models.structured.search import Search
 from forcegp.models.structured.surface_distance import check_distance
+from forcegp.models.structured.widening import widened
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior, prior_to_dict
@@ -239,6 +240,7 @@ class StructuredGP(StructuredModel):
             fitted = self._with_refined_loads(self._fit(rows, dataset, search), rows, dataset, search)
         else:
             fitted = self._identify(rows, dataset, search, learn, prior_strength)
+        fitted = widened(fitted, search.hyperprior)
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
         described = described_rows(all_rows, dataset)
         return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
@@ -261,7 +263,9 @@ class StructuredGP(StructuredModel):
             fitted = model._identify(windows, dataset, search, learn, prior_strength)
         reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
         described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
-        return fitted.with_settings(**described, engine=Exact().to_dict(), engine_reason=reason)
+        return widened(fitted, search.hyperprior).with_settings(
+            **described, engine=Exact().to_dict(), engine_reason=reason
+        )
 
     def _fit_as_before(
         self,

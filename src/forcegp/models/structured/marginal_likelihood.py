@@ -172,8 +172,20 @@ class MarginalLikelihood:
         report: Iteration | None = None,
     ) -> LatentPosterior:
         """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`."""
+        return self.condition_kernels(kernels.at(parameters), parameters, engine, start=start, report=report)
+
+    def condition_kernels(
+        self,
+        kernels: LatentKernels,
+        parameters: Mapping[str, Tensor],
+        engine: Engine | None = None,
+        *,
+        start: Tensor | None = None,
+        report: Iteration | None = None,
+    ) -> LatentPosterior:
+        """`condition` with kernels that hold the parameters already; they are not copied."""
         with torch.no_grad():
             terms = self.terms(parameters)
             if self.training.weights is not None:
-                return FunctionalPosterior.condition(kernels.at(parameters), self.training.weights, terms)
-            return (engine or Exact()).condition(kernels.at(parameters), terms, start=start, report=report)
+                return FunctionalPosterior.condition(kernels, self.training.weights, terms)
+            return (engine or Exact()).condition(kernels, terms, start=start, report=report)

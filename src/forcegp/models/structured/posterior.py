@@ -152,7 +152,17 @@ class StructuredPosterior(Posterior):
             nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
             return Latents(nothing.flatten(-2), nothing if covariance else None)
         mean = self.latent.mean(features).reshape(*batch, latents)
-        return Latents(mean, self.latent.covariance(features).reshape(*batch, latents, latents) if covariance else None)
+        if not covariance:
+            return Latents(mean, None)
+        return Latents(mean, self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents))
+
+    @property
+    def widening(self) -> float:
+        """How many times as wide intervals are as those of `latent`, whose hyper-parameters count as known.
+
+        `structured/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
+        """
+        return float(self.settings.get("widening", 1.0))
 
     @override
     def predictor(
@@ -170,7 +180,7 @@ class StructuredPosterior(Posterior):
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        return prepared_predictor(self.latent, self.training, self._terms_function, **how)
+        return prepared_predictor(self.latent, self.widening, self.training, self._terms_function, **how)
 
     def _terms_function(self, prepared: PreparedKernels, features: bool) -> TermsFunction:
         """The terms of a predictor as a function of the state, differentiable, by the same code as `predict`.
@@ -231,7 +241,7 @@ class StructuredPosterior(Posterior):
             plain if labels is None else labels[index],
             z,
             mean,
-            variance.clamp_min(0.0).sqrt(),
+            self.widening * variance.clamp_min(0.0).sqrt(),
             visited,
         )
 
@@ -329,7 +339,7 @@ class StructuredPosterior(Posterior):
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             if not len(self.kernels.kernels):  # no unknown force: all functions are the same
                 return mean()
-            return through(draw_functions(self.latent, samples, seed))
+            return through(draw_functions(self.latent, samples, seed, self.widening))
 
         return AccelerationModel(system, baumgarte, mean, sampled)
 
