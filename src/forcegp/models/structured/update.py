@@ -20,6 +20,7 @@ from forcegp.models.search import blas_threads
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.surface_distance import check_distance
 from forcegp.models.training_data import TrainingData
+from forcegp.robots.real_numbers import whole_number
 
 Keep = Callable[[ExactPosterior, int], Tensor]
 """(posterior, budget) -> numbers of the rows to keep, ascending."""
@@ -74,8 +75,8 @@ def _check(joints: Sequence[str], rows: Dataset, budget: int | None) -> None:
     """Raises InvalidInput for rows of other joints and a budget below 2."""
     if tuple(rows.joint_names) != tuple(joints):
         raise InvalidInput(f"the new rows have joints {', '.join(rows.joint_names)}; the model has {', '.join(joints)}")
-    if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 2):
-        raise InvalidInput(f"budget is {budget!r}; it is the number of rows to keep, 2 or more, or None for all")
+    if budget is not None:
+        whole_number("budget", budget, 2)
 
 
 def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
