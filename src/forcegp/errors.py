@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import TypeVar
+
+Kind = TypeVar("Kind")
 
 
 class ForceGPError(Exception):
@@ -139,6 +142,13 @@ class OutdatedWarning(UserWarning):
 
 class DataWarning(UserWarning):
     """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
+
+
+def require_type(name: str, given: object, kind: type[Kind], example: str = "") -> Kind:
+    """The argument `name`, which is a `kind`; InvalidInput with an `example` for any other."""
+    if not isinstance(given, kind):
+        raise InvalidInput(f"{name} is a {type(given).__name__}; give a {kind.__name__}{example}")
+    return given
 
 
 def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str], *, cutoff: float = 0.6) -> str:

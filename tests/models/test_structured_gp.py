@@ -281,5 +281,5 @@ def test_states_that_make_no_sense_are_refused(posterior, test):
         posterior.predict(np.full(3, np.nan), np.zeros(3), np.zeros(3))
     with pytest.raises(InvalidInput, match="do not broadcast"):
         posterior.predict(test.q[:2], test.v[:3], test.u[:3])
-    with pytest.raises(InvalidInput, match="is not an array of real numbers|must be an array of real numbers"):
+    with pytest.raises(InvalidInput, match=r"is not an array of real numbers|must be an array of real numbers"):
         posterior.predict(["a", "b", "c"], test.v, test.u)

@@ -2,7 +2,6 @@
 
 import pickle
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -27,14 +26,6 @@ def tree() -> Robot:
 @pytest.fixture(scope="module")
 def chain() -> Robot:
     return Robot.from_urdf_text(CHAIN)
-
-
-@pytest.fixture
-def unchecked():
-    """Without the run-time check of shapes in signatures, as users have it."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def test_joints_come_depth_first_and_branches_in_file_order(tree):

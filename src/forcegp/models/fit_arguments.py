@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.noise import Noise
 from forcegp.robots.real_numbers import whole_number
@@ -24,15 +24,14 @@ def check_system_and_noise(model: Any) -> None:
 
     Raises InvalidInput for another system.
     """
-    if not isinstance(model.system, MechanicalSystem):
-        given = type(model.system).__name__
-        raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
+    require_type("system", model.system, MechanicalSystem, ", for example system=dataset.system")
     if model.noise is not None and not isinstance(model.noise, Noise):
         object.__setattr__(model, "noise", Noise(model.noise))
 
 
 def checked_rows(joint_names: Sequence[str], dataset: Dataset) -> Dataset:
     """`dataset`, if it has these joints and at least 2 rows. Raises InvalidInput otherwise."""
+    require_type("dataset", dataset, Dataset, "; the system belongs to the model, as in StructuredGP(system)")
     if tuple(dataset.joint_names) != tuple(joint_names):
         raise InvalidInput(
             f"the dataset has joints {', '.join(dataset.joint_names)}; the robot has {', '.join(joint_names)}"

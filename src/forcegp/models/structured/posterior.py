@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_type, unknown_name_message
 from forcegp.inference import (
     Engine,
     InducingPosterior,
@@ -267,6 +267,7 @@ class StructuredPosterior(Posterior):
 
         Raises InvalidInput as `with_robot`, and UnknownFrame where a force acts on a frame that the robot lacks.
         """
+        require_type("system", system, MechanicalSystem)
         trained = self.model.system
         if system.robot.joint_names != trained.robot.joint_names:
             raise InvalidInput(
