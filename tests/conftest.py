@@ -5,13 +5,14 @@ the time. `FORCEGP_TEST_THREADS=2` computes with two threads (`make test-process
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # numpy and torch read them at import
     os.environ[variable] = str(THREADS)
 
+import jaxtyping
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
@@ -45,3 +46,11 @@ def shared() -> Callable[[str], Path]:
         return found
 
     return path
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Without the types of signatures checked, as users have it: forcegp's own checks speak, integers are numbers."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -248,7 +248,7 @@ def posterior():
 
 @pytest.mark.parametrize("budget", [1, 0, -3, True])
 def test_budgets_that_mean_nothing_are_refused(posterior, budget):
-    with pytest.raises(InvalidInput, match="2 or more"):
+    with pytest.raises(InvalidInput, match="must be an integer of at least 2"):
         posterior.update(arm_data(2, seed=17), budget)
 
 

@@ -33,7 +33,7 @@ def scores(test_rows):
     """Of the URDF alone with a given noise: its prediction and its density are known in closed form."""
     system = given_system()
     posterior = StructuredGP(system, NoForces(), "analytical", tuple(SIGMA)).fit(test_rows, points=5)
-    return acceleration_scores(posterior, test_rows, mass_matrices(system, test_rows))
+    return acceleration_scores(posterior, test_rows, mass_matrices(test_rows, system))
 
 
 def predicted(test_rows) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_stretches_of_time_make_up_the_whole(scores, test_rows):
 def test_the_mass_matrix_counts_rotors(test_rows):
     system = given_system()
     with_rotors = MechanicalSystem(system.robot, (), (*system.known_forces, Armature((0.1, 0.2, 0.3))))
-    added = mass_matrices(with_rotors, test_rows) - mass_matrices(system, test_rows)
+    added = mass_matrices(test_rows, with_rotors) - mass_matrices(test_rows, system)
     assert np.allclose(added, np.diag([0.1, 0.2, 0.3]))
     change = force_errors(np.ones((len(test_rows), 3)), np.zeros((len(test_rows), 3)), added)
     assert np.allclose(change, [0.1, 0.2, 0.3])

@@ -32,7 +32,7 @@ def data():
 
 def comparison(data, **changes) -> Comparison:
     how = {"points": 15, "horizons": (0.1, 0.2), "starts": 2, "restarts": 1, "iterations": 5, **changes}
-    return Comparison(data, data, given_system(), split_named("episodes:1", data), **how)
+    return Comparison(data, data, given_system(), split_named(data, "episodes:1"), **how)
 
 
 @pytest.fixture(autouse=True)

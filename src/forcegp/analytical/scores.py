@@ -7,11 +7,13 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset
+from forcegp.data.argument_order import dataset_first
 from forcegp.mechanics import MechanicalSystem
 
 
+@dataset_first
 def motion_residuals(
-    system: MechanicalSystem, dataset: Dataset
+    dataset: Dataset, system: MechanicalSystem
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 

@@ -19,7 +19,7 @@ from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 
 
@@ -96,7 +96,10 @@ def check(
 
     Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
     """
+    require_type("dataset", dataset, Dataset)
     system = dataset.system if system is None else system
+    if system is not None:
+        require_type("system", system, MechanicalSystem)
     if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
         raise InvalidInput(
             f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "

@@ -40,6 +40,11 @@ class Command(ABC):
     json: Json
     debug: Debug
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The names of its fields, which are those of its options."""
+        return tuple(vars(self))
+
     def check_inputs(self) -> None:
         """Raise FileFormatError for an input that does not exist, at once: `run` imports torch, which takes seconds."""
         for name, annotation in get_type_hints(type(self), include_extras=True).items():

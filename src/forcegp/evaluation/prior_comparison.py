@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset, time_blocks
-from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.evaluation.scoring import evaluate
 from forcegp.inference import Exact, OptimizerOptions, ProblemSize
 from forcegp.inference.memory import require_memory
@@ -181,6 +181,8 @@ def compare_priors(
     FitError: no start of the search for a candidate could be evaluated.
     NotEnoughMemory: the exact covariances of the rows do not fit; give fewer points.
     """
+    require_type("dataset", dataset, Dataset)
+    require_type("priors", priors, Mapping, " from names to priors")
     workers = backend_for(backend, jobs)
     known = dataset.system if system is None else system
     if known is None:

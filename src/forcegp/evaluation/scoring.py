@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Evaluation, Numbers
 from forcegp.evaluation.overlap import overlap_warnings
@@ -26,6 +26,8 @@ def evaluate(
 
     Raises InvalidInput if the joints of model and Dataset differ.
     """
+    require_type("posterior", posterior, Posterior, " of a fit, and the dataset after it")
+    require_type("dataset", dataset, Dataset)
     if tuple(dataset.joint_names) != posterior.joint_names:
         raise InvalidInput(
             f"the dataset has joints {', '.join(dataset.joint_names)}; the model was trained on "

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput
+from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.mechanics.contacts import Baumgarte, Contact
 from forcegp.mechanics.gauss_principle import ConstrainedDynamics
 from forcegp.mechanics.known_forces import (
@@ -48,6 +48,7 @@ class MechanicalSystem:
     baumgarte: Baumgarte | None = None
 
     def __post_init__(self) -> None:
+        require_type("robot", self.robot, Robot, ", for example Robot.from_urdf(path)")
         for name, kind in (("contacts", Contact), ("known_forces", KnownForce)):
             given = getattr(self, name)
             values = tuple(given) if isinstance(given, Iterable) else (given,)
@@ -142,7 +143,7 @@ class MechanicalSystem:
 
     def with_contacts(self, contacts: Sequence[Contact]) -> MechanicalSystem:
         """The same robot and forces under other contacts."""
-        return replace(self, contacts=tuple(contacts))
+        return replace(self, contacts=contacts)  # type: ignore[arg-type]  # the constructor makes a tuple, or refuses
 
     def force_index(self, name: str) -> int:
         """Position of the one known force that files call `name`, among those whose coefficients can be estimated.

@@ -10,9 +10,13 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.noise import Noise
+from forcegp.robots.real_numbers import whole_number
+
+MOST_RESTARTS = 10_000
+"""So that a slip such as 10**9 is refused: a start takes from tenths of a second to minutes."""
 
 
 def check_system_and_noise(model: Any) -> None:
@@ -20,15 +24,14 @@ def check_system_and_noise(model: Any) -> None:
 
     Raises InvalidInput for another system.
     """
-    if not isinstance(model.system, MechanicalSystem):
-        given = type(model.system).__name__
-        raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
+    require_type("system", model.system, MechanicalSystem, ", for example system=dataset.system")
     if model.noise is not None and not isinstance(model.noise, Noise):
         object.__setattr__(model, "noise", Noise(model.noise))
 
 
 def checked_rows(joint_names: Sequence[str], dataset: Dataset) -> Dataset:
     """`dataset`, if it has these joints and at least 2 rows. Raises InvalidInput otherwise."""
+    require_type("dataset", dataset, Dataset, "; the system belongs to the model, as in StructuredGP(system)")
     if tuple(dataset.joint_names) != tuple(joint_names):
         raise InvalidInput(
             f"the dataset has joints {', '.join(dataset.joint_names)}; the robot has {', '.join(joint_names)}"
@@ -46,8 +49,7 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
     checked_rows(joint_names, dataset)
     if points is None:
         return dataset
-    if not 2 <= points <= len(dataset):
-        raise InvalidInput(f"points={points} is not between 2 and the {len(dataset)} rows of the dataset")
+    points = whole_number("points", points, 2, len(dataset), "the rows of the dataset")
     return dataset if points == len(dataset) else farthest_rows(dataset, points)
 
 
@@ -94,10 +96,8 @@ def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
 
 def check_search_numbers(restarts: int, seed: int) -> None:
     """Raises InvalidInput for numbers that are out of range."""
-    if restarts < 1:
-        raise InvalidInput(f"restarts={restarts} must be at least 1")
-    if seed < 0:
-        raise InvalidInput(f"seed={seed} must be 0 or larger")
+    whole_number("restarts", restarts, 1, MOST_RESTARTS, "the most that one search runs")
+    whole_number("seed", seed, 0)
 
 
 def first_start(

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
@@ -24,6 +24,7 @@ from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
 from forcegp.models.training_data import TrainingData
+from forcegp.robots.real_numbers import real_tensor, require_finite
 
 ROWS_PER_BLOCK = 4096
 """States that are predicted at once; bounds the memory of long recordings."""
@@ -120,7 +121,8 @@ class Posterior(ABC):
         States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
         taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
         in q, v and u where these are tensors that require gradients.
-        Raises InvalidInput for wrong shapes or values that are not finite.
+        Raises InvalidInput for wrong shapes or values that are not finite, and inside `torch.func.vmap`, whose batch
+        the leading dimensions are; NumericalError where the result is not finite.
         """
         states, batch = self.checked_states(q, v, u)
         q, v, u = states
@@ -129,7 +131,9 @@ class Posterior(ABC):
             for start in range(0, max(len(q), 1), ROWS_PER_BLOCK)
             for block in [slice(start, start + ROWS_PER_BLOCK)]
         ]
-        return join_predictions(blocks, batch)
+        predicted = join_predictions(blocks, batch)
+        _require_finite_prediction(predicted)
+        return predicted
 
     def predictor(
         self,
@@ -352,24 +356,29 @@ class Model(ABC):
         """Names and shapes of the parameters that a posterior on these points needs."""
 
 
+def _require_finite_prediction(predicted: Prediction) -> None:
+    """Raise NumericalError for a state so large, or a system so singular, that the numbers were lost on the way."""
+    variance = predicted.mean if predicted.covariance is None else predicted.variance
+    lost = ~torch.isfinite(predicted.mean.detach() + variance.detach()).reshape(-1, predicted.mean.shape[-1]).all(-1)
+    if bool(lost.any()):
+        raise NumericalError(
+            f"the prediction of row {int(lost.nonzero()[0])} is not finite: q, v or u is too large for float64 there, "
+            "the mass matrix is singular, or a surface has no normal; check q, v and u of that row, and the system by "
+            "MechanicalSystem.check_states."
+        )
+
+
 def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
 
 
 def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
-    if isinstance(values, Tensor):
-        tensor = values.to(torch.float64)
-    else:
-        try:
-            tensor = torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
-        except (TypeError, ValueError) as error:
-            raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None
+    tensor = real_tensor(name, values, device)
     if tensor.dim() == 0 or tensor.shape[-1] != nv:
         raise InvalidInput(
             f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {nv}, one value per joint."
         )
-    if not bool(torch.isfinite(tensor).all()):
-        raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
+    require_finite(name, tensor)
     return tensor
 
 

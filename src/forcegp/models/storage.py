@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder
 from forcegp.data import units_for
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.protocol import Model, Posterior
@@ -54,6 +54,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     FileFormatError: `path` exists and `overwrite` is false, or is not a model folder.
     ContactError: a surface of the system holds code.
     """
+    require_type("posterior", posterior, Posterior)
     path = Path(path)
     if path.exists():
         if not overwrite:

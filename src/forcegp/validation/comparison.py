@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions
@@ -61,8 +61,10 @@ class Comparison:
     friction: tuple[str, ...] = FRICTION
 
     def __post_init__(self) -> None:
+        require_type("system", self.system, MechanicalSystem)
         names = tuple(self.system.robot.joint_names)
         for what, dataset in (("rows", self.rows), ("recording", self.recording)):
+            require_type(what, dataset, Dataset)
             if tuple(dataset.joint_names) != names:
                 raise InvalidInput(
                     f"the {what} have joints {', '.join(dataset.joint_names)}; the robot {', '.join(names)}"

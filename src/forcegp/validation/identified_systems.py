@@ -52,11 +52,11 @@ class Identification:
 
 
 def _identified(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> MechanicalSystem:
-    return identify_analytical(system, rows, friction=friction, **how).system
+    return identify_analytical(rows, system, friction=friction, **how).system
 
 
 def _noise(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> NoiseLevels:
-    return held_out_noise(system, rows, friction=friction, **how)
+    return held_out_noise(rows, system, friction=friction, **how)
 
 
 def _consistent(likelihood: str, rows: str, all_rows: bool) -> Identification:

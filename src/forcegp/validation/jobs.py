@@ -190,6 +190,6 @@ def reference_mass(
     found = kept(store, name)
     if found["result"] is None:
         whose = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
-        return mass_matrices(comparison.system, test), whose
+        return mass_matrices(test, comparison.system), whose
     system = MechanicalSystem.from_dict(found["result"]["system"])
-    return mass_matrices(system, test), f"the system identified with seed 0 by {found['result']['how']}"
+    return mass_matrices(test, system), f"the system identified with seed 0 by {found['result']['how']}"

@@ -25,7 +25,7 @@ STRETCHES = 20
 ROWS_PER_BLOCK = 4096
 
 
-def mass_matrices(system: MechanicalSystem, dataset: Dataset) -> Float[np.ndarray, "_ nv nv"]:
+def mass_matrices(dataset: Dataset, system: MechanicalSystem) -> Float[np.ndarray, "_ nv nv"]:
     """M of every row [kg m^2, kg m or kg], rotors and armature included."""
     blocks = []
     with torch.no_grad():

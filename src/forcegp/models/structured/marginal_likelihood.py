@@ -27,6 +27,7 @@ from forcegp.inference.linear_functionals import functional_negative_log_likelih
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.identification.physical_parameters import COEFFICIENTS, INERTIALS, coefficients_of, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
+from forcegp.models.structured.prior_values import checked_kernels
 from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
 from forcegp.priors import ForcePrior
 
@@ -133,7 +134,8 @@ class MarginalLikelihood:
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         dimensions = tuple(z.shape[-1] for z in features)
-        return LatentKernels(self.prior.kernels(self.system.robot, dimensions, variances)).to(variances.device)
+        kernels = self.prior.kernels(self.system.robot, dimensions, variances)
+        return LatentKernels(checked_kernels(self.prior, kernels, len(dimensions))).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood, exact and differentiable in every parameter.

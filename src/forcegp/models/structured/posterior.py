@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_type, unknown_name_message
 from forcegp.inference import (
     Engine,
     InducingPosterior,
@@ -47,6 +47,7 @@ from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots import Robot
+from forcegp.robots.real_numbers import real_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,6 +277,7 @@ class StructuredPosterior(Posterior):
 
         Raises InvalidInput as `with_robot`, and UnknownFrame where a force acts on a frame that the robot lacks.
         """
+        require_type("system", system, MechanicalSystem)
         trained = self.model.system
         if system.robot.joint_names != trained.robot.joint_names:
             raise InvalidInput(
@@ -410,7 +412,7 @@ def _curve_features(latent: str, given: Array | None, visited: Tensor, points: i
             raise InvalidInput(f"a curve of points={points} was asked for; give 1 or more")
         steps = torch.linspace(0.0, 1.0, points, dtype=torch.float64, device=visited.device)
         return visited[0] + steps[:, None] * (visited[1] - visited[0])
-    z = torch.as_tensor(given, dtype=torch.float64, device=visited.device)
+    z = real_tensor(f"features of {latent!r}", given, visited.device)
     z = z[:, None] if z.dim() == 1 and count == 1 else z
     if z.dim() != 2 or z.shape[-1] != count or not bool(torch.isfinite(z).all()):
         raise InvalidInput(f"features of {latent!r} have shape {tuple(z.shape)}; give finite numbers (n, {count})")

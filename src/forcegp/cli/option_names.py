@@ -1,0 +1,32 @@
+"""Names of arguments in messages, as the options of the command that printed them.
+
+The library marks arguments in its messages by backquotes, as Python writes them: `points`, `mean='analytical'`. Options
+have the same names, so the command line needs no message of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+
+_ARGUMENT = re.compile(r"`([a-z_]+)(?:=([^`]*))?`")
+
+OTHERWISE = {"most_rows": "max_rows", "observe": "learn_from", "options.iterations": "iterations"}
+"""Options whose argument has another name in Python."""
+
+
+def with_option_names(message: str, options: Collection[str]) -> str:
+    """The message with --points for `points` and --points 5 for `points=5`, where the command has such an option.
+
+    Arguments that the command does not have stay as they are.
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name = OTHERWISE.get(found[1], found[1])
+        if name not in options:
+            return found[0]
+        value = found[2]
+        flag = f"--{name.replace('_', '-')}"
+        return flag if value in (None, "True") else f"{flag} {value.strip(chr(39))}"
+
+    return _ARGUMENT.sub(option, message)
