@@ -168,9 +168,7 @@ class Compare(LearningOptions):
                 f"Next: forcegp fit {self.data} --prior {_quoted(preferred)} --points {comparison.points} --out run"
             )
         table = columns(title, header, rows, long_names=True)
-        unfinished = ", ".join(score.name for score in comparison.scores if not score.converged)
-        warning = [Text(f"Not converged: {unfinished}; give more --iterations.")] if unfinished else []
-        return [table, Text(comparison.verdict), *warning, Text(following)]
+        return [table, Text(comparison.verdict), Text(following)]
 
     def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import forcegp
+import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
 import forcegp.robots
@@ -68,6 +69,8 @@ class Fit(ModelOptions):
             command._write(folder, posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)
+        for doubt in forcegp.evaluation.unfinished_search(posterior):
+            terminal.warn(doubt)
         terminal.show(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 

@@ -9,10 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 
-_ARGUMENT = re.compile(r"`([a-z_]+)(?:=([^`]*))?`")
+_ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
 OTHERWISE = {"most_rows": "max_rows", "observe": "learn_from", "options.iterations": "iterations"}
 """Options whose argument has another name in Python."""
+
+ELSEWHERE = {"`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)"}
+"""Calls of Python that an option stands for."""
 
 
 def with_option_names(message: str, options: Collection[str]) -> str:
@@ -29,4 +32,6 @@ def with_option_names(message: str, options: Collection[str]) -> str:
         flag = f"--{name.replace('_', '-')}"
         return flag if value in (None, "True") else f"{flag} {value.strip(chr(39))}"
 
+    for call, words in ELSEWHERE.items():
+        message = message.replace(call, words)
     return _ARGUMENT.sub(option, message)

@@ -12,12 +12,12 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models import Noise
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions
 from forcegp.validation.identified_systems import (
     DEFAULT_IDENTIFICATION,
     FRICTION,
     IDENTIFICATIONS,
-    learned_noise,
 )
 from forcegp.validation.splits import Split
 from forcegp.validation.training_subsets import training_subset
@@ -73,7 +73,7 @@ class Comparison:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
-        learned_noise(self.rows, self.force_noise)
+        Noise(None, self.force_noise)
         integrator_named(self.integrator, self.system)
         if self.identification not in IDENTIFICATIONS:
             given, allowed = self.identification, ", ".join(IDENTIFICATIONS)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from forcegp.checks.findings import plain
 from forcegp.data import Dataset, time_blocks
 from forcegp.evaluation import metrics
+from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
@@ -56,8 +57,12 @@ def force_errors(
     return (mass @ (predicted - target)[..., None])[..., 0]
 
 
-def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndarray, "rows nv nv"]) -> dict[str, Any]:
-    """All scores of the held-out rows; `mass` is the same for every model (`mass_matrices`).
+def acceleration_scores(
+    posterior: Posterior, test: Dataset, mass: Float[np.ndarray, "rows nv nv"]
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """All scores of the held-out rows, and what a reader has to know beside them (`evaluation.doubts`).
+
+    `mass` is the same for every model (`mass_matrices`).
 
     Intervals and densities are those of a measurement: with the noise of the model, or of the Dataset where that is
     larger. What is not a number (a constant target) is None.
@@ -66,7 +71,8 @@ def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndar
     a, variance = test.a, predicted.measurement_variance
     forces = force_errors(predicted.mean, a, mass)
     covered = [metrics.interval_coverage(predicted.mean, variance, a, level) for level in LEVELS]
-    return {
+    known = metrics.mean_absolute_error(predicted.known_physics, a)
+    scores = {
         "rmse": plain(metrics.root_mean_square_error(predicted.mean, a)),
         "mae": plain(metrics.mean_absolute_error(predicted.mean, a)),
         "nrmse": plain(normalized_error(predicted.mean, a)),
@@ -79,6 +85,12 @@ def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndar
         "stretches": _by_stretch(predicted, test, forces),
         "noise_std": plain(posterior.noise_std.detach().cpu().numpy()),
     }
+    shared = {
+        "mae_per_joint": scores["mae"],
+        "known_physics_mae_per_joint": known,
+        "coverage_95_per_joint": covered[LEVELS.index(0.95)],
+    }
+    return scores, doubts(posterior, test, shared)
 
 
 def _by_stretch(
