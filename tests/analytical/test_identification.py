@@ -16,6 +16,7 @@ from forcegp.mechanics import (
     Armature,
     ConstantJointForce,
     CoulombJointFriction,
+    LoadJointFriction,
     MechanicalSystem,
     RigidBodyBias,
     ViscousJointFriction,
@@ -174,3 +175,25 @@ def test_standard_errors_are_those_of_the_posterior():
     np.testing.assert_allclose(ours, in_terms, rtol=0.3)
     poor = identify_analytical(recorded(4, 31), given(), inertias="free", prior_strength=1e-6)
     assert np.isfinite(list(poor.standard_errors.values())).all()
+
+
+def test_friction_under_load_does_not_explain_the_torque_by_itself():
+    """A wrist whose torque is friction of a changing level: from the measured |u| its mu came out as 1.
+
+    The first joint has friction under load, and its mu is found.
+    """
+    robot = arm_system(0).robot
+    generator = np.random.default_rng(0)
+    q, v, a = generator.normal(size=(3, 400, 3))
+    torque = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
+    sign = np.tanh(v / 0.05)
+    u = torque + 0.02 * generator.normal(size=a.shape)
+    u[:, 0] = torque[:, 0] / (1.0 - 0.15 * sign[:, 0] * np.sign(torque[:, 0]))  # u = torque + 0.15 |u| sign
+    u[:, 2] += 20.0 * sign[:, 2] * generator.uniform(0.5, 1.5, 400)
+    log = Dataset(q=q, v=v, u=u, a=a, time=0.01 * np.arange(400.0), system=arm_system(0))
+    found = identify_analytical(log, friction=("load",), rotors=None)
+    mu = found.system.known_forces[-1].coefficients
+    assert float(mu[0]) == pytest.approx(0.15, abs=0.01)
+    assert float(mu[2]) < 0.5
+    force, _ = motion_residuals(log, found.system)
+    assert force[:, 2].std() > 4.0  # of 5.8 that no model can know

@@ -223,6 +223,7 @@ def test_known_forces_replace_those_of_the_dataset(folder):
     ("noise", "learned", "file"),
     [("learned", True, "no_noise.h5"), ("0.2", False, "no_noise.h5"), ("dataset", True, "no_noise.h5")],
 )
+@pytest.mark.filterwarnings("ignore:the dataset does not state the noise")
 def test_noise_is_learned_or_given(folder, noise, learned, file):
     assert main(["fit", file, *QUICK, "--noise", noise, "--out", "run"]) == 0
     posterior = load_posterior("run")
