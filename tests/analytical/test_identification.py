@@ -16,7 +16,6 @@ from forcegp.mechanics import (
     Armature,
     ConstantJointForce,
     CoulombJointFriction,
-    LoadJointFriction,
     MechanicalSystem,
     RigidBodyBias,
     ViscousJointFriction,
