@@ -78,6 +78,8 @@ def acceleration_scores(
         "nrmse": plain(normalized_error(predicted.mean, a)),
         "force_rms": plain(np.sqrt(np.square(forces).mean(axis=0))),
         "force_mae": plain(np.abs(forces).mean(axis=0)),
+        # a light joint under a noisy torque is predicted well by not moving at all: a score has to beat this
+        "force_rms_at_rest": plain(np.sqrt(np.square(force_errors(np.zeros_like(a), a, mass)).mean(axis=0))),
         "nlpd": float(predicted.negative_log_density.mean()),
         "nlpd_per_joint": plain(metrics.marginal_negative_log_density(predicted.mean, variance, a)),
         "levels": list(LEVELS),
