@@ -50,7 +50,7 @@ from forcegp.robots import Robot
 from forcegp.robots.real_numbers import real_tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StructuredPosterior(Posterior):
     """A `StructuredGP` conditioned on training data; made by `StructuredGP.fit` or `load_posterior`.
 
@@ -190,6 +190,7 @@ class StructuredPosterior(Posterior):
 
         return terms
 
+    @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
         """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
 
@@ -201,6 +202,7 @@ class StructuredPosterior(Posterior):
         latents = self._latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
+    @override
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
         """One process of the prior over its features: a friction curve, for example.
 
@@ -245,6 +247,7 @@ class StructuredPosterior(Posterior):
     def _scales(self) -> tuple[Tensor, ...]:
         return self.likelihood.standardization.scale
 
+    @override
     def with_contacts(self, contacts: Sequence[Contact]) -> StructuredPosterior:
         """The same forces under other contacts, without another fit: another surface, or none at all, `[]`.
 
@@ -253,6 +256,7 @@ class StructuredPosterior(Posterior):
         """
         return self.with_system(self.system.with_contacts(contacts))
 
+    @override
     def with_robot(self, robot: Robot) -> StructuredPosterior:
         """The same forces on another robot with the same joints, for example with another known tool.
 
