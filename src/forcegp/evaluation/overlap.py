@@ -62,7 +62,7 @@ def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     if isinstance(posterior, StructuredPosterior) and not (robots and posterior.carries_known_forces):
         remedy = (
             "; to predict what the forces do there, carry the model over: posterior.with_system(dataset.system), on "
-            "the command line --system data"
+            "the command line forcegp evaluate --system data"
         )
     yield f"the {what} of the model {are} not {those} of the data{measured}{remedy}"
 

@@ -208,7 +208,7 @@ class Posterior(Summary, ABC):
         if baumgarte is not None:
             raise InvalidInput(
                 f"baumgarte was given, but a {type(self).__name__} has no constraint, so there is "
-                "nothing to stabilise; give baumgarte=None, and integrator='projected' to stay on the surface."
+                "nothing to stabilise; give baumgarte=None, and `integrator='projected'` to stay on the surface."
             )
 
         def mean() -> AccelerationFunction:
@@ -216,7 +216,7 @@ class Posterior(Summary, ABC):
 
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             raise InvalidInput(
-                f"no functions can be drawn from a {type(self).__name__}; give samples=0, or use a StructuredGP."
+                f"no functions can be drawn from a {type(self).__name__}; give `samples=0`, or use a StructuredGP."
             )
 
         return AccelerationModel(self.system, None, mean, sampled)

@@ -281,7 +281,7 @@ class StructuredPosterior(Posterior):
         if self.carries_known_forces and not system.robot.tree.equals(trained.robot.tree):
             raise InvalidInput(
                 "the model has no analytical mean, so its processes hold gravity and inertia of the robot that it was "
-                "trained on and cannot move to another; fit with mean='analytical' (--mean analytical)."
+                "trained on and cannot move to another; fit with `mean='analytical'`."
             )
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
