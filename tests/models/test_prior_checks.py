@@ -190,7 +190,7 @@ def test_a_prior_that_does_not_fit_the_system_is_refused_before_any_data(data, p
     "prior", [ToolForces(), ContactFriction(), ToolForces("hand", axes="world", inputs=("load",))], ids=["a", "b", "c"]
 )
 def test_forces_of_a_contact_need_one(prior):
-    with pytest.raises(InvalidInput, match=r"no contact.*--contact"):
+    with pytest.raises(InvalidInput, match=r"no contact.*`contacts`"):
         StructuredGP(arm_system(contacts=0), prior)
     StructuredGP(arm_system(contacts=0), ToolForces("hand", axes="world"))
 
@@ -268,7 +268,7 @@ def test_known_forces_that_no_latent_can_carry_are_pointed_out(data, prior):
         fit(data, prior, mean="zero")
     assert len(caught) == 1
     assert f"but {np.sqrt(left / size):.0%} of the acceleration that they cause" in str(caught[0].message)
-    assert "take mean='analytical' (--mean analytical), or add a force on every joint" in str(caught[0].message)
+    assert "take `mean='analytical'`, or add a force on every joint" in str(caught[0].message)
 
 
 @pytest.mark.parametrize(

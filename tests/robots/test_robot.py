@@ -83,7 +83,9 @@ def test_links_show_who_moves_them_and_their_inertia(tree):
 
 
 def test_repr_names_robot_and_joints(chain):
-    assert repr(chain).startswith("Robot('chain', nv=4, links=7, joints=[slide (prismatic), spin (continuous)")
+    assert repr(chain).startswith(
+        "Robot(\n  name: 'chain'\n  nv: 4\n  links: 7\n  joints: slide (prismatic), spin (continuous)"
+    )
 
 
 def test_merged_link_stays_a_parameter(chain):

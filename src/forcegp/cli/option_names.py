@@ -11,7 +11,14 @@ from collections.abc import Collection
 
 _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
-OTHERWISE = {"most_rows": "max_rows", "observe": "learn_from", "options.iterations": "iterations"}
+OTHERWISE = {
+    "contacts": "contact",
+    "folder": "out",
+    "locked": "lock",
+    "most_rows": "max_rows",
+    "observe": "learn_from",
+    "system": "robot",
+}
 """Options whose argument has another name in Python."""
 
 ELSEWHERE = {"`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)"}
@@ -25,12 +32,12 @@ def with_option_names(message: str, options: Collection[str]) -> str:
     """
 
     def option(found: re.Match[str]) -> str:
-        name = OTHERWISE.get(found[1], found[1])
+        name, value = found[1], (found[2] or "").strip("'")
+        name = name if name in options else OTHERWISE.get(name)
         if name not in options:
             return found[0]
-        value = found[2]
         flag = f"--{name.replace('_', '-')}"
-        return flag if value in (None, "True") else f"{flag} {value.strip(chr(39))}"
+        return flag if value in ("", "True") else f"{flag}{'=' if value.startswith('-') else ' '}{value}"
 
     for call, words in ELSEWHERE.items():
         message = message.replace(call, words)

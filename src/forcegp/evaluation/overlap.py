@@ -78,7 +78,7 @@ def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> 
     A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
     data more than those of another recording: the rows decide, not a rule.
     """
-    if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
+    if not isinstance(posterior, StructuredPosterior):
         return ""
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
     try:

@@ -330,7 +330,7 @@ def _require_memory(sizes: Sequence[ProblemSize], system: MechanicalSystem) -> N
     kept = sum(8 * (size.rows * size.rank) ** 2 for size in sizes)
     needed = kept + max(Exact().required_bytes(size) for size in sizes)
     what = f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows"
-    require_memory(needed, what, "give fewer points (points=N, --points N), or fewer candidates", system.robot.device)
+    require_memory(needed, what, "give fewer `points`, or fewer candidates", system.robot.device)
 
 
 def _note(progress: Progress, name: str) -> Callable[[int, int, float], None]:

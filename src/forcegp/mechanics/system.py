@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.mechanics.contacts import Baumgarte, Contact
@@ -26,6 +27,7 @@ from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.summary import Summary, listed
 
 FORMAT_VERSION = 1
 STORED_PARTS = {"urdf": str, "gravity": list, "armature": list, "locked": dict, "contacts": list, "known_forces": list}
@@ -33,8 +35,8 @@ CONSISTENCY_TOLERANCE = 1e-6
 """|A a - b| above this fraction of 1 + |b| means that redundant contacts contradict each other."""
 
 
-@dataclass(frozen=True, eq=False)
-class MechanicalSystem:
+@dataclass(frozen=True, eq=False, repr=False)
+class MechanicalSystem(Summary):
     """What is known: the robot, its contacts, the known forces, and Baumgarte's terms if the motion has them.
 
     `known_forces` is the complete list; the default is actuation and rigid-body bias. Joint damping and friction of the
@@ -64,6 +66,16 @@ class MechanicalSystem:
                     "constrains nothing; name a frame "
                     "that moves."
                 )
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """Robot, contacts and known forces."""
+        return {
+            "robot": f"{self.robot.name!r}, {self.robot.nv} joints",
+            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.contacts),
+            "known forces": listed(type(force).__name__ for force in self.known_forces),
+            "baumgarte": self.baumgarte or "none",
+        }
 
     def dynamics(
         self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None

@@ -13,18 +13,22 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
-from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.prediction import Prediction, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
+from forcegp.models.structured.components import Components, Curve
 from forcegp.models.training_data import TrainingData
+from forcegp.robots import Robot
 from forcegp.robots.real_numbers import real_tensor, require_finite
+from forcegp.summary import Summary, rounded
 
 ROWS_PER_BLOCK = 4096
 """States that are predicted at once; bounds the memory of long recordings."""
@@ -34,7 +38,7 @@ AnyPosterior = TypeVar("AnyPosterior", bound="Posterior")  # beartype cannot che
 Array = Tensor | np.ndarray | Sequence[Any]
 
 
-class Posterior(ABC):
+class Posterior(Summary, ABC):
     """What a fitted model has learned, as a frozen value.
 
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
@@ -82,6 +86,18 @@ class Posterior(ABC):
         self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
     ) -> Prediction:
         """`predict` for one block of checked states."""
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """Model, robot, training rows, and how the search ended."""
+        rows, result = self.training, self.result
+        return {
+            "model": self.description,
+            "robot": f"{self.system.robot.name!r}, {self.system.robot.nv} joints, {len(self.system.contacts)} contacts",
+            "learned from": f"{len(rows)} {'rows' if rows.weights is None else 'windows'}",
+            "noise std": rounded(self.noise_std.tolist()),
+            "search": f"{'converged' if result.converged else 'not converged'}, {result.status}",
+        }
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -135,6 +151,14 @@ class Posterior(ABC):
         _require_finite_prediction(predicted)
         return predicted
 
+    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
+        """Every force by itself, at states as for `predict`. Raises InvalidInput for models that predict no forces."""
+        raise InvalidInput(f"a {self.description} predicts no forces, so it has no components; use a StructuredGP.")
+
+    def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
+        """One process of the prior over its features. Raises InvalidInput for models without a prior on forces."""
+        raise InvalidInput(f"a {self.description} has no latent forces, so it has no curves; use a StructuredGP.")
+
     def predictor(
         self,
         *,
@@ -184,7 +208,7 @@ class Posterior(ABC):
         if baumgarte is not None:
             raise InvalidInput(
                 f"baumgarte was given, but a {type(self).__name__} has no constraint, so there is "
-                "nothing to stabilise; give baumgarte=None, and integrator='projected' to stay on the surface."
+                "nothing to stabilise; give baumgarte=None, and `integrator='projected'` to stay on the surface."
             )
 
         def mean() -> AccelerationFunction:
@@ -192,7 +216,7 @@ class Posterior(ABC):
 
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             raise InvalidInput(
-                f"no functions can be drawn from a {type(self).__name__}; give samples=0, or use a StructuredGP."
+                f"no functions can be drawn from a {type(self).__name__}; give `samples=0`, or use a StructuredGP."
             )
 
         return AccelerationModel(self.system, None, mean, sampled)
@@ -284,6 +308,14 @@ class Posterior(ABC):
             f"a {self.description} learned the accelerations of one system, contacts included, so it cannot move to "
             "another; fit it to data from there, or use a structured model, which learns forces."
         )
+
+    def with_contacts(self, contacts: Sequence[Contact]) -> Posterior:
+        """The same knowledge under other contacts. Raises InvalidInput as `with_system`."""
+        return self.with_system(self.system.with_contacts(contacts))
+
+    def with_robot(self, robot: Robot) -> Posterior:
+        """The same knowledge on another robot with the same joints. Raises InvalidInput as `with_system`."""
+        return self.with_system(self.system.with_robot(robot))
 
     def to(self: AnyPosterior, device: torch.device | str) -> AnyPosterior:
         """The same knowledge on another device, for instance "cuda": conditioned there on the same rows.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
 from forcegp.robots.arguments import Inertials, check_mapping, checked_tensor
@@ -14,10 +15,11 @@ from forcegp.robots.layout import WORLD, Layout
 from forcegp.robots.parts import Joint, Link
 from forcegp.robots.tree import Tree, merged_inertias
 from forcegp.robots.urdf import RobotDescription
+from forcegp.summary import Summary, listed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RobotStructure:
+class RobotStructure(Summary):
     """The constants of a :class:`~forcegp.robots.Robot`, for code that its algorithms are made of."""
 
     description: RobotDescription
@@ -107,9 +109,11 @@ class RobotStructure:
             self.layout.require_moving(name, self.name)
         return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
 
-    def __repr__(self) -> str:
-        kinds = ", ".join(f"{joint.name} ({joint.type})" for joint in self.layout.joints)
-        return f"Robot({self.name!r}, nv={self.nv}, links={len(self.layout.links)}, joints=[{kinds}])"
+    @override
+    def facts(self) -> dict[str, object]:
+        """Name, sizes and joints."""
+        kinds = listed((f"{joint.name} ({joint.type})" for joint in self.layout.joints), most=7)
+        return {"name": repr(self.name), "nv": self.nv, "links": len(self.layout.links), "joints": kinds}
 
     # ------------------------------------------------------------------ checks of inputs
 

@@ -80,8 +80,8 @@ class Comparison:
             raise InvalidInput(f"no identification is called {given!r}; there are {allowed}.")
         if self.measured_torque and self.force_noise is None and IDENTIFICATIONS[self.identification].noise is None:
             raise InvalidInput(
-                "measured_torque needs a noise of the forces; give force_noise (--force-noise SIGMA), or an "
-                "identification of all training rows, which finds it (--identification acceleration-all or torque-all)."
+                "measured_torque needs a noise of the forces; give `force_noise`, or an `identification` of "
+                "all training rows, which finds it: acceleration-all or torque-all."
             )
         if len({split.name for split in self.splits}) < len(self.splits) or not self.splits:
             raise InvalidInput("give one split or more, each of its own name.")

@@ -50,7 +50,7 @@ from forcegp.robots import Robot
 from forcegp.robots.real_numbers import real_tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StructuredPosterior(Posterior):
     """A `StructuredGP` conditioned on training data; made by `StructuredGP.fit` or `load_posterior`.
 
@@ -200,6 +200,7 @@ class StructuredPosterior(Posterior):
 
         return terms
 
+    @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
         """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
 
@@ -211,6 +212,7 @@ class StructuredPosterior(Posterior):
         latents = self._latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
+    @override
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
         """One process of the prior over its features: a friction curve, for example.
 
@@ -255,6 +257,7 @@ class StructuredPosterior(Posterior):
     def _scales(self) -> tuple[Tensor, ...]:
         return self.likelihood.standardization.scale
 
+    @override
     def with_contacts(self, contacts: Sequence[Contact]) -> StructuredPosterior:
         """The same forces under other contacts, without another fit: another surface, or none at all, `[]`.
 
@@ -263,6 +266,7 @@ class StructuredPosterior(Posterior):
         """
         return self.with_system(self.system.with_contacts(contacts))
 
+    @override
     def with_robot(self, robot: Robot) -> StructuredPosterior:
         """The same forces on another robot with the same joints, for example with another known tool.
 
@@ -287,7 +291,7 @@ class StructuredPosterior(Posterior):
         if self.carries_known_forces and not system.robot.tree.equals(trained.robot.tree):
             raise InvalidInput(
                 "the model has no analytical mean, so its processes hold gravity and inertia of the robot that it was "
-                "trained on and cannot move to another; fit with mean='analytical' (--mean analytical)."
+                "trained on and cannot move to another; fit with `mean='analytical'`."
             )
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))

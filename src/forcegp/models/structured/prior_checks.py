@@ -153,8 +153,8 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
     if share > LEFT_OUT:
         warnings.warn(
             f"with the mean 'zero' the prior carries gravity, actuation and all known forces, but {share:.0%} of the "
-            "acceleration that they cause lies where none of its forces acts; take mean='analytical' (--mean "
-            "analytical), or add a force on every joint, JointForces() (--prior joint)",
+            "acceleration that they cause lies where none of its forces acts; take `mean='analytical'`, or "
+            "add a force on every joint to the `prior`, JointForces()",
             DataWarning,
             stacklevel=5,
         )
