@@ -4,8 +4,10 @@
 the time. `FORCEGP_TEST_THREADS=2` computes with two threads (`make test-processors`).
 """
 
+import contextlib
 import os
-from collections.abc import Callable
+import resource
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
@@ -45,3 +47,19 @@ def shared() -> Callable[[str], Path]:
         return found
 
     return path
+
+
+@pytest.fixture
+def limited_file_size() -> Callable[[int], contextlib.AbstractContextManager[None]]:
+    """`with limited_file_size(count):` no file of this process can grow beyond `count` bytes, as on a full disk."""
+
+    @contextlib.contextmanager
+    def limited(count: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))  # Python ignores the signal: EFBIG is left
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
