@@ -153,14 +153,14 @@ class Rollout(Command):
         dataset: forcegp.Dataset,
         summary: Mapping[str, Any],
     ) -> None:
-        import h5py  # here, so that --help does not wait for it
+        from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
 
         write_json(folder / "rollout.json", summary)
         arrays = {"time": rollout.time, "q": rollout.q, "v": rollout.v, "a": rollout.a}
         arrays |= {"constraint": rollout.constraint, "diverged_at": rollout.diverged_at}
         if rollout.samples is not None:
             arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
-        with h5py.File(folder / "rollout.h5", "w") as file:
+        with NewFile(folder / "rollout.h5") as file:
             for name, values in arrays.items():
                 file[name] = values.cpu().numpy()
             for name in ("q", "v", "u"):
