@@ -19,6 +19,7 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 PACKAGES = {
     "errors": set(),
     "atomic_files": {"errors"},
+    "checksums": {"errors"},
     "codegen": {"errors"},
     "parallel": {"errors"},
     "jobs": {"errors", "atomic_files", "parallel"},
@@ -34,6 +35,7 @@ PACKAGES = {
     "models": {
         "errors",
         "atomic_files",
+        "checksums",
         "codegen",
         "parallel",
         "robots",

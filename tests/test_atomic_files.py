@@ -153,7 +153,6 @@ class TestJson:
         with pytest.raises(FileFormatError, match=r"a\.json is .*damaged.*; write it again\.$"):
             read_json(tmp_path / "a.json", "write it again")
 
-
     @pytest.mark.parametrize("links", [True, False])
     def test_without_overwrite_a_file_that_appears_meanwhile_stays(self, tmp_path, monkeypatch, links):
         if not links:

@@ -42,7 +42,7 @@ def atomic_file(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
         raise InvalidInput(f"cannot write {path}: the folder {target.parent} does not exist; create it first.")
     if target.is_dir():
         raise InvalidInput(f"cannot write {path}: it is a folder; give a file name.")
-    if os.path.lexists(target) and not target.is_file():
+    if target.exists() and not target.is_file():
         raise InvalidInput(f"cannot write {path}: it is not a regular file; choose another name.")
     with _beside(target) as temporary:
         yield temporary
@@ -66,7 +66,7 @@ def atomic_folder(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]
     OSError is raised, unless it is empty. Raises InvalidInput if `path` is no folder.
     """
     target = _target(path)
-    if os.path.lexists(target) and not target.is_dir():
+    if target.exists() and not target.is_dir():
         raise InvalidInput(f"cannot write the folder {path}: it is a file; choose another name.")
     target.parent.mkdir(parents=True, exist_ok=True)
     with _beside(target) as temporary:
@@ -126,7 +126,10 @@ def remove_leftovers(folder: Path) -> None:
 
 def _target(path: str | Path) -> Path:
     """Where a rename has to end: a rename onto a symbolic link would replace the link, not what it points to."""
-    return Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise InvalidInput(f"cannot write {path}: it is a link that leads back to itself; choose another name.")
+    return target
 
 
 @contextmanager

@@ -6,7 +6,9 @@ exactly the one that the files give, so a flip in it is found, too.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import json
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
@@ -41,6 +43,17 @@ def require_unchanged(folder: Path, remedy: str) -> bool:
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{folder} is damaged: {SUMS} cannot be read ({error}); {remedy}") from None
     return True
+
+
+def added_files(folder: Path, own: Iterable[str] = ()) -> list[str]:
+    """Files in the folder that nobody lists: neither its digests, nor `files` of its config.json, nor `own`."""
+    known = {SUMS, *own}
+    with contextlib.suppress(OSError, ValueError):
+        known |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
+    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):  # folders of before had no digests
+        known |= set(json.loads((folder / "config.json").read_text(encoding="utf-8")).get("files", ()))
+    entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
+    return sorted({entry.relative_to(folder).as_posix() for entry in entries} - known)
 
 
 def _text(folder: Path, names: Iterable[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -19,6 +20,12 @@ from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError
 
 OK, INTERNAL_ERROR, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+
+
+_FULL, _ELSEWHERE = "; free some space, or write elsewhere.", "; write to a folder where you may."
+_REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL)
+_REMEDIES |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), _ELSEWHERE)
+"""What to do about an OSError, by its number."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
         with Terminal(json=command.json) as terminal:
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
-            command.check_inputs()
+            command.check_paths()
             terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -48,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except (ForceGPError, OSError) as error:
-        return _fail(str(error), USER_ERROR, debug)
+        return _fail(f"{error}{_REMEDIES.get(getattr(error, 'errno', None), '')}", USER_ERROR, debug)
     except MemoryError as error:
         return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
     except Exception as error:  # the last resort: one line also for a defect of ours, with its own exit code

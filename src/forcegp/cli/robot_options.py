@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
+from forcegp.checksums import require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -127,6 +128,8 @@ class RobotOptions(Command):
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
 
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
+        if path != self.identified:
+            require_unchanged(self.identified, "identify again")
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
