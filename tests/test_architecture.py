@@ -19,7 +19,7 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 PACKAGES = {
     "errors": set(),
     "atomic_files": {"errors"},
-    "checksums": {"errors"},
+    "file_digests": {"errors"},
     "codegen": {"errors"},
     "parallel": {"errors"},
     "jobs": {"errors", "atomic_files", "parallel"},
@@ -35,7 +35,7 @@ PACKAGES = {
     "models": {
         "errors",
         "atomic_files",
-        "checksums",
+        "file_digests",
         "codegen",
         "parallel",
         "robots",

@@ -172,7 +172,8 @@ def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path,
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo" / "notes.txt").write_text("mine")
     assert main(small) == 2
-    assert "--overwrite" in capfd.readouterr().err
+    assert "demo holds files that `forcegp demo` did not write (notes.txt)" in capfd.readouterr().err
+    assert (tmp_path / "demo" / "notes.txt").read_text() == "mine"
     (tmp_path / "demo" / "notes.txt").unlink()
     assert main([*small, "--seed", "5"]) == 0
     told = capfd.readouterr().out

@@ -13,8 +13,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from tests.models.arm import URDF, arm_data, arm_system
 
-from forcegp.checksums import SUMS, write_checksums
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.file_digests import SUMS, write_digests
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
 from forcegp.models import IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
@@ -209,7 +209,7 @@ def test_a_missing_or_damaged_file_is_named(run, name):
 def test_a_changed_document_is_refused(run, change, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | change))
-    write_checksums(run)
+    write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)
 
@@ -248,7 +248,7 @@ def test_a_urdf_with_other_line_ends_comes_back(data, tmp_path):
 def test_tensors_of_another_type_shape_or_value_are_refused(run, name, damage):
     tensors = load_file(run / "tensors.safetensors")
     save_file(tensors | {name: damage(tensors[name]).contiguous()}, run / "tensors.safetensors")
-    write_checksums(run)
+    write_digests(run)
     with pytest.raises(FileFormatError, match="tensors"):
         load_posterior(run)
 
@@ -304,7 +304,7 @@ def test_what_a_model_holds_is_declared_by_name(carried, run, tmp_path):
 def test_features_that_are_unknown_or_not_there_are_refused(posterior, run, features, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | {"features": features}))
-    write_checksums(run)
+    write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)
 
@@ -313,7 +313,7 @@ def test_a_feature_that_is_there_must_be_declared(carried, tmp_path):
     save_posterior(carried, tmp_path / "run")
     file = tmp_path / "run" / "model.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"features": []}))
-    write_checksums(file.parent)
+    write_digests(file.parent)
     with pytest.raises(FileFormatError, match="declares no features and holds 'target'"):
         load_posterior(tmp_path / "run")
 
@@ -330,7 +330,7 @@ def test_a_damaged_target_is_named(carried, tmp_path, damage):
         document = json.loads(model.read_text())
         del document["target"]
         model.write_text(json.dumps(document))
-        write_checksums(model.parent)
+        write_digests(model.parent)
     with pytest.raises(FileFormatError, match=r"target\.urdf|'target'"):
         load_posterior(tmp_path / "run")
 

@@ -83,9 +83,10 @@ class Demo(Command):
                 evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
             pictures = _draw_all(terminal, folder, models, test)
             terminal.note(f"drew {', '.join(pictures)}")
-            results = self._results(models, evaluations, fit_seconds, time.monotonic() - start) | {"machine": machine}
+            wall_seconds = time.monotonic() - start
+            results = self._results(models, evaluations, fit_seconds, wall_seconds) | {"machine": machine}
             write_json(folder / "results.json", results)
-        self._show(terminal, evaluations, results["wall_seconds"])
+        self._show(terminal, evaluations, wall_seconds)
         return results
 
     def _seeds(self) -> dict[str, int]:

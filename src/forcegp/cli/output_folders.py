@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from forcegp.atomic_files import atomic_folder, require_writable, write_json
-from forcegp.checksums import SUMS, added_files, write_checksums
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
+from forcegp.file_digests import SUMS, added_files, write_digests
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
@@ -89,7 +89,7 @@ def write_config(folder: Path, kind: str, content: Mapping[str, Any]) -> None:
     versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
     files = sorted({CONFIG, SUMS, *present})
     write_json(folder / CONFIG, {"kind": kind, **content, "versions": versions, "files": files})
-    write_checksums(folder)
+    write_digests(folder)
 
 
 def _config(path: Path) -> dict[str, Any]:

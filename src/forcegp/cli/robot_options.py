@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
-from forcegp.checksums import require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command
 from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.file_digests import require_unchanged
 
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""

@@ -1,7 +1,8 @@
 """Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
 
-`SHA256SUMS` holds the digest of each: a flipped bit would hardly ever be noticed otherwise. A model that was carried to another system (`with_system`) has `target.urdf`, too, the robot there. The folder holds the
-training points and parameters; loading runs the same conditioning as fitting, so predictions are the same.
+`SHA256SUMS` holds the digest of each: a flipped bit would hardly ever be noticed otherwise. A model that was carried to
+another system (`with_system`) has `target.urdf`, too, the robot there. The folder holds the training points and
+parameters; loading runs the same conditioning as fitting, so predictions are the same.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from safetensors.torch import load_file, save
 
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder
-from forcegp.checksums import SUMS, added_files, require_unchanged, write_checksums
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+from forcegp.file_digests import SUMS, added_files, require_unchanged, write_digests
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.protocol import Model, Posterior
@@ -115,7 +116,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         for name, urdf in robots.items():
             (folder / name).write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
         (folder / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        write_checksums(folder)
+        write_digests(folder)
 
 
 def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:

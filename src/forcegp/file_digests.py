@@ -1,7 +1,6 @@
 """`SHA256SUMS`: a digest of every file of a stored folder, because a bit that flipped on a disk changes predictions.
 
-The file is that of `sha256sum`, so `sha256sum --check SHA256SUMS` needs no forcegp. It protects itself: its text must be
-exactly the one that the files give, so a flip in it is found, too.
+The format is that of `sha256sum`. The file protects itself: its text must be exactly the one that the files give.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from forcegp.errors import FileFormatError
 SUMS = "SHA256SUMS"
 
 
-def write_checksums(folder: Path) -> None:
+def write_digests(folder: Path) -> None:
     """Write the digests of all files that are in the folder and those below it."""
     names = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
     (folder / SUMS).write_bytes(_text(folder, (name for name in names if name != SUMS)).encode("utf-8"))
