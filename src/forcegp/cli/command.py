@@ -7,7 +7,6 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, get_type_hints
 
@@ -62,15 +61,16 @@ class Command(ABC):
                         raise FileFormatError(f"{path}{mark.refusal}")
                     inputs.append(path)
         outputs = [path for name in OUTPUTS if (path := getattr(self, name, None)) is not None]
-        for path in outputs:
-            for other in inputs:
+        for path in (*inputs, *outputs):
+            if any("\ud800" <= letter <= "\udfff" for letter in str(path)):  # bytes that Python could not decode
+                raise InvalidInput(f"the name {str(path)!r} is not UTF-8, so it could not be reported; rename it.")
+        for place, path in enumerate(outputs):
+            for other in (*inputs, *outputs[:place], *outputs[place + 1 :]):
                 if _same(path, other) or (self.replaces and _within(other, path)):
+                    does = "reads" if other in inputs else "writes, too"
                     raise InvalidInput(
-                        f"{path} would be written over {other}, which this command reads; choose another name."
+                        f"{path} would be written over {other}, which this command {does}; choose another name."
                     )
-        for one, other in permutations(outputs, 2):
-            if _same(one, other) or (self.replaces and _within(one, other)):
-                raise InvalidInput(f"{one} and {other} are both written by this command; choose another name.")
 
     @abstractmethod
     def run(self, terminal: Terminal) -> Mapping[str, Any]:

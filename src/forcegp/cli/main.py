@@ -90,8 +90,8 @@ def _require_address_space() -> None:
             mmap.mmap(-1, needed).close()
         except OSError:
             raise NotEnoughMemory(
-                f"the address space is limited to {limit >> 20} MiB (ulimit -v), and {needed >> 20} MiB more are needed "
-                "to begin with; raise the limit."
+                f"the address space is limited to {limit >> 20} MiB (ulimit -v), and {needed >> 20} MiB more are "
+                "needed to begin with; raise the limit."
             ) from None
 
 

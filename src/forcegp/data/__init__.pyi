@@ -10,7 +10,7 @@ from .filtering import (
 )
 from .frozen_dict import FrozenDict as FrozenDict
 from .hdf5 import is_dataset as is_dataset
-from .preparation import Preparation as Preparation, Prepared as Prepared
+from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
 from .spectrum import (
     MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,
 )
