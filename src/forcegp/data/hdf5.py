@@ -71,19 +71,47 @@ class NewFile(h5py.File):
 
 
 class _Sink(io.FileIO):
-    """A file that takes whatever it is given and keeps the first error."""
+    """A file that takes whatever it is given: what the disk does not take, and all that follows, stays in memory.
+
+    So HDF5 reads what it has written, which it needs in order to close the file.
+    """
 
     error: OSError | None = None
 
+    def __init__(self, path: Path, mode: str) -> None:
+        super().__init__(path, mode)
+        self._lost: list[tuple[int, bytes]] = []
+
     def write(self, data: Any, /) -> int:
-        view = memoryview(data).cast("B")
-        size = len(view)
+        view, begin = memoryview(data).cast("B"), self.tell()
+        done = 0
         try:
-            while view and self.error is None:
-                view = view[super().write(view) :]
+            while done < len(view) and self.error is None:
+                done += super().write(view[done:])
         except OSError as error:
             self.error = error
-        return size
+        if done < len(view):
+            self._lost.append((begin + done, bytes(view[done:])))
+            self.seek(begin + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any, /) -> int:
+        view, begin = memoryview(buffer).cast("B"), self.tell()
+        count = super().readinto(view)
+        if not self._lost:
+            return count
+        for start, data in self._lost:
+            first, last = max(start, begin), min(start + len(data), begin + len(view))
+            if first < last:
+                view[first - begin : last - begin] = data[first - start : last - start]
+        self.seek(begin + len(view))
+        return len(view)
+
+    def seek(self, place: int, whence: int = 0, /) -> int:
+        if whence == io.SEEK_END and self._lost:
+            end = max(super().seek(0, io.SEEK_END), *(start + len(data) for start, data in self._lost))
+            return super().seek(end + place)
+        return super().seek(place, whence)
 
     def truncate(self, size: int | None = None, /) -> int:
         try:
