@@ -4,7 +4,9 @@
 the time. `FORCEGP_TEST_THREADS=2` computes with two threads (`make test-processors`).
 """
 
+import contextlib
 import os
+import resource
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -54,3 +56,19 @@ def unchecked() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def limited_file_size() -> Callable[[int], contextlib.AbstractContextManager[None]]:
+    """`with limited_file_size(count):` no file of this process can grow beyond `count` bytes, as on a full disk."""
+
+    @contextlib.contextmanager
+    def limited(count: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))  # Python ignores the signal: EFBIG is left
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited

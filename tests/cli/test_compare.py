@@ -97,7 +97,7 @@ WRONG = [
     (f"compare train.h5 {TWO} --seed -1", "--seed is -1"),
     (f"compare train.h5 {TWO} --noise loud", "--noise is 'loud'"),
     (f"compare train.h5 {TWO} --test missing.h5", "missing.h5 is not a file"),
-    (f"compare train.h5 {TWO} --out train.h5", "was not written by `forcegp compare`"),
+    (f"compare train.h5 {TWO} --out train.h5", "train.h5 would be written over train.h5"),
     (f"compare no_robot.h5 {TWO}", "does not carry its robot; add --robot"),
     (f"compare missing.h5 {TWO}", "missing.h5 is not a file"),
 ]

@@ -63,7 +63,7 @@ WRONG = [
     ("fit arm.h5 --known-force wind --out run", "wind"),
     ("fit arm.h5 --out mine", "mine exists"),
     ("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"),
-    ("fit arm.h5 --out arm.h5 --overwrite", "was not written by `forcegp fit`"),
+    ("fit arm.h5 --out arm.h5 --overwrite", "arm.h5 would be written over arm.h5, which this command reads"),
     ("fit arm.h5", "--out"),
     ("fit arm.h5 --pionts 5 --out run", "--pionts, 5. Perhaps you meant: --points N."),
     ("fit arm.h5 --device cuda:999 --out run", "device 'cuda:999' cannot be used here; there is cpu"),
@@ -94,7 +94,7 @@ WRONG = [
     ("simulate kuka-surface --out nowhere/a.h5", "folder nowhere does not exist"),
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
     ("simulate mars --out a.h5", "'mars'"),
-    ("demo --out mine --overwrite", "was not written by `forcegp demo`"),
+    ("demo --out mine", "was not written by `forcegp demo`"),
     ("learn arm.h5", "Available subcommands: demo, simulate, import, "),
     ("", "demo, simulate, import, "),
 ]

@@ -28,7 +28,7 @@ def test_rollouts_are_compared_with_the_recording_and_written(workshop, forcegp,
     assert (summary["rows"], summary["steps"], summary["samples"]) == ([0, 100, 200], 60, 3)
     assert summary["baumgarte"] == {"omega": 10.0, "zeta": 1.0}
     assert (out / "rollout.png").read_bytes().startswith(PNG)
-    files = {"rollout.json", "rollout.h5", "rollout.png", "config.json"}
+    files = {"rollout.json", "rollout.h5", "rollout.png", "config.json", "SHA256SUMS"}
     assert {file.name for file in out.iterdir()} == files
     assert sorted(json.loads((out / "config.json").read_text())["files"]) == sorted(files)
 

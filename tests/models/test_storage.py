@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import random
+import shutil
 import stat
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from tests.models.arm import URDF, arm_data, arm_system
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.file_digests import SUMS, write_digests
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
 from forcegp.models import IndependentGP, Noise, Posterior, StructuredGP, load_posterior, save_posterior
@@ -21,7 +24,7 @@ from forcegp.models.storage import FORMAT_VERSION
 from forcegp.models.structured.components import Components, Curve
 from forcegp.robots import Robot
 
-FILES = {"model.json", "tensors.safetensors", "robot.urdf"}
+FILES = {"model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS"}
 OPTIONS = OptimizerOptions(iterations=3)
 
 
@@ -85,6 +88,64 @@ def test_nothing_is_overwritten_unasked_and_only_models_ever(posterior, run, tmp
     assert (other / "chapter.txt").read_text() == "mine"
 
 
+def test_files_that_a_user_put_there_are_never_deleted(posterior, run):
+    (run / "notes").mkdir()
+    (run / "notes" / "monday.txt").write_text("mine")
+    (run / "elsewhere").symlink_to("/nowhere")
+    with pytest.raises(FileFormatError, match=r"did not write there \(elsewhere, notes/monday\.txt\)"):
+        save_posterior(posterior, run, overwrite=True)
+    assert (run / "notes" / "monday.txt").read_text() == "mine"
+    (run / "notes" / "monday.txt").unlink()
+    (run / "elsewhere").unlink()
+    (run / SUMS).unlink()  # a folder of an earlier version
+    save_posterior(posterior, run, overwrite=True)
+    assert {path.name for path in run.iterdir()} == FILES
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_a_flipped_bit_in_any_file_is_noticed(run, name):
+    content = (run / name).read_bytes()
+    generator = random.Random(name)
+    for _ in range(40):
+        place, bit = generator.randrange(len(content)), 1 << generator.randrange(8)
+        (run / name).write_bytes(content[:place] + bytes([content[place] ^ bit]) + content[place + 1 :])
+        with pytest.raises(FileFormatError):
+            load_posterior(run)
+    (run / name).write_bytes(content)
+    load_posterior(run)
+
+
+def test_a_flipped_bit_does_not_make_a_model_one_of_before_digests(run):
+    document = (run / "model.json").read_text()
+    for version in range(1, 7):
+        stored = document.replace(f'"format_version": {FORMAT_VERSION}', f'"format_version": {version}')
+        assert stored != document
+        (run / "model.json").write_text(stored)
+        with pytest.raises(FileFormatError, match=r"model\.json is not as it was written"):
+            load_posterior(run)
+
+
+def test_digests_belong_to_the_format(run):
+    (run / SUMS).unlink()
+    with pytest.raises(FileFormatError, match="it has no SHA256SUMS; fit the model again"):
+        load_posterior(run)
+
+
+@pytest.mark.parametrize(
+    "line", ["", "0" * 64 + "  ../run/model.json\n", "0" * 64 + "  /dev/zero\n", "0" * 64 + "  pipe\n", "\udcff"]
+)
+def test_digests_that_lead_elsewhere_are_refused_without_reading(run, line):
+    os.mkfifo(run / "pipe")
+    (run / SUMS).write_bytes(line.encode("utf-8", "surrogateescape"))
+    with pytest.raises(FileFormatError, match=r"SHA256SUMS"):
+        load_posterior(run)
+
+
+@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="no sha256sum here")
+def test_the_digests_are_those_of_sha256sum(run):
+    subprocess.run(["sha256sum", "--check", "--strict", SUMS], cwd=run, check=True, capture_output=True)
+
+
 def test_an_interrupted_save_leaves_nothing(posterior, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
@@ -98,15 +159,12 @@ def test_an_interrupted_save_leaves_nothing(posterior, tmp_path, monkeypatch):
 @pytest.mark.parametrize("what", ["write", "rename"])
 def test_the_old_model_can_be_loaded_after_an_overwrite_that_failed(posterior, carried, run, monkeypatch, what):
     before = {file.name: file.read_bytes() for file in run.iterdir()}
-    rename = os.rename
 
-    def fail(data, *to):
-        if not to or str(to[0]) == str(run):
-            monkeypatch.undo()
-            raise OSError("disk full")
-        rename(data, *to)
+    def fail(*_):
+        monkeypatch.undo()
+        raise OSError("disk full")
 
-    monkeypatch.setattr(*(("forcegp.models.storage.save", fail) if what == "write" else (os, "rename", fail)))
+    monkeypatch.setattr({"write": "forcegp.models.storage.save", "rename": "forcegp.atomic_files._swapped"}[what], fail)
     with pytest.raises(OSError, match="disk full"):
         save_posterior(carried, run, overwrite=True)
     assert {file.name: file.read_bytes() for file in run.iterdir()} == before
@@ -145,12 +203,16 @@ def test_a_missing_or_damaged_file_is_named(run, name):
         ({"urdf_sha256": "0"}, "hash differs"),
         ({"units": {"q": "deg"}}, "units that are not those"),
         ({"settings": 5}, "incomplete or damaged"),
+        ({"settings": {"data": 5}}, "of another type"),
+        ({"joint_names": 5}, "incomplete or damaged"),
+        ({"joint_names": [1, 2, 3]}, "of another type"),
         ({"result": {"value": "abc"}}, "incomplete or damaged"),
     ],
 )
 def test_a_changed_document_is_refused(run, change, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | change))
+    write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)
 
@@ -189,6 +251,7 @@ def test_a_urdf_with_other_line_ends_comes_back(data, tmp_path):
 def test_tensors_of_another_type_shape_or_value_are_refused(run, name, damage):
     tensors = load_file(run / "tensors.safetensors")
     save_file(tensors | {name: damage(tensors[name]).contiguous()}, run / "tensors.safetensors")
+    write_digests(run)
     with pytest.raises(FileFormatError, match="tensors"):
         load_posterior(run)
 
@@ -244,6 +307,7 @@ def test_what_a_model_holds_is_declared_by_name(carried, run, tmp_path):
 def test_features_that_are_unknown_or_not_there_are_refused(posterior, run, features, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | {"features": features}))
+    write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)
 
@@ -252,6 +316,7 @@ def test_a_feature_that_is_there_must_be_declared(carried, tmp_path):
     save_posterior(carried, tmp_path / "run")
     file = tmp_path / "run" / "model.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"features": []}))
+    write_digests(file.parent)
     with pytest.raises(FileFormatError, match="declares no features and holds 'target'"):
         load_posterior(tmp_path / "run")
 
@@ -268,6 +333,7 @@ def test_a_damaged_target_is_named(carried, tmp_path, damage):
         document = json.loads(model.read_text())
         del document["target"]
         model.write_text(json.dumps(document))
+        write_digests(model.parent)
     with pytest.raises(FileFormatError, match=r"target\.urdf|'target'"):
         load_posterior(tmp_path / "run")
 

@@ -285,6 +285,18 @@ def test_a_compiler_that_fails(robot, tmp_path, monkeypatch):
     assert list((tmp_path / "dynamics").iterdir()) == []
 
 
+def test_what_cannot_be_loaded_never_enters_the_folder(robot, tmp_path, monkeypatch):
+    broken = tmp_path / "broken"
+    broken.write_text('#!/bin/sh\nwhile [ "$1" != -o ]; do shift; done\necho "no library" > "$2"\n')
+    broken.chmod(0o700)
+    monkeypatch.setenv("CC", str(broken))
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*robot\.compile\(folder=\.\.\.\)"):
+        robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
+    assert list((tmp_path / "dynamics").iterdir()) == []
+    monkeypatch.delenv("CC")
+    robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
+
+
 def test_folders_that_others_can_write_to(robot, tmp_path):
     tmp_path.chmod(0o777)
     with pytest.raises(CompilerError, match=r"can be written to by others than you, .*chmod go-w"):

@@ -66,7 +66,7 @@ class Check(CutoffOptions, RobotOptions):
             report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
-            with plots_folder(terminal, self.plots, KIND, {"data": str(self.data)}) as folder:
+            with plots_folder(terminal, self.plots, KIND, {"data": str(self.data)}, overwrite=self.overwrite) as folder:
                 forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
                 write_json(folder / "check.json", content)
         terminal.show(*_shown(terminal, self.data, report))

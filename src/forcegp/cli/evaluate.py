@@ -92,7 +92,7 @@ class Evaluate(Command):
         }
         if self.plots is not None:
             options = {name: scores[name] for name in ("run", "data", "every", "system", "contact")}
-            with plots_folder(terminal, self.plots, KIND, {"options": options}) as folder:
+            with plots_folder(terminal, self.plots, KIND, {"options": options}, overwrite=self.overwrite) as folder:
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
 

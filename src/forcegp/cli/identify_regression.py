@@ -10,10 +10,10 @@ from rich.text import Text
 
 import forcegp
 import forcegp.analytical
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.identify_options import IdentifyOptions
-from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.robot_options import SYSTEM_FILE
 from forcegp.cli.tables import columns
 from forcegp.cli.terminal import Terminal
@@ -57,13 +57,11 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     except NonPhysicalInertia as error:
         identified, why_not = None, str(error)
     content["robot"] = "no" if identified is None else "yes"
-    with atomic_folder(command.out) as folder:
-        folder.mkdir()
+    with output_folder(command.out, kind, command._given(), overwrite=command.overwrite) as folder:
         write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
             (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))
-        write_config(folder, kind, command._given())
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*_report(command, found, content, identified))

@@ -42,6 +42,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     """
 
     interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
+    replaces: ClassVar[bool] = False
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset (HDF5), raw or prepared."""

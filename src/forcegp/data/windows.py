@@ -27,6 +27,7 @@ from typing_extensions import override
 from forcegp.data.dataset import Dataset
 from forcegp.data.farthest_points import farthest_point_sampling
 from forcegp.data.filtering import episodes_in_order, require_no_turns
+from forcegp.data.preparation import preparation_report
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message
 from forcegp.robots.real_numbers import whole_number
 
@@ -280,8 +281,7 @@ def _window_rows(dataset: Dataset, how: WindowObservation) -> Int[np.ndarray, "N
 
 
 def _warn_of_filtered(dataset: Dataset) -> None:
-    preparation = dataset.metadata.get("preparation")
-    cutoff = preparation.get("cutoff") if isinstance(preparation, Mapping) else None
+    cutoff = preparation_report(dataset.metadata).get("cutoff")
     if cutoff is not None:
         warnings.warn(
             f"the dataset was filtered at {cutoff:g} Hz, so the noise of its windows is not what they take it for; "

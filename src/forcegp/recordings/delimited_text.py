@@ -107,7 +107,8 @@ class DelimitedText(Source):
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:
             return line.split()
-        row = next(csv.reader([line], delimiter=self._delimiter), [])
+        with reading(self.path, "text with a delimiter", csv.Error):  # a field of more than 131,072 letters, say
+            row = next(csv.reader([line], delimiter=self._delimiter), [])
         return [field.strip() for field in row]
 
     @override
