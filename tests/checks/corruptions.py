@@ -26,9 +26,12 @@ def two_links(
     masses: tuple[float, float] = (1.5, 0.8),
     axes: tuple[str, str] = ("0 1 0", "0 1 0"),
     kinds: tuple[str, str] = ("continuous", "continuous"),
+    elbow: tuple[float, float] | None = None,
     **options: object,
 ) -> Robot:
     """Two links that hang down at q = 0, with the centre of mass of each in its middle."""
+    x, z = (0.0, -lengths[0]) if elbow is None else elbow
+    at = f"{x} 0 {z}"
     limits = '<limit lower="-9" upper="9" effort="900" velocity="90"/>'
     links = "".join(
         f'<link name="link{k + 1}"><inertial><origin xyz="0.01 0 {-length / 2}"/><mass value="{mass}"/>'
@@ -38,7 +41,7 @@ def two_links(
     )
     joints = "".join(
         f'<joint name="joint{k + 1}" type="{kinds[k]}"><parent link="{("base", "link1")[k]}"/><child link="link{k + 1}"/>'
-        f'<axis xyz="{axes[k]}"/><origin xyz="0 0 {(0.0, -lengths[0])[k]}"/>{limits}</joint>'
+        f'<axis xyz="{axes[k]}"/><origin xyz="{("0 0 0", at)[k]}"/>{limits}</joint>'
         for k in range(2)
     )
     text = f'<robot name="two"><link name="base"/>{links}{joints}</robot>'
@@ -48,9 +51,9 @@ def two_links(
 ROBOTS: Mapping[str, Callable[[], Robot]] = {
     "planar": two_links,
     "heavy": lambda: two_links((0.4, 0.5), (6.0, 3.0)),
-    "spatial": lambda: two_links((0.4, 0.35), (2.0, 1.2), ("0 0 1", "0 1 0")),
+    "spatial": lambda: two_links((0.4, 0.35), (2.0, 1.2), ("0 0 1", "0 1 0"), elbow=(0.4, -0.1)),
     "geared": lambda: two_links((0.5, 0.3), (3.0, 2.0), armature=(0.15, 0.05)),
-    "crane": lambda: two_links((0.4, 0.4), (4.0, 1.0), ("1 0 0", "0 1 0"), ("prismatic", "continuous")),
+    "crane": lambda: two_links((0.4, 0.4), (4.0, 1.0), ("0 0 1", "0 1 0"), ("prismatic", "continuous")),
 }
 
 
@@ -238,7 +241,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "gravity not stated": (lambda d: other_robot(d, gravity=(0, 0, 0)), "gravity"),
     "masses doubled": (lambda d: scaled(d, (2.0, 2.0)), "mass"),
     "a mass doubled": (lambda d: scaled(d, (1.0, 2.0)), "mass"),
-    "a mass halved": (lambda d: scaled(d, (0.5, 1.0)), "mass"),
+    "a mass halved": (lambda d: scaled(d, (0.5, 1.0)), "mass|torque unit|inertia"),
     "length .4 -> .6": (lambda d: scaled(d, length=1.5), "length"),
     "length .4 -> .25": (lambda d: scaled(d, length=0.625), "length"),
     "3 % of all rows zero": (lambda d: dropped(d, "qvau", 0.03), "zero|drop"),
@@ -257,6 +260,11 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
 CONTACT_CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "contact 2 cm sideways": (lambda d: moved(d, (0.02, 0.0, 0.0)), "contact"),
     "contact missing": (without_contacts, "contact"),
+}
+
+
+UNSEEN: Mapping[str, tuple[str, ...]] = {
+    "crane": ("length .4 -> .6", "length .4 -> .25", "gravity of a wall"),  # these change no torque, or a constant
 }
 
 
@@ -295,6 +303,8 @@ def table(seeds: int, say: Callable[[Dataset], str], verbose: bool) -> None:
             if before:
                 print(f"CLEAN {where} {seed}: {before}")
             for name, (corrupt, words) in {**corruptions, **free}.items():
+                if name in UNSEEN.get(where.partition(",")[0], ()):
+                    continue
                 try:
                     said = say(corrupt(data))
                 except Exception as error:  # noqa: BLE001  # a table of everything

@@ -29,6 +29,14 @@ MOST_ROWS = 1000
 
 DEGREE = np.pi / 180.0
 
+JUMP = 10.0
+"""A signal that is not measured jumps to 0 by more than so many of the steps that nine of ten rows stay below."""
+
+LEAST_JUMP = 0.02
+"""And by more than this share of its range."""
+
+FEWEST_DROPS = 2
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CheckInput:
@@ -38,7 +46,7 @@ class CheckInput:
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
     acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the
     cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
-    by more than pi otherwise. `prepared` and `compared` are None where jumps forbid any derivative.
+    by more than pi otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `even`). `prepared` and `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset
@@ -50,6 +58,7 @@ class CheckInput:
     automatic: bool
     wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
+    dropped: Mapping[str, Bool[np.ndarray, "rows nv"]]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -80,8 +89,10 @@ class CheckInput:
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
         system = dataset.system if system is None else system
-        wraps, jumps = _leaps(dataset)
-        even = _even(_unwrapped(dataset, wraps), jumps)
+        dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
+        mended = _mended(dataset, dropped)
+        wraps, jumps = _leaps(mended)
+        even = _even(_unwrapped(mended, wraps), jumps)
         prepared = compared = None
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
@@ -103,6 +114,7 @@ class CheckInput:
             automatic=preparation.cutoff == "auto",
             wraps=wraps,
             jumps=jumps,
+            dropped=dropped,
         )
 
 
@@ -123,6 +135,39 @@ def _first(even: Dataset) -> np.ndarray:
 def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
     """Whether the next row belongs to the same episode and follows; False for the last row."""
     return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
+
+
+def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
+    """Where a signal is exactly 0 between values far from 0: it was not measured, or lost on its way."""
+    values = getattr(dataset, name)
+    lost = np.zeros(values.shape, dtype=bool)
+    follows = consecutive(dataset)[:-1]
+    for joint in np.flatnonzero(((values == 0.0).sum(axis=0) >= FEWEST_DROPS) & (np.ptp(values, axis=0) > 0.0)):
+        x = values[:, joint]
+        steps = np.abs(np.diff(x))
+        usual = max(JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], x == 0.0, [False]]).astype(int)))
+        runs = edges.reshape(-1, 2)
+        into, out = runs[:, 0] - 1, runs[:, 1] - 1  # the steps that lead into a run of zeros, and out of it
+        inner = (into >= 0) & (out < len(steps))
+        runs, into, out = runs[inner], into[inner], out[inner]
+        sudden = (steps[into] > usual) & (steps[out] > usual) & follows[into] & follows[out]
+        for start, stop in runs[sudden] if sudden.sum() >= FEWEST_DROPS else []:
+            lost[start:stop, joint] = True
+    return lost
+
+
+def _mended(dataset: Dataset, dropped: Mapping[str, np.ndarray]) -> Dataset:
+    """With straight lines where signals dropped out, so that nothing else is blamed for it."""
+    changed = {}
+    for name, lost in dropped.items():
+        if lost.any():
+            values = getattr(dataset, name).copy()
+            for joint in np.flatnonzero(lost.any(axis=0)):
+                gone = lost[:, joint]
+                values[gone, joint] = np.interp(np.flatnonzero(gone), np.flatnonzero(~gone), values[~gone, joint])
+            changed[name] = values
+    return replace(dataset, **changed, truth={}) if changed else dataset
 
 
 def _leaps(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:

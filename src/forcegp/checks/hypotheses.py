@@ -34,6 +34,9 @@ EXPLAINED = 0.1
 """Where no more than this remains in any joint there is nothing to explain."""
 
 MAX_CORRECTIONS = 4
+GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
+"""Gear ratios that are tried."""
+
 TILTED = np.deg2rad(15.0)
 """Angle from which a direction of gravity is reported."""
 
@@ -93,7 +96,7 @@ def _explains(now: Hypothesis, best: Hypothesis) -> bool:
 def _candidates(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     yield from _torque_signs(now, given, inputs.names)
     yield from _torque_places(now, given, inputs.names)
-    yield from _degrees(now, given, inputs)
+    yield from _motion_units(now, given, inputs)
     yield from _motion_signs(now, given, inputs.names)
     yield from _motion_places(now, given, inputs.names)
     yield from _gravity(now, given)
@@ -156,21 +159,39 @@ def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
     yield replace(better, finding=finding)
 
 
-def _degrees(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
-    """All angles in degrees."""
+def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+    """Angles in degrees, or positions of one joint before its gear."""
     largest = np.abs(now.rows.q * inputs.rotates).max()
-    if largest < 1.0:
-        return  # less than a degree of motion is not worth the question
-    finding = Finding(
-        severity="wrong",
-        subject="degrees",
-        seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken for "
-        "radians.",
-        remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
-        joints=tuple(name for name, turns in zip(inputs.names, inputs.rotates, strict=True) if turns),
-    )
-    factor = np.where(inputs.rotates, DEGREE, 1.0)
-    yield _hypothesis(now.robot, now.correction.motion(np.arange(len(factor)), factor), given, finding=finding)
+    places = np.arange(len(inputs.names))
+    if largest > 1.0:  # less than a degree of motion is not worth the question
+        for turned in [inputs.rotates, *(inputs.rotates & (places == joint) for joint in places)]:
+            if not turned.any() or (turned is not inputs.rotates and inputs.rotates.sum() == 1):
+                continue
+            finding = Finding(
+                severity="wrong",
+                subject="degrees",
+                seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
+                "for radians.",
+                remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
+                joints=tuple(inputs.names[joint] for joint in _places(turned)),
+            )
+            correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
+            yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)
+    for joint, name in enumerate(inputs.names):
+        if now.fit.unexplained.max() < STILL_UNEXPLAINED / 2:
+            break
+        for ratio in GEARS:
+            finding = Finding(
+                severity="wrong",
+                subject="motion unit",
+                seen=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
+                "look like those of a motor before its gear.",
+                remedy="Divide the motion of this joint by its gear ratio (forcegp import --unit, or a factor).",
+                joints=(name,),
+                numbers={"factor": ratio},
+            )
+            correction = now.correction.motion(places, np.where(places == joint, 1.0 / ratio, 1.0))
+            yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.7)
 
 
 def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:

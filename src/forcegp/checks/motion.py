@@ -47,7 +47,7 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
     found = []
     for name, source, what, derivative in (("v", "q", "velocity", "dq/dt"), ("a", "v", "acceleration", "dv/dt")):
-        if name == "a" and found:
+        if name == "a" and any(finding.severity != "ok" for finding in found):
             break  # of wrong velocities nothing better can come
         fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
         findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]

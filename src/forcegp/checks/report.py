@@ -13,7 +13,8 @@ from forcegp.checks.excitation import excitation_findings
 from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings
-from forcegp.checks.noise import noise_findings, numbers_of, torque_noise
+from forcegp.checks.noise import noise_findings, numbers_of, stated_noise_findings, torque_noise
+from forcegp.checks.parameters import parameter_findings
 from forcegp.checks.robot_model import robot_findings
 from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
@@ -103,7 +104,8 @@ def check(
             f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
         )
     inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
-    findings = [*sampling_findings(inputs), *signal_findings(inputs), *motion_findings(inputs)]
+    findings = [*sampling_findings(inputs), *signal_findings(inputs), *stated_noise_findings(inputs)]
+    findings += motion_findings(inputs)
     comparison = None
     if inputs.robot is not None:
         findings += robot_findings(inputs.robot)
@@ -112,7 +114,11 @@ def check(
             findings.append(not_compared(inputs))
         elif dataset.u.any():
             comparison, corrections = best_hypothesis(inputs)
-            findings += [*corrections, *torque_findings(inputs, comparison)]
+            compared = torque_findings(inputs, comparison)
+            if not any(each.subject == "torque unit" and each.severity == "wrong" for each in compared):
+                numbers = parameter_findings(comparison.robot, comparison.rows)
+                compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
+            findings += [*corrections, *compared]
         findings += [*excitation_findings(inputs), *noise_findings(inputs)]
     ordered = sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
     return CheckReport(findings=tuple(ordered), inputs=inputs, comparison=comparison)

@@ -10,6 +10,10 @@ from forcegp.checks.check_input import CheckInput, consecutive
 from forcegp.checks.findings import Finding, listed
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
+EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
+HELD_STEPS = 0.5
+"""Share of equal successive values from which on a signal is one that moves in steps, such as a held command."""
+
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
 MOVES = 0.2
@@ -28,7 +32,7 @@ COARSE = {"q": 1e-3, "v": 1e-2, "u": 1e-2}
 
 def signal_findings(inputs: CheckInput) -> list[Finding]:
     """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
-    found = [*_leaps(inputs), *_constant(inputs)]
+    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs)]
     for name in QUANTITY:
         found += [finding for joint in range(inputs.log.nv) for finding in _frozen(inputs, name, joint)]
     found += [finding for joint in range(inputs.log.nv) for finding in _clipped(inputs, joint)]
@@ -53,6 +57,26 @@ def _leaps(inputs: CheckInput) -> Iterator[Finding]:
                 joints=tuple(inputs.names[k] for k in np.flatnonzero(places.any(axis=0))),
                 numbers={"row": row, "count": int(places.sum())},
             )
+
+
+def _dropped(inputs: CheckInput) -> Iterator[Finding]:
+    """Rows of a signal that were lost and read 0."""
+    lost = {name: rows for name, rows in inputs.dropped.items() if rows.any()}
+    if not lost:
+        return
+    rows = np.logical_or.reduce([each.any(axis=1) for each in lost.values()])
+    first = int(np.flatnonzero(rows)[0])
+    joints = np.logical_or.reduce([each.any(axis=0) for each in lost.values()])
+    yield Finding(
+        severity="wrong",
+        subject="drop-outs",
+        seen=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
+        f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
+        f"{inputs.log.time[first]:.3f} s.",
+        remedy="They were not measured: leave these rows out, and look at the logger.",
+        joints=tuple(inputs.names[joint] for joint in np.flatnonzero(joints)),
+        numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
+    )
 
 
 def _constant(inputs: CheckInput) -> Iterator[Finding]:
