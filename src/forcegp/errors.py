@@ -141,6 +141,10 @@ class DataWarning(UserWarning):
     """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
 
 
+class ContactWarning(DataWarning):
+    """The rows contradict the contacts that are stated: another point, no force, or a contact that is missing."""
+
+
 def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str], *, cutoff: float = 0.6) -> str:
     """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Valid frames: ...`; `cutoff` as in difflib."""
     names = sorted(valid)

@@ -8,13 +8,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from tests.checks.logs import column, exchanged
 
-from forcegp.checks import check
+from forcegp.checks import check, quick_check
+from forcegp.cli.findings_line import findings_in_one_line
 from forcegp.data import Dataset
+from forcegp.errors import ForceGPError
 from forcegp.mechanics import Contact, MechanicalSystem, Plane
 from forcegp.robots import Robot
 
@@ -291,6 +294,17 @@ def said_by_check(data: Dataset) -> str:
     return "\n".join(f"[{each.severity}] {each.subject}: {each.seen}" for each in found if each.severity != "ok")
 
 
+def said_by_fit(data: Dataset) -> str:
+    """The line that `forcegp fit` prints, or why it refuses these rows."""
+    assert data.system is not None
+    try:
+        q, v, u = (torch.tensor(getattr(data.rows([*range(0, len(data), 50)]), name)) for name in "qvu")
+        data.system.check_states(q, v, u)
+    except ForceGPError as error:
+        return str(error)
+    return findings_in_one_line(quick_check(data), Path("log.h5")) or ""
+
+
 def table(seeds: int, say: Callable[[Dataset], str], verbose: bool) -> None:
     """Print how often each corruption is named, and what is said of the clean logs."""
     counts: dict[str, list[int]] = {}
@@ -321,4 +335,4 @@ def table(seeds: int, say: Callable[[Dataset], str], verbose: bool) -> None:
 
 
 if __name__ == "__main__":
-    table(int(sys.argv[1]) if len(sys.argv) > 1 else 1, said_by_check, "-v" in sys.argv)
+    table(int(sys.argv[1]), said_by_fit if "fit" in sys.argv else said_by_check, "-v" in sys.argv)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,6 +28,15 @@ LONGEST_TRIM = 0.1
 MOST_ROWS = 1000
 """Rows on which torques are compared: neighbouring rows hold the same information."""
 
+QUICK_ROWS = 300
+"""The same before a fit."""
+
+STRETCHES, STRETCH_ROWS = 3, 500
+"""How many stretches of how many rows are looked at before a fit, where a log is longer."""
+
+SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15
+"""Length of the running mean that stands for a filter before a fit: SciPy's filters take half a second to import."""
+
 DEGREE = np.pi / 180.0
 
 JUMP = 10.0
@@ -46,7 +56,8 @@ class CheckInput:
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
     acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the
     cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
-    by more than pi otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `even`). `prepared` and `compared` are None where jumps forbid any derivative.
+    by more than pi otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a
+    log that is otherwise as given). `prepared` and `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset
@@ -59,6 +70,8 @@ class CheckInput:
     wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
     dropped: Mapping[str, Bool[np.ndarray, "rows nv"]]
+    mended: Dataset
+    most_rows: int = MOST_ROWS
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,10 +85,10 @@ class CheckInput:
         return np.array([unit == "rad" for unit in ([units] * self.log.nv if isinstance(units, str) else units)])
 
     def rows(self) -> Dataset:
-        """Up to 1000 rows of `compared`, evenly over the log."""
+        """Up to `most_rows` rows of `compared`, evenly over the log."""
         assert self.compared is not None
         data = self.compared
-        return data.rows(slice(None, None, max(1, -(-len(data) // MOST_ROWS))))
+        return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
 
     @property
     def price(self) -> Mapping[str, Any]:
@@ -115,6 +128,38 @@ class CheckInput:
             wraps=wraps,
             jumps=jumps,
             dropped=dropped,
+            mended=mended,
+        )
+
+    @classmethod
+    def quick(cls, dataset: Dataset, system: MechanicalSystem | None) -> CheckInput:
+        """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
+        system = dataset.system if system is None else system
+        dropped, mended = {}, dataset
+        even, prepared = dataset, None
+        wraps = jumps = np.zeros(dataset.q.shape, dtype=bool)
+        compared: Dataset | None = dataset
+        if dataset.time_ordered:
+            dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
+            mended = _mended(dataset, dropped)
+            wraps, jumps = _leaps(mended)
+            compared = None if jumps.any() else _smoothed(_unwrapped(mended, wraps))
+            with contextlib.suppress(InvalidInput):
+                even = _even(_few(mended if compared is None else compared), jumps)
+                prepared = None if compared is None else Preparation().apply(even)
+        return cls(
+            log=dataset,
+            robot=None if system is None else system.robot,
+            contacts=0 if system is None else len(system.contacts),
+            even=even,
+            prepared=prepared,
+            compared=compared,
+            automatic=False,
+            wraps=wraps,
+            jumps=jumps,
+            dropped=dropped,
+            mended=mended,
+            most_rows=QUICK_ROWS,
         )
 
 
@@ -145,7 +190,7 @@ def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
     for joint in np.flatnonzero(((values == 0.0).sum(axis=0) >= FEWEST_DROPS) & (np.ptp(values, axis=0) > 0.0)):
         x = values[:, joint]
         steps = np.abs(np.diff(x))
-        usual = max(JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)))
+        usual = max(JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max()))
         edges = np.flatnonzero(np.diff(np.concatenate([[False], x == 0.0, [False]]).astype(int)))
         runs = edges.reshape(-1, 2)
         into, out = runs[:, 0] - 1, runs[:, 1] - 1  # the steps that lead into a run of zeros, and out of it
@@ -180,6 +225,34 @@ def _leaps(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     size = np.abs(change)
     turn = (np.abs(size - 2.0 * np.pi) < 0.5) & angular
     return turn, (size > np.pi) & angular & ~turn
+
+
+def _few(dataset: Dataset) -> Dataset:
+    """A few stretches of successive rows, evenly over the log, each an episode."""
+    if len(dataset) <= STRETCHES * STRETCH_ROWS:
+        return dataset
+    starts = np.linspace(0, len(dataset) - STRETCH_ROWS, STRETCHES).astype(int)
+    rows = (starts[:, None] + np.arange(STRETCH_ROWS)).ravel()
+    pieces = np.repeat(np.arange(STRETCHES), STRETCH_ROWS)
+    _, numbers = np.unique(np.stack([pieces, dataset.episode[rows]]), axis=1, return_inverse=True)
+    return replace(dataset.rows(rows), episode=numbers.ravel())
+
+
+def _smoothed(dataset: Dataset) -> Dataset:
+    """Running means of all signals within each episode, of one length for all: the equation of motion keeps holding."""
+    joins = consecutive(dataset)
+    steps = np.diff(dataset.time)[joins[:-1]]
+    width = int(min(SMOOTH_SECONDS / np.median(steps), SMOOTH_ROWS)) // 2 * 2 + 1 if len(steps) else 1
+    if width < 3 or len(dataset) < 10 * width:
+        return dataset
+    half = width // 2
+    inside = np.flatnonzero(np.convolve(joins, np.ones(width - 1), "valid") > width - 1.5)[: len(dataset) - width + 1]
+    if not len(inside):
+        return dataset
+    sums = {name: np.cumsum(np.insert(getattr(dataset, name), 0, 0.0, axis=0), axis=0) for name in ("q", "v", "u", "a")}
+    means = {name: (total[inside + width] - total[inside]) / width for name, total in sums.items()}
+    rows = dataset.rows(inside + half)
+    return replace(rows, **means, noise_std=None, truth={})
 
 
 def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:

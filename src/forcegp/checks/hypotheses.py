@@ -37,6 +37,9 @@ MAX_CORRECTIONS = 4
 GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
 """Gear ratios that are tried."""
 
+NEARLY = 3.0
+"""Factor either way that wrong masses explain."""
+
 TILTED = np.deg2rad(15.0)
 """Angle from which a direction of gravity is reported."""
 
@@ -191,7 +194,9 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
                 numbers={"factor": ratio},
             )
             correction = now.correction.motion(places, np.where(places == joint, 1.0 / ratio, 1.0))
-            yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.7)
+            slower = _hypothesis(now.robot, correction, given, finding=finding, cost=0.7, concerns=(joint,))
+            if 1.0 / NEARLY < slower.fit.factor[joint] < NEARLY:  # else any small motion with a large factor would do
+                yield slower
 
 
 def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:

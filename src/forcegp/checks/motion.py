@@ -32,6 +32,9 @@ UNEXPLAINED = 0.3
 FEW = 0.05
 """Share below which a factor is meant seriously."""
 
+ROUNDING = 1e-20
+"""Of the mean square velocity of all joints."""
+
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2
 """Time steps by which v must be late or early to be reported."""
@@ -83,8 +86,9 @@ def _compared(data: Dataset, name: str, source: str, joint: int) -> tuple[float,
         return None
     values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
     power = np.square(values).sum(axis=1)
-    if not np.square(slopes).sum() > 0.0 or not power.min() > 0.0:
-        return None
+    least = ROUNDING * max(float(np.square(getattr(data, name)).mean()), float(np.square(slopes).mean())) * len(slopes)
+    if not np.square(slopes).sum() > least or not power.min() > least:
+        return None  # a joint that stands still
     factor = values @ slopes / np.square(slopes).sum()
     unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
     best = int(np.argmin(unexplained))

@@ -140,15 +140,15 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
         kept = np.where(np.arange(len(names)) == joint, 0.0, tau)
         yield factor(
             "torque constant",
-            lambda x, name=name: f"the torque of {name} fits {x:.3g} times what is measured of the other joints' scale "
-            "(its torque constant, gear ratio or unit)",
+            lambda x, name=name: f"the torque of {name} is {x:.3g} times what the motion needs, that of the "
+            "others is not (its torque constant, gear ratio or unit)",
             kept,
             joints=(name,),
         )
     if len(names) > 1:
         yield factor(
             "masses",
-            lambda x: f"all torques fit {x:.3g} times the masses of the URDF (or u is in another unit)",
+            lambda x: f"all torques fit {x:.3g} times the masses of the URDF (or the torque unit is another)",
             0.0 * tau,
             cost=-0.1,
         )

@@ -8,9 +8,13 @@ import numpy as np
 
 from forcegp.checks.check_input import CheckInput, consecutive
 from forcegp.checks.findings import Finding, listed
+from forcegp.data import Dataset
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
+ROUNDING = 1e-12
+"""Of the largest value of any joint."""
+
 HELD_STEPS = 0.5
 """Share of equal successive values from which on a signal is one that moves in steps, such as a held command."""
 
@@ -83,7 +87,7 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
     log = inputs.log
     for name, quantity in QUANTITY.items():
         values = getattr(log, name)
-        dead = [joint for joint in range(log.nv) if np.ptp(values[:, joint]) == 0.0]
+        dead = [joint for joint in range(log.nv) if still(log, name)[joint]]
         if not dead:
             continue
         names = tuple(inputs.names[joint] for joint in dead)
@@ -99,14 +103,21 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
             else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         )
         passive = name == "u" and not values[:, dead].any()
+        rests = still(log, "v") & still(log, "q")
         yield Finding(
-            severity="look" if passive or len(dead) == log.nv else "wrong",
+            severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
             subject="constant channel",
             seen=seen,
             remedy=remedy,
             joints=names,
             numbers={"quantity": name},
         )
+
+
+def still(log: Dataset, name: str) -> np.ndarray:
+    """Which joints' signal never changes, up to rounding."""
+    values = getattr(log, name)
+    return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
 def _runs(same: np.ndarray) -> tuple[int, int]:
@@ -120,28 +131,33 @@ def _runs(same: np.ndarray) -> tuple[int, int]:
 
 
 def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
-    """A channel that stands still, to the last digit, while the joint's other channels do not."""
+    """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
     values = getattr(log, name)[:, joint]
-    if np.ptp(values) == 0.0:
+    follows = consecutive(log)[:-1]
+    held = np.diff(values) == 0
+    if still(log, name)[joint] or (name == "u" and held.mean() > HELD_STEPS):
         return []
     others = np.zeros(len(log) - 1, dtype=bool)
     for other in QUANTITY:
         if other != name:
             others |= np.diff(getattr(log, other)[:, joint]) != 0
-    moves = np.abs(log.v[:, joint]) > MOVES * np.sqrt(np.square(log.v[:, joint]).mean())
+    seconds = np.diff(log.time)
+    step = float(np.median(seconds[follows]))
+    # a velocity that stands still at rest is right, also where the position is noisy
+    speed = log.v[1:, joint] if name != "v" else np.where(follows, np.diff(log.q[:, joint]), 0.0) / step
+    moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-        moves = np.ones(len(log), dtype=bool) if name == "v" else moves
-        if name == "v":
-            others &= np.diff(log.q[:, joint]) != 0
-    start, length = _runs((np.diff(values) == 0) & others & consecutive(log)[:-1] & moves[1:])
-    step = float(np.median(np.diff(log.time)[consecutive(log)[:-1]]))
+    start, length = _runs(held & others & follows & moves)
     if length < FROZEN_ROWS or length * step < FROZEN_SECONDS or _is_extreme(values, values[start]):
         return []
+    run = speed[start : start + length]
+    if abs(run.sum()) < 0.5 * np.abs(run).sum():
+        return []  # noise about rest
     return [
         Finding(
-            severity="wrong",
+            severity="look" if name == "u" and values[start] == 0.0 else "wrong",
             subject="frozen channel",
             seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
             f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",

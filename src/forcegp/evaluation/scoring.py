@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, contact_doubts
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Evaluation, Numbers
@@ -40,7 +40,11 @@ def evaluate(
         if dataset.noise_std is None
         else _numbers(metrics.noise_floor(np.atleast_2d(dataset.noise_std).mean(axis=0))),
         known_physics_mae_per_joint=_numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
-        warnings=(*overlap_warnings(posterior, dataset), *_noise_warnings(posterior, dataset)),
+        warnings=(
+            *overlap_warnings(posterior, dataset),
+            *_noise_warnings(posterior, dataset),
+            *(str(doubt) for doubt in contact_doubts(dataset, posterior.system)),
+        ),
         **_against_measurements(predicted, dataset),
         **_against_truth(predicted, dataset),
         **_constraint(predicted),
