@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, Preparation, Prepared, resample, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
@@ -34,6 +34,13 @@ QUICK_ROWS = 300
 STRETCHES, STRETCH_ROWS = 3, 500
 """How many stretches of how many rows are looked at before a fit, where a log is longer."""
 
+MOTION = 1.5
+"""Ratio of noise as seen by third and by fourth differences above which they see motion instead."""
+
+FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
+HALF_CUTOFF = COMPARED**2.5
+"""Noise of an acceleration that is differenced twice, after a filter at half the cut-off, relative to that before."""
+
 SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15
 """Length of the running mean that stands for a filter before a fit: SciPy's filters take half a second to import."""
 
@@ -57,7 +64,8 @@ class CheckInput:
     acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the
     cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
     by more than pi otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a
-    log that is otherwise as given). `prepared` and `compared` are None where jumps forbid any derivative.
+    log that is otherwise as given). `compared_noise` (nv,) is the standard deviation of the noise of the
+    acceleration in `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset
@@ -71,6 +79,7 @@ class CheckInput:
     jumps: Bool[np.ndarray, "rows nv"]
     dropped: Mapping[str, Bool[np.ndarray, "rows nv"]]
     mended: Dataset
+    compared_noise: Float[np.ndarray, " nv"] | None
     most_rows: int = MOST_ROWS
 
     @property
@@ -129,6 +138,7 @@ class CheckInput:
             jumps=jumps,
             dropped=dropped,
             mended=mended,
+            compared_noise=None if compared is None else np.nan_to_num(_filtered_noise(mended, prepared, compared)),
         )
 
     @classmethod
@@ -139,6 +149,7 @@ class CheckInput:
         even, prepared = dataset, None
         wraps = jumps = np.zeros(dataset.q.shape, dtype=bool)
         compared: Dataset | None = dataset
+        noise = dataset.noise_level
         if dataset.time_ordered:
             dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
             mended = _mended(dataset, dropped)
@@ -147,6 +158,8 @@ class CheckInput:
             with contextlib.suppress(InvalidInput):
                 even = _even(_few(mended if compared is None else compared), jumps)
                 prepared = None if compared is None else Preparation().apply(even)
+            seen = None if compared is None else white_noise(mended, _width(mended))
+            noise = noise if seen is None else np.nan_to_num(seen)
         return cls(
             log=dataset,
             robot=None if system is None else system.robot,
@@ -159,6 +172,7 @@ class CheckInput:
             jumps=jumps,
             dropped=dropped,
             mended=mended,
+            compared_noise=noise,
             most_rows=QUICK_ROWS,
         )
 
@@ -238,21 +252,64 @@ def _few(dataset: Dataset) -> Dataset:
     return replace(dataset.rows(rows), episode=numbers.ravel())
 
 
+def _width(dataset: Dataset) -> int:
+    """Rows of the running mean."""
+    steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
+    width = int(min(SMOOTH_SECONDS / np.median(steps), SMOOTH_ROWS)) // 2 * 2 + 1 if len(steps) else 1
+    return width if len(dataset) >= 10 * width else 1
+
+
 def _smoothed(dataset: Dataset) -> Dataset:
     """Running means of all signals within each episode, of one length for all: the equation of motion keeps holding."""
-    joins = consecutive(dataset)
-    steps = np.diff(dataset.time)[joins[:-1]]
-    width = int(min(SMOOTH_SECONDS / np.median(steps), SMOOTH_ROWS)) // 2 * 2 + 1 if len(steps) else 1
-    if width < 3 or len(dataset) < 10 * width:
+    width = _width(dataset)
+    inside = _whole_windows(dataset, width)
+    if width < 3 or not len(inside):
         return dataset
-    half = width // 2
-    inside = np.flatnonzero(np.convolve(joins, np.ones(width - 1), "valid") > width - 1.5)[: len(dataset) - width + 1]
-    if not len(inside):
-        return dataset
-    sums = {name: np.cumsum(np.insert(getattr(dataset, name), 0, 0.0, axis=0), axis=0) for name in ("q", "v", "u", "a")}
-    means = {name: (total[inside + width] - total[inside]) / width for name, total in sums.items()}
-    rows = dataset.rows(inside + half)
+    means = {name: _means(getattr(dataset, name), inside, width) for name in ("q", "v", "u", "a")}
+    rows = dataset.rows(inside + width // 2)
     return replace(rows, **means, noise_std=None, truth={})
+
+
+def _whole_windows(dataset: Dataset, width: int) -> np.ndarray:
+    """First rows of the windows of so many rows that lie within an episode."""
+    breaks = np.cumsum(np.insert(~consecutive(dataset), 0, False))
+    first = np.arange(max(0, len(dataset) - width + 1))
+    return first[breaks[first + width - 1] == breaks[first]]
+
+
+def _means(values: np.ndarray, first: np.ndarray, width: int) -> np.ndarray:
+    sums = np.cumsum(np.insert(values, 0, 0.0, axis=0), axis=0)
+    return (sums[first + width] - sums[first]) / width
+
+
+def white_noise(log: Dataset, width: int = 1) -> Float[np.ndarray, " nv"] | None:
+    """Standard deviation of noise on `a`, or on its means over `width` rows, from differences of successive ones.
+
+    The k-th difference of white noise has the variance binomial(2k, k), that of a smooth motion falls with k: NaN where
+    it is motion that is seen. Medians, since impacts are no noise. None for rows out of order and fewer than 30.
+    """
+    if not log.time_ordered:
+        return None
+    noise = []
+    for order, variance in ((3, 20.0), (4, 70.0)):
+        first = _whole_windows(log, width * (order + 1))
+        if len(first) < FEWEST_DIFFERENCES:
+            return None
+        first = first[:: max(1, len(first) // MOST_DIFFERENCES)]
+        means = np.stack([_means(log.a, first + k * width, width) for k in range(order + 1)])
+        differences = np.diff(means, order, axis=0)[0]
+        noise.append(1.4826 * np.median(np.abs(differences), axis=0) / np.sqrt(variance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where((noise[0] < MOTION * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
+
+
+def _filtered_noise(log: Dataset, prepared: Prepared | None, compared: Dataset) -> np.ndarray:
+    """Noise of the acceleration in `compared`: white noise as logged, or what the filter left."""
+    price = {} if prepared is None else prepared.report.get("acceleration_noise", {})
+    if "after" in price:
+        return np.array([np.nan if value is None else value for value in price["after"]], dtype=float) * HALF_CUTOFF
+    seen = white_noise(log)
+    return np.zeros(compared.nv) if seen is None else seen
 
 
 def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from forcegp.checks.check_input import CheckInput, consecutive
+from forcegp.checks.check_input import CheckInput, white_noise
 from forcegp.checks.findings import Finding, plain
-from forcegp.data import Dataset
 
 MUCH = 0.2
 """Noise relative to the spread of the signal from which a filter is worth its name."""
@@ -19,9 +18,6 @@ STATED_OFF = 3.0
 """Factor either way between stated and seen noise of the acceleration that is reported."""
 
 FAR_OFF = 10.0
-FEWEST_DIFFERENCES = 30
-SMOOTH = 1.5
-"""Ratio of noise as seen by third and by fourth differences above which they see motion instead."""
 
 LARGE_TORQUE = 0.5
 """Noise times M, relative to the spread of the torque."""
@@ -30,7 +26,7 @@ LARGE_TORQUE = 0.5
 def stated_noise_findings(inputs: CheckInput) -> list[Finding]:
     """`noise_std` against the noise that the acceleration of successive rows shows."""
     log = inputs.log
-    stated, seen = log.noise_level, seen_noise(log)
+    stated, seen = log.noise_level, white_noise(log)
     if stated is None or seen is None:
         return []
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -53,25 +49,6 @@ def stated_noise_findings(inputs: CheckInput) -> list[Finding]:
             numbers={"stated": plain(stated), "seen": plain(seen)},
         )
     ]
-
-
-def seen_noise(log: Dataset) -> np.ndarray | None:
-    """Standard deviation (nv,) of white noise on `a`, from differences of successive rows; NaN where they show motion.
-
-    The k-th difference of white noise has the variance binomial(2k, k), that of a smooth motion falls with k. Medians,
-    since impacts are no noise. None for rows out of order and fewer than 30.
-    """
-    if not log.time_ordered:
-        return None
-    a, joins = log.a, consecutive(log)[:-1]
-    noise = []
-    for order, variance in ((3, 20.0), (4, 70.0)):
-        inside = np.lib.stride_tricks.sliding_window_view(joins, order).all(axis=1) if len(joins) >= order else joins[:0]
-        if inside.sum() < FEWEST_DIFFERENCES:
-            return None
-        noise.append(1.4826 * np.median(np.abs(np.diff(a, order, axis=0)[inside]), axis=0) / np.sqrt(variance))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where((noise[0] < SMOOTH * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
 
 
 def noise_findings(inputs: CheckInput) -> list[Finding]:

@@ -26,6 +26,9 @@ GAIN = np.log(2.5)
 FLOOR = 1e-5
 """Share of a torque's power below which everything is explained."""
 
+NOISE = 3.0
+"""How much of the power of the noise is left to every explanation."""
+
 FEWEST_ROWS = 30
 STANDARD_GRAVITY = 9.81  # m/s^2
 NO_GRAVITY = 0.05
@@ -59,9 +62,12 @@ class Variation:
 
 
 class Unexplained:
-    """Power of each joint's torque that friction, a rotor and a constant leave, for many torques tau(x) at once."""
+    """Power of each joint's torque that friction, a rotor and a constant leave, for many torques tau(x) at once.
 
-    def __init__(self, rows: Dataset) -> None:
+    `noise` (nv,) is that of tau [Nm or N], from the acceleration: a factor below 1 makes it smaller, which is no merit.
+    """
+
+    def __init__(self, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> None:
         slow = SLOW * np.sqrt(np.square(rows.v).mean(axis=0)) + 1e-12
         self.u, self.bases, self.rotors = rows.u, [], []
         for joint in range(rows.nv):
@@ -71,6 +77,7 @@ class Unexplained:
             rotor = rows.a[:, joint] - basis @ (basis.T @ rows.a[:, joint])
             self.bases.append(basis)
             self.rotors.append(rotor / max(float(np.linalg.norm(rotor)), 1e-300))
+        self.noise = NOISE * len(rows) * np.square(noise)
         self.power = np.maximum(np.square(rows.u - rows.u.mean(axis=0)).sum(axis=0), 1e-300)
 
     def logarithms(self, taus: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "values nv"]:
@@ -83,16 +90,22 @@ class Unexplained:
             left = np.einsum("xi,ij,xj->x", factors, parts.T @ parts, factors)
             inertia = factors @ (parts.T @ rotor)  # a rotor's inertia is positive
             left = left - np.square(np.maximum(inertia, 0.0))
+            left = np.maximum(left, 0.0) + self.noise[joint]
             shares.append(np.log(np.maximum(left / self.power[joint], FLOOR)))
         return np.stack(shares, axis=1)
 
 
-def parameter_findings(robot: Robot, rows: Dataset) -> list[Finding]:
-    """Numbers of the robot without which the torques of `rows` would be explained far better, the worst first."""
+def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> list[Finding]:
+    """The number of the robot that, if it were another, would explain the torques of `rows` far better; or none.
+
+    `noise` (nv,) is the standard deviation of the noise of their accelerations.
+    """
     moving = np.std(rows.u, axis=0) > 0.0
     if len(rows) < FEWEST_ROWS or not moving.all():
         return []
-    left = Unexplained(rows)
+    with torch.no_grad():
+        M = robot.mass_matrix(torch.tensor(rows.q, device=robot.device)).cpu().numpy()
+    left = Unexplained(rows, np.sqrt(np.square(M).mean(axis=0) @ np.square(noise)))
     tau = inverse_dynamics(robot, rows)
     now = left.logarithms(tau[None], np.ones((1, 1)))[0]
     if np.exp(now).max() < 100.0 * FLOOR:

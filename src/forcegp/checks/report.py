@@ -126,6 +126,8 @@ def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tup
     _require_same_joints(dataset, system)
     findings, _ = _findings(CheckInput.quick(dataset, system), system)
     said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
+    if dataset.nv > 1:  # friction of one joint can look like a delay
+        said = [each for each in said if each.subject != "delay" or len(each.joints) > 1]
     return _sorted([*said, *(each for each in findings if each.severity == "wrong")])
 
 
@@ -144,8 +146,9 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
     if inputs.log.u.any() and not contacts:
         comparison, corrections = best_hypothesis(inputs)
         compared = torque_findings(inputs, comparison)
-        if not any(each.subject == "torque unit" and each.severity == "wrong" for each in compared):
-            numbers = parameter_findings(comparison.robot, comparison.rows)
+        noise = inputs.compared_noise
+        if noise is not None and not any(each.subject == "torque unit" and each.severity == "wrong" for each in compared):
+            numbers = parameter_findings(comparison.robot, comparison.rows, noise)
             compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
         findings += [*corrections, *compared]
     return findings, comparison
