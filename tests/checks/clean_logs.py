@@ -1,14 +1,14 @@
-"""Logs without a mistake, on which nothing may be called wrong: robots that rest, no gravity, contacts, odd friction."""
+"""Logs without a mistake, on which nothing may be called wrong: rest, no gravity, contacts, odd friction."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
 from tests.checks.corruptions import ROBOTS, clean, on_a_line, two_links
-
 from tests.checks.logs import clean as filtered_log
 from tests.models.arm import arm_system
 
@@ -36,7 +36,7 @@ def rests(robot: Robot, seed: int, noise: float = 0.05, jitter: float = 0.0) -> 
     rise = np.linspace(0.0, 1.0, 200)
     blend = 10 * rise**3 - 15 * rise**4 + 6 * rise**5
     pieces = []
-    for start, stop in zip(points[:-1], points[1:], strict=True):
+    for start, stop in pairwise(points):
         pieces += [start + blend[:, None] * (stop - start), np.repeat(stop[None], 150, axis=0)]
     data = with_motion(robot, np.concatenate(pieces), 200.0, seed, noise)
     return replace(data, u=data.u + jitter * generator.normal(size=data.u.shape))
@@ -80,7 +80,11 @@ def clean_logs(seed: int) -> Iterator[tuple[str, Dataset]]:
     yield "on a line, no noise", on_a_line(seed, noise=0.0)
     yield "on a line, few rows", on_a_line(seed).rows(slice(None, None, 40))
     yield "three joints", free_log(seed)
-    yield "rests with noisy positions", replace(
-        still_noisy := rests(two_links(), seed), q=still_noisy.q + 1e-5 * np.random.default_rng(seed).normal(size=still_noisy.q.shape)
+    yield (
+        "rests with noisy positions",
+        replace(
+            still_noisy := rests(two_links(), seed),
+            q=still_noisy.q + 1e-5 * np.random.default_rng(seed).normal(size=still_noisy.q.shape),
+        ),
     )
     yield "no noise at all", rests(two_links(), seed, noise=0.0)

@@ -43,7 +43,8 @@ def two_links(
         for k, (length, mass) in enumerate(zip(lengths, masses, strict=True))
     )
     joints = "".join(
-        f'<joint name="joint{k + 1}" type="{kinds[k]}"><parent link="{("base", "link1")[k]}"/><child link="link{k + 1}"/>'
+        f'<joint name="joint{k + 1}" type="{kinds[k]}"><parent link="{("base", "link1")[k]}"/>'
+        f'<child link="link{k + 1}"/>'
         f'<axis xyz="{axes[k]}"/><origin xyz="{("0 0 0", at)[k]}"/>{limits}</joint>'
         for k in range(2)
     )
@@ -61,7 +62,7 @@ ROBOTS: Mapping[str, Callable[[], Robot]] = {
 
 
 def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: str = "a") -> Dataset:
-    """Sums of sines with friction that nobody modelled; noise on `a` alone, as simulated, or on q, v and u, as logged."""
+    """Sums of sines with friction that nobody modelled; noise on `a` alone (simulated), or on q, v and u (logged)."""
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     omega = 2 * np.pi * generator.uniform(0.1, 1.0, (5, 1, 2))
@@ -86,7 +87,9 @@ LINE = Plane((1.0, 0.0, 0.0), 0.35)
 POINT = (0.0, 0.0, -0.3)
 
 
-def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: float = 0.1, push: float = 8.0) -> Dataset:
+def on_a_line(
+    seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: float = 0.1, push: float = 8.0
+) -> Dataset:
     """A planar arm whose tip stays on the line x = 0.35 m, pushed against it, with friction along the line."""
     robot = two_links()
     generator = np.random.default_rng(seed)
@@ -94,7 +97,10 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: fl
     omega, phase = 2 * np.pi * generator.uniform(0.15, 0.8, (4, 1)), generator.uniform(0, 2 * np.pi, (4, 1))
     size = generator.uniform(0.02, 0.05, (4, 1))
     z = -0.4 + (size * np.sin(omega * time + phase)).sum(0)
-    dz, ddz = (size * omega * np.cos(omega * time + phase)).sum(0), (-size * omega**2 * np.sin(omega * time + phase)).sum(0)
+    dz, ddz = (
+        (size * omega * np.cos(omega * time + phase)).sum(0),
+        (-size * omega**2 * np.sin(omega * time + phase)).sum(0),
+    )
     # the tip lies at -(l1 sin q1 + l2 sin(q1 + q2)), -(l1 cos q1 + l2 cos(q1 + q2)) in x and z
     reach = np.hypot(0.35, z)
     bend = np.arccos((reach**2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))
@@ -117,6 +123,12 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: fl
 def at(data: Dataset, names: str, sign: list[float]) -> Dataset:
     """Signals times one factor per joint."""
     return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
+
+
+def degrees(data: Dataset) -> list[float]:
+    """Factors that turn radians into degrees, and leave metres."""
+    assert data.system is not None
+    return [1.0 if joint.type == "prismatic" else DEGREES for joint in data.system.robot.joints]
 
 
 def late(data: Dataset, names: str, seconds: float) -> Dataset:
@@ -214,10 +226,10 @@ def invented(data: Dataset) -> Dataset:
 
 Corruption = Callable[[Dataset], Dataset]
 CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
-    "degrees": (lambda d: at(d, "qva", [DEGREES] * 2), "degrees|velocity|length"),
-    "q in degrees": (lambda d: at(d, "q", [DEGREES] * 2), "degrees|velocity|jumps"),
-    "v in degrees": (lambda d: at(d, "v", [DEGREES] * 2), "velocity"),
-    "a in degrees": (lambda d: at(d, "a", [DEGREES] * 2), "acceleration"),
+    "degrees": (lambda d: at(d, "qva", degrees(d)), "degrees|velocity"),
+    "q in degrees": (lambda d: at(d, "q", degrees(d)), "degrees|velocity|jumps"),
+    "v in degrees": (lambda d: at(d, "v", degrees(d)), "velocity"),
+    "a in degrees": (lambda d: at(d, "a", degrees(d)), "acceleration"),
     "u in mNm": (lambda d: at(d, "u", [1000.0] * 2), "torque unit"),
     "motor side of gears, u": (lambda d: at(d, "u", [1 / 50, 1 / 100]), "torque unit"),
     "motor side of one gear, u": (lambda d: at(d, "u", [1.0, 1 / 30]), "torque unit"),
@@ -321,7 +333,7 @@ def table(seeds: int, say: Callable[[Dataset], str], verbose: bool) -> None:
                     continue
                 try:
                     said = say(corrupt(data))
-                except Exception as error:  # noqa: BLE001  # a table of everything
+                except Exception as error:  # a table of everything
                     said = f"{type(error).__name__}: {error}"
                 new = "\n".join(line for line in said.splitlines() if line not in before)
                 hit = named(new, words)

@@ -28,6 +28,9 @@ LONGEST_TRIM = 0.1
 MOST_ROWS = 1000
 """Rows on which torques are compared: neighbouring rows hold the same information."""
 
+FEW_JOINTS = 3
+"""Of more joints, half as many rows."""
+
 QUICK_ROWS = 300
 """The same before a fit."""
 
@@ -65,7 +68,8 @@ class CheckInput:
     cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
     by more than pi otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a
     log that is otherwise as given). `compared_noise` (nv,) is the standard deviation of the noise of the
-    acceleration in `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any derivative.
+    acceleration in `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any
+    derivative.
     """
 
     log: Dataset
@@ -97,7 +101,8 @@ class CheckInput:
         """Up to `most_rows` rows of `compared`, evenly over the log."""
         assert self.compared is not None
         data = self.compared
-        return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
+        most = self.most_rows if data.nv <= FEW_JOINTS else self.most_rows // 2
+        return data.rows(slice(None, None, max(1, -(-len(data) // most))))
 
     @property
     def price(self) -> Mapping[str, Any]:
@@ -204,7 +209,9 @@ def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
     for joint in np.flatnonzero(((values == 0.0).sum(axis=0) >= FEWEST_DROPS) & (np.ptp(values, axis=0) > 0.0)):
         x = values[:, joint]
         steps = np.abs(np.diff(x))
-        usual = max(JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max()))
+        usual = max(
+            JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max())
+        )
         edges = np.flatnonzero(np.diff(np.concatenate([[False], x == 0.0, [False]]).astype(int)))
         runs = edges.reshape(-1, 2)
         into, out = runs[:, 0] - 1, runs[:, 1] - 1  # the steps that lead into a run of zeros, and out of it

@@ -34,6 +34,9 @@ EXPLAINED = 0.1
 """Where no more than this remains in any joint there is nothing to explain."""
 
 MAX_CORRECTIONS = 4
+ALL_TRIED = 3
+"""Joints up to which the motion of every one is tried in other directions and places."""
+
 GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
 """Gear ratios that are tried."""
 
@@ -168,7 +171,8 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
     places = np.arange(len(inputs.names))
     if largest > 1.0:  # less than a degree of motion is not worth the question
         for turned in [inputs.rotates, *(inputs.rotates & (places == joint) for joint in places)]:
-            if not turned.any() or (turned is not inputs.rotates and inputs.rotates.sum() == 1):
+            alone = turned is not inputs.rotates
+            if not turned.any() or (alone and (inputs.rotates.sum() == 1 or len(places) > ALL_TRIED)):
                 continue
             finding = Finding(
                 severity="wrong",
@@ -181,8 +185,8 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
             correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)
     for joint, name in enumerate(inputs.names):
-        if now.fit.unexplained.max() < STILL_UNEXPLAINED / 2:
-            break
+        if not now.fit.unexplained[joint] > STILL_UNEXPLAINED / 2:
+            continue
         for ratio in GEARS:
             finding = Finding(
                 severity="wrong",
@@ -203,6 +207,8 @@ def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> It
     """The motion of one joint, or all of that joint, in the other direction."""
     places = np.arange(len(names))
     for joint, name in enumerate(names):
+        if not _worth(now, joint):
+            continue
         turned = np.where(places == joint, -1.0, 1.0)
         motion = now.correction.motion(places, turned)
         for seen, correction in (
@@ -224,6 +230,8 @@ def _motion_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
     ones = np.ones(len(names))
     for one in range(len(names)):
         for other in range(one + 1, len(names)):
+            if not _worth(now, one) or not _worth(now, other):
+                continue
             order = np.arange(len(names))
             order[[one, other]] = order[[other, one]]
             motion = now.correction.motion(order, ones)
@@ -266,6 +274,11 @@ def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
         )
         cost = 1.5 if index == len(directions) - 1 else 1.0  # a base along its axes is the likelier one
         yield _hypothesis(with_gravity(now.robot, gravity), now.correction, given, finding=finding, cost=cost)
+
+
+def _worth(now: Hypothesis, joint: int) -> bool:
+    """Whether an error in this joint's own motion is possible: of many joints only those that fit badly are tried."""
+    return len(now.fit.unexplained) <= ALL_TRIED or bool(now.fit.unexplained[joint] > EXPLAINED)
 
 
 def _places(chosen: np.ndarray) -> tuple[int, ...]:

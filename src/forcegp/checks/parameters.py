@@ -1,8 +1,8 @@
 """One number of the robot that is wrong: masses, lengths, torque constants, zeros of joints, gravity.
 
-Inverse dynamics is a polynomial of each of these numbers, of degree 1 (masses, gravity, torque constants) or 2 (lengths),
-and a trigonometric one of degree 2 in the zero of a turning joint. So a few evaluations give the torques for every
-value, and the value is found that leaves least of all torques unexplained, next to friction and rotors as in
+Inverse dynamics is a polynomial of each of these numbers, of degree 1 (masses, gravity, torque constants) or 2
+(lengths), and a trigonometric one of degree 2 in the zero of a turning joint. So a few evaluations give the torques for
+every value, and the value is found that leaves least of all torques unexplained, next to friction and rotors as in
 `forcegp.checks.torques`, but with the torques of the URDF taken as they are.
 """
 
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.findings import Finding
+from forcegp.checks.gravity import with_gravity
 from forcegp.checks.torques import SLOW, inverse_dynamics
 from forcegp.data import Dataset
 from forcegp.robots import Robot
@@ -153,8 +154,10 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
         kept = np.where(np.arange(len(names)) == joint, 0.0, tau)
         yield factor(
             "torque constant",
-            lambda x, name=name: f"the torque of {name} is {x:.3g} times what the motion needs, that of the "
-            "others is not (its torque constant, gear ratio or unit)",
+            lambda x, name=name: (
+                f"the torque of {name} is {x:.3g} times what the motion needs, that of the "
+                "others is not (its torque constant, gear ratio or unit)"
+            ),
             kept,
             joints=(name,),
         )
@@ -202,11 +205,15 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
                 else:
                     rest[body, :3, 3] *= x
                 taus.append(with_tree(rest=rest, inertias=inertias))
-            what = f"the length of {robot.joints[body].child}" if whole else f"the length from {name} to the joint before"
+            what = (
+                f"the length of {robot.joints[body].child}" if whole else f"the length from {name} to the joint before"
+            )
             yield Variation(
                 subject="lengths",
-                seen=lambda x, what=what, whole=whole, length=length: f"the torques fit {x:.3g} times {what}"
-                + ("" if whole else f" ({x * length:.3g} instead of {length:.3g} m)"),
+                seen=lambda x, what=what, whole=whole, length=length: (
+                    f"the torques fit {x:.3g} times {what}"
+                    + ("" if whole else f" ({x * length:.3g} instead of {length:.3g} m)")
+                ),
                 values=FACTORS,
                 weights=quadratic,
                 taus=np.stack(taus),
@@ -214,7 +221,7 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
                 joints=(name,),
             )
     yield from _zeros(robot, rows)
-    yield from _gravity(robot, rows, tau, with_tree)
+    yield from _gravity(robot, rows, tau)
 
 
 def _zeros(robot: Robot, rows: Dataset) -> Iterator[Variation]:
@@ -232,8 +239,10 @@ def _zeros(robot: Robot, rows: Dataset) -> Iterator[Variation]:
         taus = [inverse_dynamics(robot, replace(rows, q=rows.q + x * one)) for x in samples]
         yield Variation(
             subject="joint zero",
-            seen=lambda x, name=name: f"the torques fit positions of {name} that are {x:+.3g} rad ({np.rad2deg(x):+.0f} "
-            "degrees) from the logged ones: its zero is elsewhere",
+            seen=lambda x, name=name: (
+                f"the torques fit positions of {name} that are {x:+.3g} rad ({np.rad2deg(x):+.0f} "
+                "degrees) from the logged ones: its zero is elsewhere"
+            ),
             values=angles,
             weights=weights,
             taus=np.stack(taus),
@@ -244,36 +253,28 @@ def _zeros(robot: Robot, rows: Dataset) -> Iterator[Variation]:
         )
 
 
-def _gravity(
-    robot: Robot, rows: Dataset, tau: np.ndarray, with_tree: Callable[..., np.ndarray]
-) -> Iterator[Variation]:
+def _gravity(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation]:
     """More or less gravity; none; or any where the robot has none."""
-    tree = robot.tree
-    size = float(torch.linalg.vector_norm(tree.gravity))
-    free = with_tree(fall=torch.zeros_like(tree.fall), gravity=torch.zeros_like(tree.gravity)) if size else tau
-    values = np.linspace(-1.5, 3.0, 226)  # with 0 and 1
-    directions = [tree.gravity / size] if size else list(torch.eye(3, dtype=tree.fall.dtype, device=tree.fall.device))
-    signs = (1.0,) if size else (1.0, -1.0)
-    for direction in directions:
-        for sign in signs:
-            along = sign * (size or STANDARD_GRAVITY) * direction
-            if size:
-                pulled = tau
-            else:
-                fall = torch.zeros_like(tree.fall)
-                fall[:, 3, 0] = along
-                pulled = with_tree(fall=fall, gravity=along)
-            text = ",".join(f"{float(value) + 0.0:.3g}" for value in along)
-            yield Variation(
-                subject="gravity",
-                seen=lambda x, text=text, size=size: "the torques show no gravity, although the robot states one "
-                "(--gravity=0,0,0)"
+    nominal = robot.gravity.cpu().numpy()
+    size = float(np.linalg.norm(nominal))
+    free = inverse_dynamics(with_gravity(robot, np.zeros(3)), rows) if size else tau
+    values = np.linspace(-1.5, 3.0, 226) if size else np.linspace(0.0, 1.5, 76)  # with 0 and 1
+    axes = [nominal / size] if size else [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
+    for axis in axes:
+        along = (size or STANDARD_GRAVITY) * axis
+        pulled = tau if size else inverse_dynamics(with_gravity(robot, along), rows)
+        text = ",".join(f"{value + 0.0:.3g}" for value in along)
+        stated = "" if size else f", but the robot states none (--gravity={text})"
+        yield Variation(
+            subject="gravity",
+            seen=lambda x, text=text, stated=stated: (
+                "the torques show no gravity, although the robot states one (--gravity=0,0,0)"
                 if abs(x) < NO_GRAVITY
-                else f"the torques fit {x:.3g} times gravity along ({text}) m/s²"
-                + ("" if size else f", but the robot states none (--gravity={text})"),
-                values=values,
-                weights=np.stack([1.0 - values, values], axis=1),
-                taus=np.stack([free, pulled]),
-                stated=1.0 if size else 0.0,
-                cost=0.1,
-            )
+                else f"the torques fit {x:.3g} times gravity along ({text}) m/s²{stated}"
+            ),
+            values=values,
+            weights=np.stack([1.0 - values, values], axis=1),
+            taus=np.stack([free, pulled]),
+            stated=1.0 if size else 0.0,
+            cost=0.1,
+        )

@@ -24,10 +24,9 @@ from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem
 
-
 BEFORE_A_FIT = frozenset(
     ("contact", "noise_std", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
-     "joint zero", "gravity")
+     "joint zero", "gravity", "dead torque")
 )  # fmt: skip
 """Subjects that a fit reports also where a person should judge."""
 
@@ -147,7 +146,9 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
         comparison, corrections = best_hypothesis(inputs)
         compared = torque_findings(inputs, comparison)
         noise = inputs.compared_noise
-        if noise is not None and not any(each.subject == "torque unit" and each.severity == "wrong" for each in compared):
+        if noise is not None and not any(
+            each.subject == "torque unit" and each.severity == "wrong" for each in compared
+        ):
             numbers = parameter_findings(comparison.robot, comparison.rows, noise)
             compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
         findings += [*corrections, *compared]

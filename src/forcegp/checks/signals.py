@@ -136,7 +136,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
     values = getattr(log, name)[:, joint]
     follows = consecutive(log)[:-1]
     held = np.diff(values) == 0
-    if still(log, name)[joint] or (name == "u" and held.mean() > HELD_STEPS):
+    if np.ptp(values) == 0.0 or (name == "u" and held.mean() > HELD_STEPS):
         return []
     others = np.zeros(len(log) - 1, dtype=bool)
     for other in QUANTITY:
@@ -144,17 +144,28 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
             others |= np.diff(getattr(log, other)[:, joint]) != 0
     seconds = np.diff(log.time)
     step = float(np.median(seconds[follows]))
-    # a velocity that stands still at rest is right, also where the position is noisy
+    # a velocity that stands still at rest is right, also where the position is noisy; a joint that sticks while its
+    # velocity is an estimate does not jump afterwards; and noise about rest goes nowhere
     speed = log.v[1:, joint] if name != "v" else np.where(follows, np.diff(log.q[:, joint]), 0.0) / step
     moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-    start, length = _runs(held & others & follows & moves)
-    if length < FROZEN_ROWS or length * step < FROZEN_SECONDS or _is_extreme(values, values[start]):
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], held & others & follows, [False]]).astype(int)))
+    longest = (0, 0)
+    for start, stop in edges.reshape(-1, 2):
+        length = int(stop - start)
+        if length > longest[1] and length >= FROZEN_ROWS and length * step >= FROZEN_SECONDS:
+            gone = np.cumsum(speed[start:stop]) * step
+            sticks = name == "q" and stop < len(held) and abs(values[stop + 1] - values[start]) < 0.5 * abs(gone[-1])
+            if (
+                moves[start:stop].mean() > 0.5
+                and np.ptp(gone) > 0.25 * np.abs(speed[start:stop]).sum() * step
+                and not sticks
+            ):
+                longest = (int(start), length)
+    start, length = longest
+    if not length or _is_extreme(values, values[start]):
         return []
-    run = speed[start : start + length]
-    if abs(run.sum()) < 0.5 * np.abs(run).sum():
-        return []  # noise about rest
     return [
         Finding(
             severity="look" if name == "u" and values[start] == 0.0 else "wrong",

@@ -177,7 +177,9 @@ class _Residual:
         left = np.maximum(np.einsum("k,jkl,l->j", solution, gram, solution), FLOOR * gram[:, -1, -1]) + 1e-300
         return -solution[:-1] / self.size[:-1] * self.size[-1], left * self.size[-1] ** 2
 
-    def fitted(self, extra: bool = False, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def fitted(
+        self, extra: bool = False, weights: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Coefficients, power left, and weights: those given, or in proportion to 1 over the power that is left."""
         gram = self.grams().sum(axis=0)
         rounds = 4 if weights is None else 1
@@ -195,7 +197,11 @@ def _friction(
     """Joint forces of viscous and dry friction and constants in every joint, and of friction at every contact."""
     state, v = dynamics.state, dynamics.state.v
     slow = SLOW * v.square().mean(0).sqrt() + 1e-12
-    forces = [torch.diag_embed(v), torch.diag_embed(torch.tanh(v / slow)), torch.eye(rows.nv).to(v).expand(len(v), -1, -1)]
+    forces = [
+        torch.diag_embed(v),
+        torch.diag_embed(torch.tanh(v / slow)),
+        torch.eye(rows.nv).to(v).expand(len(v), -1, -1),
+    ]
     multipliers = dynamics.multiplier_map().offset.abs()
     many = len(v) >= MANY_ROWS
     for index, contact in enumerate(system.contacts):
@@ -285,7 +291,7 @@ def _missing(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[
         if body in parents:
             continue
         for contact in _surfaces(rows, robot, robot.joints[body].child):
-            others, tangents = _moved_points(rows, system.with_contacts([contact]))
+            others, _ = _moved_points(rows, system.with_contacts([contact]))
             with_it = _Residual(rows, system.with_contacts([contact]), more=others)
             _, left, weights = with_it.fitted(extra=True)  # the motion may show the surface, and not the point
             free = _Residual(rows, system, friction=with_it.friction).fitted(weights=weights)[1]
@@ -305,8 +311,8 @@ def _missing(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[
     return [
         ContactDoubt(
             kind="missing",
-            seen=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations need a force "
-            "along its normal.",
+            seen=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations "
+            "need a force along its normal.",
             remedy="State the contact (--contact FRAME@x,y,z:SURFACE), or leave out the rows in contact.",
             numbers={"frame": contact.frame, "gain": gain},
         )
@@ -327,7 +333,9 @@ def _surfaces(rows: Dataset, robot: Any, frame: str) -> list[forcegp.mechanics.C
     turned = [np.cross(J[:, 3:], R[:, None, :, k], axisa=1, axisb=2).transpose(0, 2, 1) for k in range(3)]  # w x R e_k
     plane = [J[:, i] for i in range(3)] + [turned[k][:, i] for i in range(3) for k in range(3)]
     round_ = [np.einsum("ri,rij->rj", origin, J[:, :3])]
-    round_ += [np.einsum("ri,rij->rj", origin, turned[k]) + np.einsum("ri,rij->rj", R[:, :, k], J[:, :3]) for k in range(3)]
+    round_ += [
+        np.einsum("ri,rij->rj", origin, turned[k]) + np.einsum("ri,rij->rj", R[:, :, k], J[:, :3]) for k in range(3)
+    ]
     spread = np.sqrt(np.square(rows.v).mean(axis=0))
     found = []
     for columns in (plane, plane + round_):
@@ -369,4 +377,6 @@ def _surface(
         radius = float(np.linalg.norm(position - center, axis=1).mean())
         return forcegp.mechanics.Contact(frame, tuple(point), forcegp.mechanics.Sphere(tuple(center), radius))
     normal = normal / size
-    return forcegp.mechanics.Contact(frame, tuple(point), forcegp.mechanics.Plane(tuple(normal), float((position @ normal).mean())))
+    return forcegp.mechanics.Contact(
+        frame, tuple(point), forcegp.mechanics.Plane(tuple(normal), float((position @ normal).mean()))
+    )
