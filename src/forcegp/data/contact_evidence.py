@@ -182,13 +182,11 @@ class _Residual:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Coefficients, power left, and weights: those given, or in proportion to 1 over the power that is left."""
         gram = self.grams().sum(axis=0)
-        rounds = 4 if weights is None else 1
-        scale = 1.0 / np.maximum(gram[:, -1, -1], 1e-300) if weights is None else weights
-        for _ in range(rounds):
-            solution, left = self.solved(gram, scale, extra)
-            if weights is None:
-                scale = self.size[-1] ** 2 / left
-        return solution, left, scale
+        if weights is None:
+            weights = 1.0 / np.maximum(gram[:, -1, -1], 1e-300)
+            for _ in range(3):
+                weights = self.size[-1] ** 2 / self.solved(gram, weights, extra)[1]
+        return *self.solved(gram, weights, extra), weights
 
 
 def _friction(
