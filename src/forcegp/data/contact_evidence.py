@@ -35,6 +35,9 @@ SLOPE, LEAST_SPEED = 0.02, 2e-3
 HARDLY_ANY = 0.2
 """Share of rows that move along a surface, below which it is another one."""
 
+BROKEN, NOISE = 0.2, 3.0
+"""|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
+
 MOVED = 5e-3  # m
 MOVED_DEVIATIONS = 5.0
 MOVED_GAIN = 0.7
@@ -92,15 +95,23 @@ def _tensors(rows: Dataset) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _stated(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[ContactDoubt]:
-    q, v, u, _ = _tensors(rows)
+    q, v, u, a = _tensors(rows)
     state = forcegp.mechanics.State.of(system.robot, q, v, u)
     touching = np.ones(len(rows), dtype=bool)
     for index, contact in enumerate(system.contacts):
-        A, _, gradient = contact.constraint(state, None)
+        A, b, gradient = contact.constraint(state, system.baumgarte)
         size = torch.linalg.vector_norm(gradient, dim=-1)
         J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
         speed = torch.linalg.vector_norm((J @ v[..., None])[..., 0], dim=-1).numpy()
         rate = ((A * v).sum(-1) / size).abs().numpy()
+        residual = float((((A * a).sum(-1) - b) / size).abs().median())  # |A a - b| in m/s^2
+        acceleration = float(torch.linalg.vector_norm((J @ a[..., None])[..., 0], dim=-1).median())
+        noise = (
+            0.0
+            if rows.noise_std is None
+            else float((A / size[:, None] * torch.tensor(rows.noise_std)).norm(dim=-1).median())
+        )
+        broken = residual > max(BROKEN * acceleration, NOISE * noise)
         distance = (contact.distance(state.kinematics) / size).numpy()
         recovery = 0.0 if system.baumgarte is None else system.baumgarte.omega
         slow = rate <= SLOPE * speed + LEAST_SPEED + recovery * np.minimum(np.abs(distance), NEAR)
@@ -111,11 +122,13 @@ def _stated(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[C
         share = float(along[moves].mean()) if moves.any() else 1.0
         far = float(np.median(np.abs(distance[along]))) if along.any() else float(np.median(np.abs(distance)))
         if share < HARDLY_ANY:
+            if not broken:
+                return []  # states that no contact holds, but accelerations that obey it: drawn, not recorded
             return [
                 ContactDoubt(
                     kind="off",
                     seen=f"{what}only {100.0 * share:.0f} % of the rows move along its surface; the others move "
-                    f"through it with {np.median(rate):.2g} m/s (median), {np.median(np.abs(distance)):.2g} m away.",
+                    f"through it with {np.median(rate):.2g} m/s, and |A a - b| is {residual:.2g} m/s² (medians).",
                     remedy=remedy,
                     numbers={"contact": index, "share": share, "distance": float(np.median(np.abs(distance)))},
                 )
