@@ -148,6 +148,10 @@ class DataWarning(UserWarning):
     """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
 
 
+class ContactWarning(DataWarning):
+    """The rows contradict the contacts that are stated: another point, no force, or a contact that is missing."""
+
+
 def require_type(name: str, given: object, kind: type[Kind], example: str = "") -> Kind:
     """The argument `name`, which is a `kind`; InvalidInput with an `example` for any other."""
     if not isinstance(given, kind):

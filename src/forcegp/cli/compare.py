@@ -78,6 +78,7 @@ class Compare(LearningOptions):
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
         priors = self._priors(system)
+        self._check(terminal, dataset, system)
         dataset, rows_note = self._rows(dataset, system)
         test = None if self.test is None else forcegp.Dataset.load(self.test)
         comparison = self._compare(terminal, dataset, system, priors, test)

@@ -56,6 +56,7 @@ class Fit(ModelOptions):
         start = time.monotonic()
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
+        self._check(terminal, dataset, system)
         rows_note = None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)

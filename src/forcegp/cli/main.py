@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
-        with Terminal(json=command.json, options=command.options) as terminal:
+        with Terminal(json=command.json, options=command.options) as terminal, warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
             _require_address_space()

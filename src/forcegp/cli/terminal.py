@@ -14,13 +14,19 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from rich.console import Console, RenderableType
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 from forcegp.cli.option_names import with_option_names
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
 
+
+UNLIMITED = 10_000
+FOLDED = 16
+"""Columns that are left to long names, which are folded."""
 
 LEAST_SHARE = 0.02
 """Of the work that must be done before the remaining time is guessed from it."""
@@ -86,10 +92,12 @@ class Terminal:
                 stdout.write(text)
 
     def show(self, *renderables: RenderableType) -> None:
-        """Print the result; nothing with --json."""
+        """Print the result; nothing with --json. A table that needs more columns than there are gets them."""
         if not self.json:
             for renderable in renderables:
-                self.out.print(renderable)
+                needed = _columns_needed(self.out, renderable)
+                console = self.out if needed <= self.out.width else Console(highlight=False, width=needed)
+                console.print(renderable)
 
     def note(self, text: str) -> None:
         """Report on stderr what was done."""
@@ -128,6 +136,16 @@ class Terminal:
                 bars.update(task, completed=done, total=total, note=note and f"  {note}", remaining=remaining)
 
             yield report
+
+
+def _columns_needed(console: Console, renderable: RenderableType) -> int:
+    """Columns without which a table of numbers would cut them: a number without its end is a wrong number."""
+    if not isinstance(renderable, Table) or not any(column.no_wrap for column in renderable.columns):
+        return 0
+    wide = console.options.update(width=UNLIMITED)
+    folded = [column for column in renderable.columns if not column.no_wrap]
+    names = [Measurement.get(console, wide, cell).maximum for column in folded for cell in column.cells]
+    return Measurement.get(console, wide, renderable).maximum - max(0, max(names, default=0) - FOLDED)
 
 
 class _PlainProgress:

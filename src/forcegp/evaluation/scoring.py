@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, contact_doubts
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
@@ -50,6 +50,7 @@ def evaluate(
         warnings=(
             *overlap_warnings(posterior, dataset),
             *_noise_warnings(posterior, dataset),
+            *(str(doubt) for doubt in contact_doubts(dataset, posterior.system)),
             *doubts(posterior, dataset, scores),
         ),
         **scores,

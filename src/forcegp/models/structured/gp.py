@@ -33,7 +33,7 @@ from forcegp.models.structured.physical_start import PhysicalStart
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_prior
 from forcegp.models.structured.search import Search
-from forcegp.models.structured.surface_distance import check_distance
+from forcegp.models.structured.surface_distance import check_distance, warn_of_contacts
 from forcegp.models.structured.widening import widened
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
@@ -242,6 +242,7 @@ class StructuredGP(StructuredModel):
         else:
             fitted = self._identify(rows, dataset, search, learn, prior_strength)
         fitted = widened(fitted, search.hyperprior)
+        warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
         described = described_rows(all_rows, dataset)
         return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
