@@ -19,7 +19,8 @@ from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation
-from forcegp.errors import InvalidInput, require_type
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import require_type
 from forcegp.mechanics import MechanicalSystem
 
 
@@ -99,12 +100,8 @@ def check(
     require_type("dataset", dataset, Dataset)
     system = dataset.system if system is None else system
     if system is not None:
-        require_type("system", system, MechanicalSystem)
-    if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
-        raise InvalidInput(
-            f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
-            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
-        )
+        robot = require_type("system", system, MechanicalSystem).robot
+        require_rows("dataset", dataset, robot.joint_names, robot.name)
     inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
     findings = [*sampling_findings(inputs), *signal_findings(inputs), *motion_findings(inputs)]
     comparison = None

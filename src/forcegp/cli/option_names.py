@@ -30,7 +30,7 @@ def with_option_names(message: str, options: Collection[str]) -> str:
 
     def option(found: re.Match[str]) -> str:
         name, value = found[1], (found[2] or "").strip("'")
-        name = name if name in options else OTHERWISE.get(name)
+        name = name if name in options else OTHERWISE.get(name, name)
         if name not in options:
             return found[0]
         flag = f"--{name.replace('_', '-')}"
