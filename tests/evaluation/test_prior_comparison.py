@@ -100,7 +100,7 @@ def test_many_rows_are_conditioned_on_exactly_with_parameters_from_some(train, m
 
 def test_more_rows_than_memory_holds_are_refused_before_the_first_fit(train, monkeypatch):
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
-    with pytest.raises(NotEnoughMemory, match=r"N=40 rows .*fewer points"):
+    with pytest.raises(NotEnoughMemory, match=r"N=40 rows .*fewer `points`"):
         compare_priors(train, PRIORS, points=40, **QUICK)
 
 
@@ -229,7 +229,7 @@ def test_data_that_do_not_fit_are_refused_before_anything_is_fitted(train):
     with pytest.raises(InvalidInput, match="does not carry its robot"):
         compare_priors(dataclasses.replace(train, system=None), PRIORS, **how)
     other = dataclasses.replace(train, system=None, joint_names=("a", "b", "c"))
-    with pytest.raises(InvalidInput, match="the test data have joints a, b, c"):
+    with pytest.raises(InvalidInput, match="the joints of test are a, b, c"):
         compare_priors(train, PRIORS, test=other, **how)
     still = dataclasses.replace(train, v=np.zeros_like(train.v), truth={})
     with pytest.raises(InvalidInput, match="prior 'friction': latent"):

@@ -216,7 +216,7 @@ def test_bad_numbers_are_refused(train, change, message):
 
 def test_a_dataset_of_another_robot_is_refused(train):
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
-    with pytest.raises(InvalidInput, match="joints pan, lift, bend; the robot has yaw, lift, bend"):
+    with pytest.raises(InvalidInput, match="dataset are pan, lift, bend, those of the robot yaw, lift, bend"):
         StructuredGP(train.system.with_robot(renamed)).fit(train)
 
 

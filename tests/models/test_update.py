@@ -255,7 +255,7 @@ def test_budgets_that_mean_nothing_are_refused(posterior, budget):
 def test_other_joints_are_refused(posterior):
     text = posterior.system.robot.urdf_text.replace('"pan"', '"swing"')
     other = arm_data(3, seed=17, system=posterior.system.with_robot(Robot.from_urdf_text(text)))
-    with pytest.raises(InvalidInput, match="new rows have joints swing, lift, bend"):
+    with pytest.raises(InvalidInput, match="the joints of rows are swing, lift, bend"):
         posterior.update(other)
 
 

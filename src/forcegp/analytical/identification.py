@@ -17,7 +17,7 @@ from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.regressor import body_pseudo_inertias
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
-from forcegp.data.argument_order import dataset_first
+from forcegp.data.dataset_arguments import dataset_first, require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 
@@ -69,10 +69,7 @@ def identify_analytical(
     """
     given = dataset.system if system is None else system
     system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
-    if dataset.joint_names != system.robot.joint_names:
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the robot {', '.join(system.robot.joint_names)}."
-        )
+    require_rows("dataset", dataset, system.robot.joint_names, "the robot")
     for name, given, allowed in (
         ("inertias", inertias, ("consistent", "free")),
         ("likelihood", likelihood, ("torque", "acceleration")),

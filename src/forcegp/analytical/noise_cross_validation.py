@@ -15,7 +15,7 @@ import torch
 from forcegp.analytical.identification import identify_analytical
 from forcegp.analytical.noise_levels import NoiseLevels
 from forcegp.data import Dataset
-from forcegp.data.argument_order import dataset_first
+from forcegp.data.dataset_arguments import dataset_first
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem
 

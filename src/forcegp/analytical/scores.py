@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset
-from forcegp.data.argument_order import dataset_first
+from forcegp.data.dataset_arguments import dataset_first
 from forcegp.mechanics import LoadJointFriction, MechanicalSystem
 
 

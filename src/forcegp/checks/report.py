@@ -21,7 +21,8 @@ from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation
-from forcegp.errors import InvalidInput, require_type
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import require_type
 from forcegp.mechanics import MechanicalSystem
 
 BEFORE_A_FIT = frozenset(
@@ -107,8 +108,8 @@ def check(
     require_type("dataset", dataset, Dataset)
     system = dataset.system if system is None else system
     if system is not None:
-        require_type("system", system, MechanicalSystem)
-    _require_same_joints(dataset, system)
+        robot = require_type("system", system, MechanicalSystem).robot
+        require_rows("dataset", dataset, robot.joint_names, robot.name)
     inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
     findings, comparison = _findings(inputs, system)
     if inputs.robot is not None:
@@ -125,7 +126,8 @@ def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tup
     short logs are taken, of which less can be checked. Raises InvalidInput for a robot with other joints.
     """
     system = dataset.system if system is None else system
-    _require_same_joints(dataset, system)
+    if system is not None:
+        require_rows("dataset", dataset, system.robot.joint_names, system.robot.name)
     findings, _ = _findings(CheckInput.quick(dataset, system), system)
     said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
     if dataset.nv > 1:  # friction of one joint can look like a delay
@@ -156,14 +158,6 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
             compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
         findings += [*corrections, *compared]
     return findings, comparison
-
-
-def _require_same_joints(dataset: Dataset, system: MechanicalSystem | None) -> None:
-    if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
-        raise InvalidInput(
-            f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
-            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
-        )
 
 
 def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset, time_blocks
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.evaluation.doubts import unfinished_search
 from forcegp.evaluation.scoring import evaluate
@@ -226,11 +227,8 @@ def compare_priors(
         raise InvalidInput("the dataset does not carry its robot; give system=MechanicalSystem(robot, contacts)")
     if len(priors) < 2:
         raise InvalidInput(f"there is nothing to compare {', '.join(priors) or 'with'}; give two priors or more")
-    if test is not None and tuple(test.joint_names) != tuple(dataset.joint_names):
-        raise InvalidInput(
-            f"the test data have joints {', '.join(test.joint_names)}, the training data "
-            f"{', '.join(dataset.joint_names)}; give another recording of the same robot"
-        )
+    if test is not None:
+        require_rows("test", test, dataset.joint_names, "the training data")
     rows = training_rows(known.robot.joint_names, dataset, points)
     seconds = _block_seconds(rows) if block_seconds is None else block_seconds
     blocks = time_blocks(rows.time, rows.episode, seconds)

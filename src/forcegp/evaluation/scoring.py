@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset, contact_doubts
-from forcegp.errors import InvalidInput, require_type
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import require_type
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.evaluation import Evaluation, Numbers
@@ -28,12 +29,7 @@ def evaluate(
     Raises InvalidInput if the joints of model and Dataset differ.
     """
     require_type("posterior", posterior, Posterior, " of a fit, and the dataset after it")
-    require_type("dataset", dataset, Dataset)
-    if tuple(dataset.joint_names) != posterior.joint_names:
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the model was trained on "
-            f"{', '.join(posterior.joint_names)}. Evaluate on data of the same robot."
-        )
+    require_rows("dataset", dataset, posterior.joint_names, "the model")
     predicted = predict_rows(posterior, dataset, progress)
     scores = {
         "known_physics_mae_per_joint": _numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.noise import Noise
@@ -39,11 +40,8 @@ def check_system_and_noise(model: Any) -> None:
 
 def checked_rows(joint_names: Sequence[str], dataset: Dataset) -> Dataset:
     """`dataset`, if it has these joints and at least 2 rows. Raises InvalidInput otherwise."""
-    require_type("dataset", dataset, Dataset, "; the system belongs to the model, as in StructuredGP(system)")
-    if tuple(dataset.joint_names) != tuple(joint_names):
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the robot has {', '.join(joint_names)}"
-        )
+    remedy = "; the system belongs to the model, as in StructuredGP(system)"
+    require_rows("dataset", dataset, joint_names, "the robot", remedy)
     if len(dataset) < 2:
         raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
     return dataset

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
@@ -64,11 +65,7 @@ class Comparison:
         require_type("system", self.system, MechanicalSystem)
         names = tuple(self.system.robot.joint_names)
         for what, dataset in (("rows", self.rows), ("recording", self.recording)):
-            require_type(what, dataset, Dataset)
-            if tuple(dataset.joint_names) != names:
-                raise InvalidInput(
-                    f"the {what} have joints {', '.join(dataset.joint_names)}; the robot {', '.join(names)}"
-                )
+            require_rows(what, dataset, names, "the robot")
         for name in ("restarts", "iterations"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from forcegp.data import Dataset, require_disjoint
-from forcegp.data.argument_order import dataset_first
+from forcegp.data.dataset_arguments import dataset_first
 from forcegp.errors import InvalidInput
 
 FORMS = "episodes:N,N..., leave-one-out, fraction:F[:SEED] or blocks:N:K,K..."

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import DataWarning, InvalidInput, require_type
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import DataWarning
 from forcegp.inference import ExactPosterior
 from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
 from forcegp.inference.memory import require_memory
@@ -73,9 +74,8 @@ def learn_more_rows(
 
 def _check(joints: Sequence[str], rows: Dataset, budget: int | None) -> None:
     """Raises InvalidInput for rows of other joints and a budget below 2."""
-    require_type("rows", rows, Dataset, ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)")
-    if tuple(rows.joint_names) != tuple(joints):
-        raise InvalidInput(f"the new rows have joints {', '.join(rows.joint_names)}; the model has {', '.join(joints)}")
+    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
+    require_rows("rows", rows, joints, "the model", example)
     if budget is not None:
         whole_number("budget", budget, 2)
 

@@ -1,14 +1,14 @@
-"""One order of arguments: the dataset first, then what it is looked at with. Models and posteriors come before it."""
+"""Datasets as arguments: they come first, but for models and posteriors, and have the joints that are asked for."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
 from forcegp.data.dataset import Dataset
-from forcegp.errors import require_type
+from forcegp.errors import InvalidInput, require_type
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -31,3 +31,13 @@ def dataset_first(function: Callable[Parameters, Result]) -> Callable[Parameters
         return cast(Any, function)(*given, **named)
 
     return ordered
+
+
+def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str, example: str = "") -> None:
+    """Raise InvalidInput unless `rows` is a Dataset with these joints, which are those of `whose`."""
+    own = require_type(name, rows, Dataset, example).joint_names
+    if tuple(own) != tuple(joint_names):
+        raise InvalidInput(
+            f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}; give data of the "
+            "same robot, with its joints in the same order"
+        )
