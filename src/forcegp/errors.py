@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TypeVar
 
 Kind = TypeVar("Kind")
@@ -157,6 +158,17 @@ def require_type(name: str, given: object, kind: type[Kind], example: str = "") 
     if not isinstance(given, kind):
         raise InvalidInput(f"{name} is a {type(given).__name__}; give a {kind.__name__}{example}")
     return given
+
+
+@contextlib.contextmanager
+def usable_arguments(of: str) -> Iterator[None]:
+    """Also a decorator: what Python raises for values of another kind becomes an InvalidInput that names `of`."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, ForceGPError):
+            raise
+        raise InvalidInput(f"{of} was given a value of another kind: {error}; see help({of})") from error
 
 
 def unknown_name_message(

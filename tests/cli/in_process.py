@@ -51,7 +51,7 @@ def _into_a_file(name: str) -> Iterator[IO[bytes]]:
     stream.flush()
     descriptor = {"stdout": 1, "stderr": 2}[name]
     kept = os.dup(descriptor)
-    with tempfile.TemporaryFile() as file, os.fdopen(os.dup(file.fileno()), "w", encoding="utf-8") as ours:
+    with tempfile.TemporaryFile() as file, _like(name, os.dup(file.fileno())) as ours:
         os.dup2(file.fileno(), descriptor)
         setattr(sys, name, ours)
         try:
@@ -60,6 +60,11 @@ def _into_a_file(name: str) -> Iterator[IO[bytes]]:
             setattr(sys, name, stream)
             os.dup2(kept, descriptor)
             os.close(kept)
+
+
+def _like(name: str, descriptor: int) -> IO[str]:
+    """A stream to that descriptor, with what Python does there to letters that cannot be encoded."""
+    return os.fdopen(descriptor, "w", encoding="utf-8", errors={"stderr": "backslashreplace"}.get(name, "strict"))
 
 
 def _text(file: IO[bytes]) -> str:

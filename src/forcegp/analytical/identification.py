@@ -18,7 +18,7 @@ from forcegp.analytical.regressor import body_pseudo_inertias
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import dataset_first, require_rows
-from forcegp.errors import InvalidInput, require_type
+from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 
 Inertias = Literal["consistent", "free"]
@@ -67,24 +67,27 @@ def identify_analytical(
 
     Raises InvalidInput for options that make no sense and for a system in contact.
     """
-    given = dataset.system if system is None else system
-    system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
-    require_rows("dataset", dataset, system.robot.joint_names, "the robot")
-    for name, given, allowed in (
-        ("inertias", inertias, ("consistent", "free")),
-        ("likelihood", likelihood, ("torque", "acceleration")),
-    ):
-        if given not in allowed:
-            raise InvalidInput(f"{name} is {given!r}; give one of {', '.join(allowed)}.")
-    if inertias == "free" and likelihood == "acceleration":
-        raise InvalidInput(
-            "accelerations need a mass matrix that can be inverted, which free inertias need not have; use "
-            "inertias='consistent' with likelihood='acceleration'."
-        )
-    if not (np.isfinite(prior_strength) and prior_strength > 0.0):
-        raise InvalidInput(f"prior_strength is {prior_strength}; it must be > 0, since data never determine all of it.")
-    if rows < 1:
-        raise InvalidInput(f"rows is {rows}; it must be at least 1.")
+    with usable_arguments("identify_analytical"):
+        given = dataset.system if system is None else system
+        system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
+        require_rows("dataset", dataset, system.robot.joint_names, "the robot")
+        for name, given, allowed in (
+            ("inertias", inertias, ("consistent", "free")),
+            ("likelihood", likelihood, ("torque", "acceleration")),
+        ):
+            if given not in allowed:
+                raise InvalidInput(f"{name} is {given!r}; give one of {', '.join(allowed)}.")
+        if inertias == "free" and likelihood == "acceleration":
+            raise InvalidInput(
+                "accelerations need a mass matrix that can be inverted, which free inertias need not have; use "
+                "inertias='consistent' with likelihood='acceleration'."
+            )
+        if not (np.isfinite(prior_strength) and prior_strength > 0.0):
+            raise InvalidInput(
+                f"prior_strength is {prior_strength}; it must be > 0, since data never determine all of it."
+            )
+        if rows < 1:
+            raise InvalidInput(f"rows is {rows}; it must be at least 1.")
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(rows, len(dataset))).astype(int))
     q, v, u, a = (getattr(dataset, name)[chosen] for name in ("q", "v", "u", "a"))
     robot, thick = thickened(system.robot)

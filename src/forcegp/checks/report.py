@@ -110,7 +110,8 @@ def check(
     if system is not None:
         robot = require_type("system", system, MechanicalSystem).robot
         require_rows("dataset", dataset, robot.joint_names, robot.name)
-    inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
+    preparation = Preparation(cutoff="auto") if preparation is None else preparation
+    inputs = CheckInput.of(dataset, system, require_type("preparation", preparation, Preparation))
     findings, comparison = _findings(inputs, system)
     if inputs.robot is not None:
         findings += robot_findings(inputs.robot)

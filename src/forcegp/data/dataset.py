@@ -17,7 +17,7 @@ from forcegp.data.frames import arrays_of, frame_of
 from forcegp.data.frozen_dict import FrozenDict, frozen_json
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.data.units import units_for, validated_units
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message, usable_arguments
 from forcegp.summary import Summary, listed, rounded
 
 TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
@@ -69,6 +69,7 @@ class Dataset(Summary):
     metadata: Mapping[str, Any] = field(default_factory=dict)
     time_ordered: bool = True
 
+    @usable_arguments("Dataset")
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
@@ -175,6 +176,7 @@ class Dataset(Summary):
             return self.noise_std
         return np.sqrt(np.square(self.noise_std).mean(axis=0))
 
+    @usable_arguments("Dataset.rows")
     def rows(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
         """The rows of a slice, boolean mask (rows,) or list of row numbers, in the order given.
 
@@ -217,6 +219,7 @@ class Dataset(Summary):
         write_fields(Path(path), self._fields())
 
     @staticmethod
+    @usable_arguments("Dataset.load")
     def load(path: str | Path) -> Dataset:
         """Read a file written by `save`. Raises FileFormatError saying what is wrong with the file."""
         given = read_fields(Path(path))

@@ -21,7 +21,7 @@ from forcegp.data.filtering import (
     uniform_step,
 )
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
-from forcegp.errors import DatasetError, DataWarning, InvalidInput
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""
@@ -53,6 +53,7 @@ class Preparation:
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
 
+    @usable_arguments("Preparation")
     def __post_init__(self) -> None:
         if self.cutoff not in (None, "auto") and not _positive(self.cutoff):
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")

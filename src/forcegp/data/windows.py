@@ -28,7 +28,7 @@ from forcegp.data.dataset import Dataset
 from forcegp.data.farthest_points import farthest_point_sampling
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
-from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message, usable_arguments
 from forcegp.robots.real_numbers import whole_number
 
 EXACT_DEGREE = 5
@@ -172,6 +172,7 @@ class WeakForm(WindowObservation):
     signal: Literal["q", "v"] = "q"
     order: int = 2
 
+    @usable_arguments("WeakForm")
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.signal not in ("q", "v"):

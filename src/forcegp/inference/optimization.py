@@ -12,7 +12,7 @@ import torch
 from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
-from forcegp.errors import FitError, InvalidInput, NumericalError, NumericalWarning
+from forcegp.errors import FitError, InvalidInput, NumericalError, NumericalWarning, usable_arguments
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
 ProgressCallback = Callable[[int, float], None]
@@ -49,6 +49,7 @@ class OptimizerOptions:
     keep_iterates: bool = False
     slow: float = 0.0
 
+    @usable_arguments("OptimizerOptions")
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.adam_steps < 0:
             raise InvalidInput(f"iterations={self.iterations} and adam_steps={self.adam_steps} must be >= 0")

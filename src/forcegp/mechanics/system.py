@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type
+from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics.contacts import Baumgarte, Contact
 from forcegp.mechanics.gauss_principle import ConstrainedDynamics
 from forcegp.mechanics.known_forces import (
@@ -49,8 +49,11 @@ class MechanicalSystem(Summary):
     known_forces: tuple[KnownForce, ...] = (Actuation(), RigidBodyBias())
     baumgarte: Baumgarte | None = None
 
+    @usable_arguments("MechanicalSystem")
     def __post_init__(self) -> None:
         require_type("robot", self.robot, Robot, ", for example Robot.from_urdf(path)")
+        if self.baumgarte is not None:
+            require_type("baumgarte", self.baumgarte, Baumgarte)
         for name, kind in (("contacts", Contact), ("known_forces", KnownForce)):
             given = getattr(self, name)
             values = tuple(given) if isinstance(given, Iterable) else (given,)

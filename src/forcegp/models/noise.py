@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 
 ACCELERATION = "noise.log_acceleration"
 FORCE = "noise.log_force"
@@ -47,6 +47,8 @@ class Noise:
     from_data: bool = False
 
     def __post_init__(self) -> None:
+        for name in ("learn", "measured_torque", "from_data"):
+            require_type(name, getattr(self, name), bool)
         if self.acceleration is not None:
             object.__setattr__(self, "acceleration", _positive("acceleration", self.acceleration))
         if self.force is not None:

@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder
 from forcegp.data import units_for
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.file_digests import SUMS, added_files, require_unchanged, write_digests
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
@@ -120,6 +120,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         write_digests(folder)
 
 
+@usable_arguments("load_posterior")
 def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
     """Read a folder that `save_posterior` wrote; it predicts without the training file.
 
@@ -285,9 +286,9 @@ def _document(path: Path) -> dict[str, Any]:
         document = json.loads(file.read_text(encoding="utf-8"))
     except OSError:
         raise FileFormatError(f"{path} holds no model.json; give the folder that `forcegp fit --out` wrote") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also numbers of 5000 digits
         raise FileFormatError(f"{file} is damaged: {error}") from None
-    if not isinstance(document, dict) or document.get("kind") not in KINDS:
+    if not isinstance(document, dict) or document.get("kind") not in [*KINDS]:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
     if version not in range(1, FORMAT_VERSION + 1):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expected_friction import ExpectedFriction
 from forcegp.priors.expressed_kernels import ExpressedKernels
@@ -65,6 +65,7 @@ class ContactFriction(ExpressedKernels):
     inputs: tuple[str, ...] = ("velocity",)
     kernel: str | None = None
 
+    @usable_arguments("ContactFriction")
     def __post_init__(self) -> None:
         if self.axes not in AXES or not is_contact_number(self.contact):
             raise InvalidInput(

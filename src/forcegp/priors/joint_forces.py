@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.priors.expressed_kernels import ExpressedKernels
 from forcegp.priors.joint_units import joint_labels, joint_units
@@ -35,6 +35,7 @@ class JointForces(ExpressedKernels):
     kernel: str = "squared-exponential"
     angles: str = "plain"
 
+    @usable_arguments("JointForces")
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", chosen_inputs(type(self).__name__, self.inputs, INPUTS))
         check_kernel(self.kernel)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from inspect import Parameter, signature
 from typing import Any
 
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, unknown_name_message, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.priors.contact_friction import ContactFriction
 from forcegp.priors.force_prior import ForcePrior, SumPrior
@@ -61,6 +61,7 @@ Add your own: NAMED_PRIORS["mine"] = NamedPrior(..., MyPrior).
 """
 
 
+@usable_arguments("named_prior")
 def named_prior(expression: str, system: MechanicalSystem | None = None) -> ForcePrior:
     """The prior of an expression: names from `NAMED_PRIORS`, added by "+", each with options NAME:FIELD=VALUE,...
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expressed_kernels import kernels_of
 from forcegp.priors.force_prior import ForcePrior
@@ -36,6 +36,7 @@ class Payload(ForcePrior):
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
             raise InvalidInput(f"Payload frame is {self.frame!r}; give the name of the link that carries the load.")
+        require_type("moments", self.moments, bool)
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 
 import forcegp.mechanics
 from forcegp.data.dataset_writer import DatasetWriter
-from forcegp.errors import DatasetError, DataWarning, InvalidInput
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
 from forcegp.recordings.episode_rows import EpisodeRows
 from forcegp.recordings.formats import open_source
@@ -60,6 +60,7 @@ class ImportOptions:
     beyond_limits: bool = False
     most_rows: int = 100_000_000
 
+    @usable_arguments("ImportOptions")
     def __post_init__(self) -> None:
         for name in ("gap", "rate"):
             value = getattr(self, name)

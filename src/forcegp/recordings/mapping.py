@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.recordings.signal_units import UNITS, log_unit
 
 SIGNALS = ("q", "v", "u", "a")
@@ -53,6 +53,7 @@ class ColumnMapping:
     delimiter: str | None = None
     side_by_side: bool = False
 
+    @usable_arguments("ColumnMapping")
     def __post_init__(self) -> None:
         if self.time is not None and self.step is not None:
             raise InvalidInput("give a column for the time or the step between rows, not both.")

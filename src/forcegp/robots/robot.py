@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.robots.arguments import (
     Inertials,
     JointValues,
@@ -51,6 +51,7 @@ class Robot(RobotStructure):
     # ------------------------------------------------------------------ making one
 
     @classmethod
+    @usable_arguments("Robot.from_urdf")
     def from_urdf(
         cls,
         path: str | Path,
@@ -74,6 +75,7 @@ class Robot(RobotStructure):
         )
 
     @classmethod
+    @usable_arguments("Robot.from_urdf_text")
     def from_urdf_text(
         cls,
         text: str,

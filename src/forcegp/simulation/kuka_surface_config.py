@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.simulation.checked_numbers import (
     FINITE,
     NOT_NEGATIVE,
@@ -156,6 +156,7 @@ class KukaSurfaceConfig:
     least_acceleration: float = 0.5
     """Acceleration in the parabolic blends, unless a segment needs more to arrive in time [m/s^2]."""
 
+    @usable_arguments("KukaSurfaceConfig")
     def __post_init__(self) -> None:
         for name, allowed in _RANGES.items():
             value = getattr(self, name)

@@ -19,7 +19,7 @@ from jaxtyping import Bool
 
 from forcegp.data import Dataset, require_disjoint
 from forcegp.data.dataset_arguments import dataset_first
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 
 FORMS = "episodes:N,N..., leave-one-out, fraction:F[:SEED] or blocks:N:K,K..."
 DEFAULT_FRACTION, DEFAULT_BLOCKS = 0.25, "blocks:5:3,5"
@@ -189,6 +189,7 @@ def hold_out_blocks(dataset: Dataset, blocks: int, held_out: Sequence[int], guar
 
 
 @dataset_first
+@usable_arguments("split_named")
 def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split, ...]:
     """The splits of a text, as `forcegp validate --split` takes it: several for leave-one-out, else one.
 

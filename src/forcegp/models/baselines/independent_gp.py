@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import FitError, InvalidInput
+from forcegp.errors import FitError, InvalidInput, require_type
 from forcegp.inference import Engine, LatentKernels, OptimizationResult, OptimizerOptions, minimize_objective
 from forcegp.inference.memory import require_memory
 from forcegp.mechanics import MechanicalSystem
@@ -106,7 +106,7 @@ class IndependentGP(Model):
         noise_parameters = noise.parameters(self.system.robot.nv, self.system.robot.device)
         fixed = {} if noise.learn else noise_parameters
         moments = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
-        options = options or OptimizerOptions()
+        options = require_type("options", OptimizerOptions() if options is None else options, OptimizerOptions)
         objectives = tuple(
             _JointObjective(likelihood, joint, one_joint(kernels, joint), noise, joint_part(fixed, joint), hyperprior)
             for joint in range(self.system.robot.nv)

@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, NumericalError, UnknownJoint, unknown_name_message
+from forcegp.errors import InvalidInput, NumericalError, UnknownJoint, unknown_name_message, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import LinkInertia, physical_from_parameters
 
@@ -67,6 +67,7 @@ class Coefficients:
     joints: tuple[str, ...] | None = None
     start: float | None = None
 
+    @usable_arguments("Coefficients")
     def __post_init__(self) -> None:
         if self.joints is not None:
             object.__setattr__(self, "joints", (self.joints,) if isinstance(self.joints, str) else tuple(self.joints))

@@ -8,7 +8,7 @@ from typing import get_args
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.inference import ProblemSize
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.fit_arguments import check_system_and_noise
@@ -28,6 +28,7 @@ class StructuredModel(Model):
     mean: Mean = "analytical"
     noise: Noise | None = None
 
+    @usable_arguments("StructuredModel")
     def __post_init__(self) -> None:
         check_system_and_noise(self)
         if not isinstance(self.prior, ForcePrior):

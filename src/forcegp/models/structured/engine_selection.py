@@ -35,6 +35,7 @@ from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.refinement import refined
 from forcegp.models.structured.surface_distance import check_distance
 from forcegp.models.training_data import TrainingData
+from forcegp.robots.real_numbers import whole_number
 
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
@@ -49,7 +50,7 @@ def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) 
     count = len(rows)
     if learning_points is None:
         learning_points = count if count <= MOST_EXACT_ROWS else LEARNING_ROWS
-    if learning_points < 2:
+    if whole_number("learning_points", learning_points, 0) < 2:
         raise InvalidInput(f"learning_points is {learning_points}; hyper-parameters need at least 2 rows")
     if learning_points >= count:
         return rows

@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, require_type, unknown_name_message
+from forcegp.errors import InvalidInput, require_type, unknown_name_message, usable_arguments
 from forcegp.inference import (
     Engine,
     InducingPosterior,
@@ -207,12 +207,14 @@ class StructuredPosterior(Posterior):
         States as for `predict`, as many as fit into memory at once. `components(q, v, u)["joint-friction"].joint_force`
         is a `Gaussian` (..., nv) in Nm or N. Raises InvalidInput for wrong shapes or values that are not finite.
         """
+        require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
         latents = self._latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
     @override
+    @usable_arguments("curve")
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
         """One process of the prior over its features: a friction curve, for example.
 

@@ -41,9 +41,10 @@ def prepared_predictor(
     compile: bool,
 ) -> Predictor:
     """What `StructuredPosterior.predictor` documents, from the posterior of the latents and the terms of a state."""
-    if covariance not in COVARIANCES:
+    if not isinstance(covariance, str) or covariance not in COVARIANCES:
         raise InvalidInput(f"covariance is {covariance!r}; give one of {', '.join(map(repr, COVARIANCES))}.")
-    if not (0.0 < tolerance < math.inf and isinstance(largest_rank, int) and largest_rank >= 1):
+    number = isinstance(tolerance, int | float)
+    if not (number and 0.0 < tolerance < math.inf and isinstance(largest_rank, int) and largest_rank >= 1):
         raise InvalidInput(
             f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
             "0.01, and an integer from 1."

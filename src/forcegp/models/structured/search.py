@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from forcegp.errors import FitError, InvalidInput
+from forcegp.errors import FitError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import OptimizationResult, OptimizerOptions, best_of, minimize_objective
 from forcegp.models.fit_arguments import check_search_numbers, first_start
 from forcegp.models.identification.physical_parameters import PHYSICAL
@@ -39,8 +39,11 @@ class Search:
     start: Mapping[str, Tensor] | None
     progress: FitProgress | None
 
+    @usable_arguments("fit")
     def __post_init__(self) -> None:
         check_search_numbers(1 if self.restarts is None else self.restarts, self.seed)
+        if self.options is not None:
+            require_type("options", self.options, OptimizerOptions)
         if PHYSICAL in (self.start or {}):
             raise InvalidInput(
                 f"start has {PHYSICAL!r}, numbers in units that the data of their own fit gave them; leave it out, and "

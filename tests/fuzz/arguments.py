@@ -1,0 +1,428 @@
+"""Arguments of the public functions: values of another type, shape or size in the place of one or two that are right."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hypothesis import strategies as st
+from tests.fuzz.made import INPUTS, QUICK
+from tests.fuzz.oracle import DefectError, Target, allowed
+from tests.models.arm import URDF, arm_system
+
+import forcegp
+from forcegp import models
+from forcegp.priors.named import named_prior
+
+STATE = (np.full(3, 0.3), np.full(3, 0.1), np.full(3, 0.5))
+TEXTS = ("", "x", "abc", "10", "nan", "joint", "\ud800", "a\nb", "auto", "joint +", "none", "base", "hand", "pan")
+TENSORS = (
+    lambda: torch.ones(3, dtype=torch.float64, requires_grad=True),
+    lambda: torch.ones(3, dtype=torch.complex128),
+    lambda: torch.ones(3, dtype=torch.bool),
+    lambda: torch.ones(3, device="meta"),
+    lambda: torch.zeros(0),
+    lambda: torch.tensor(float("nan")),
+    lambda: torch.ones(2, 3).to_sparse(),
+)
+MADE: dict[str, Callable[[], Any]] = {
+    **{
+        repr(value): functools.partial(lambda value: value, value)
+        for value in (None, True, False, Ellipsis, NotImplemented)
+    },
+    **{
+        repr(v): functools.partial(lambda v: v, v)
+        for v in (0, -1, 1, 2, 3, 7, 2**63, 10**30, -0.0, 0.5, 1.5, 1e308, -1e308, 1e-320)
+    },
+    **{
+        repr(v): functools.partial(lambda v: v, v)
+        for v in (float("nan"), float("inf"), float("-inf"), 1j, b"x", *TEXTS)
+    },
+    **{
+        repr(v): functools.partial(lambda v: v, v)
+        for v in ((), (1,), (1, 2, 3), (0.0, 0.0, 0.0), ("pan",), (None,), (float("nan"),) * 3)
+    },
+    "[]": list,
+    "{}": dict,
+    "[[1, 2], [3]]": lambda: [[1, 2], [3]],
+    "['a', 'b', 'c']": lambda: ["a", "b", "c"],
+    "{'a': 1}": lambda: {"a": 1},
+    "{1: None}": lambda: {1: None},
+    "{'pan': 'x'}": lambda: {"pan": "x"},
+    "a set": lambda: {1, 2},
+    "an object": object,
+    "a type": lambda: int,
+    "a function": lambda: len,
+    "a generator": lambda: (k for k in range(3)),
+    "a range": lambda: range(3),
+    "a slice": lambda: slice(0, 2),
+    "a path": lambda: Path("nowhere"),
+    "a path with NUL": lambda: "a\x00b",
+    "a date": lambda: datetime.date(2026, 1, 1),
+    "an error": ValueError,
+    **{f"tensor {k}": make for k, make in enumerate(TENSORS)},
+    "array of dates": lambda: np.full(3, np.datetime64("2026-01-01")),
+    "array of texts": lambda: np.array(["a", "b", "c"]),
+    "array of objects": lambda: np.array([{}, [], None], object),
+    "array of records": lambda: np.zeros(3, [("a", "f8")]),
+    "masked": lambda: np.ma.masked_array(np.ones(3), [True, False, False]),
+    "array of nothing": lambda: np.zeros((0, 3)),
+    "array without columns": lambda: np.zeros((3, 0)),
+    "array (3, 3)": lambda: np.ones((3, 3)),
+    "array (14, 3)": lambda: np.ones((14, 3)),
+    "array (14, 3) of NaN": lambda: np.full((14, 3), np.nan),
+    "array (14, 3) huge": lambda: np.full((14, 3), 1e307),
+    "array (14,)": lambda: np.arange(14.0),
+    "array (1, 1, 1, 3)": lambda: np.ones((1, 1, 1, 3)),
+    "scalar of NumPy": lambda: np.float64(0.5),
+    "complex array": lambda: np.ones(3) * 1j,
+    "a Dataset": lambda: INPUTS.data,
+    "a Dataset of a row": lambda: INPUTS.data.rows([0]),
+    "a Dataset of other joints": lambda: INPUTS.other,
+    "a posterior": lambda: INPUTS.posterior,
+    "a robot": lambda: INPUTS.data.system.robot,
+    "a system": lambda: INPUTS.data.system,
+    "a free system": lambda: arm_system(0),
+    "a contact": lambda: INPUTS.data.system.contacts[0],
+    "a noise": lambda: forcegp.Noise(0.1),
+    "a plane": lambda: forcegp.Plane((0.0, 0.0, 1.0), 0.0),
+}
+"""Made anew for every case: some can be used once only, and none may be changed by the one before."""
+
+
+def _dataset() -> dict[str, Any]:
+    data = INPUTS.data
+    names = ("q", "v", "u", "a", "time", "joint_names", "units", "episode", "system", "noise_std", "truth", "metadata")
+    return {name: getattr(data, name) for name in names}
+
+
+def _states() -> dict[str, Any]:
+    return dict(zip("qvu", STATE, strict=True))
+
+
+def _robot() -> Any:
+    return INPUTS.data.system.robot
+
+
+def _prior(kind: Any, **arguments: Any) -> Any:
+    """A prior shows what is wrong with it where it meets a robot."""
+    dynamics = INPUTS.data.system.dynamics(*(torch.tensor(x)[None] for x in STATE))
+    made = kind(**arguments)
+    made.mixing(dynamics), made.features(dynamics)
+    made.kernels(_robot()), made.latent_names(_robot())
+    return made
+
+
+def _forces(kind: Any, **arguments: Any) -> Any:
+    made = kind(**arguments)
+    system = INPUTS.data.system.with_contacts(())
+    return (
+        forcegp.MechanicalSystem(system.robot, (), (*system.known_forces, made))
+        .dynamics(*(torch.tensor(x) for x in STATE))
+        .acceleration_map(True)
+        .offset
+    )
+
+
+def _surface(kind: Any, **arguments: Any) -> Any:
+    system = arm_system(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),))
+    return system.dynamics(*(torch.tensor(x) for x in STATE)).A
+
+
+def _contact(**arguments: Any) -> Any:
+    return arm_system(0).with_contacts((forcegp.Contact(**arguments),)).dynamics(*(torch.tensor(x) for x in STATE)).A
+
+
+def _baumgarte(**arguments: Any) -> Any:
+    return arm_system(baumgarte=forcegp.Baumgarte(**arguments)).dynamics(*(torch.tensor(x) for x in STATE)).b
+
+
+def _robot_from(**arguments: Any) -> Any:
+    return forcegp.Robot.from_urdf_text(**arguments).forward_dynamics(*(torch.tensor(x) for x in STATE))
+
+
+def _fitted(noise: Any) -> Any:
+    return forcegp.StructuredGP(INPUTS.data.system, noise=noise).fit(INPUTS.data, restarts=1, options=QUICK)
+
+
+def _model(**arguments: Any) -> Any:
+    return forcegp.StructuredGP(**arguments).fit(INPUTS.data, points=6, restarts=1, options=QUICK)
+
+
+def _options(**arguments: Any) -> Any:
+    from forcegp.inference import OptimizerOptions
+
+    made = OptimizerOptions(**arguments)
+    if (isinstance(made.iterations, int) and made.iterations > 50) or (
+        isinstance(made.adam_steps, int) and made.adam_steps > 50
+    ):
+        return None
+    return forcegp.StructuredGP(INPUTS.data.system).fit(INPUTS.data, points=6, restarts=1, options=made)
+
+
+def _engine(kind: Any, **arguments: Any) -> Any:
+    return forcegp.StructuredGP(INPUTS.data.system).fit(
+        INPUTS.data, points=8, restarts=1, options=QUICK, engine=kind(**arguments)
+    )
+
+
+FIT = {"points": 6, "restarts": 1, "seed": 0, "options": QUICK}
+SURFACES = {"normal": (0.0, 0.0, 1.0), "offset": 0.1}
+CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
+    "Dataset": (forcegp.Dataset, _dataset),
+    "Dataset.rows": (lambda index: INPUTS.data.rows(index), lambda: {"index": [0, 1]}),
+    "Dataset[]": (lambda index: INPUTS.data[index], lambda: {"index": "q"}),
+    "predict": (lambda **k: INPUTS.posterior.predict(**k), lambda: {**_states(), "covariance": True}),
+    "components": (lambda **k: INPUTS.posterior.components(**k), lambda: {**_states(), "covariance": True}),
+    "rollout": (
+        lambda **k: INPUTS.posterior.rollout(**k),
+        lambda: {
+            "q0": STATE[0],
+            "v0": STATE[1],
+            "u": np.zeros((2, 3)),
+            "dt": 0.001,
+            "integrator": "rk4",
+            "samples": 0,
+            "seed": 0,
+            "baumgarte": None,
+        },
+    ),
+    "update": (lambda **k: INPUTS.posterior.update(**k), lambda: {"rows": INPUTS.data.rows([9]), "budget": 8}),
+    "curve": (lambda **k: INPUTS.posterior.curve(**k), lambda: {"latent": "pan", "features": None, "points": 5}),
+    "with_contacts": (lambda **k: INPUTS.posterior.with_contacts(**k), lambda: {"contacts": ()}),
+    "with_robot": (lambda **k: INPUTS.posterior.with_robot(**k), lambda: {"robot": _robot()}),
+    "with_system": (lambda **k: INPUTS.posterior.with_system(**k), lambda: {"system": INPUTS.data.system}),
+    "predictor": (
+        lambda **k: INPUTS.posterior.predictor(**{**k, "compile": False})(*STATE),
+        lambda: {"covariance": "auto", "tolerance": 0.01, "largest_rank": 64},
+    ),
+    "predictor()": (lambda **k: INPUTS.predictor(**k), _states),
+    "predictor().mean": (lambda **k: INPUTS.predictor.mean(**k), _states),
+    "Noise": (lambda **k: _fitted(forcegp.Noise(**k)), lambda: {"acceleration": 0.1, "force": 0.1, "learn": False}),
+    "noise": (_fitted, lambda: {"noise": 0.1}),
+    "StructuredGP": (
+        _model,
+        lambda: {"system": INPUTS.data.system, "prior": named_prior("joint"), "mean": "zero", "noise": None},
+    ),
+    "fit": (
+        lambda **k: forcegp.StructuredGP(INPUTS.data.system).fit(**k),
+        lambda: {
+            "dataset": INPUTS.data,
+            **FIT,
+            "hyperprior": True,
+            "start": None,
+            "engine": "exact",
+            "learning_points": None,
+        },
+    ),
+    "IndependentGP": (
+        lambda **k: forcegp.IndependentGP(**k).fit(INPUTS.data, **FIT),
+        lambda: {"system": INPUTS.data.system, "inputs": ("q",), "noise": None},
+    ),
+    "NeuralNetwork": (
+        lambda **k: forcegp.NeuralNetwork(**k).fit(INPUTS.data),
+        lambda: {"system": INPUTS.data.system, "width": 3, "steps": 2, "batch": 5, "rate": 0.01},
+    ),
+    "OptimizerOptions": (
+        _options,
+        lambda: {
+            "iterations": 2,
+            "tolerance": 1e-8,
+            "gradient_tolerance": 1e-4,
+            "memory": 5,
+            "adam_steps": 0,
+            "adam_rate": 0.1,
+        },
+    ),
+    "Robot.from_urdf_text": (
+        _robot_from,
+        lambda: {"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None, "inertias": "strict"},
+    ),
+    "Robot.from_urdf": (forcegp.Robot.from_urdf, lambda: {"path": INPUTS.folder / "arm.urdf"}),
+    "inverse_dynamics": (
+        lambda **k: _robot().inverse_dynamics(**k),
+        lambda: {"q": STATE[0], "v": STATE[1], "a": STATE[2]},
+    ),
+    "forward_dynamics": (
+        lambda **k: _robot().forward_dynamics(**k),
+        lambda: {"q": STATE[0], "v": STATE[1], "tau": STATE[2]},
+    ),
+    "mass_matrix": (lambda **k: _robot().mass_matrix(**k), lambda: {"q": STATE[0]}),
+    "frame_pose": (lambda frame, q: _robot().frame_pose(frame, q), lambda: {"frame": "hand", "q": STATE[0]}),
+    "with_armature": (lambda armature: _robot().with_armature(armature), lambda: {"armature": (0.1, 0.1, 0.1)}),
+    "MechanicalSystem": (
+        forcegp.MechanicalSystem,
+        lambda: {"robot": _robot(), "contacts": (), "known_forces": (forcegp.Actuation(),), "baumgarte": None},
+    ),
+    "dynamics": (lambda **k: INPUTS.data.system.dynamics(**k).A, _states),
+    "Contact": (_contact, lambda: {"frame": "hand", "point": (0.0, 0.0, 0.2), "surface": forcegp.Plane(**SURFACES)}),
+    "Plane": (functools.partial(_surface, forcegp.Plane), lambda: dict(SURFACES)),
+    "Sphere": (functools.partial(_surface, forcegp.Sphere), lambda: {"center": (0.0, 0.0, 0.1), "radius": 0.5}),
+    "Cylinder": (
+        functools.partial(_surface, forcegp.Cylinder),
+        lambda: {"point": (0.0, 0.0, 0.1), "axis": (1.0, 0.0, 0.0), "radius": 0.5},
+    ),
+    "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
+    "viscous": (functools.partial(_forces, forcegp.ViscousJointFriction), lambda: {"coefficients": 0.1}),
+    "coulomb": (
+        functools.partial(_forces, forcegp.CoulombJointFriction),
+        lambda: {"coefficients": 0.1, "velocity_scale": 0.01},
+    ),
+    "stribeck": (
+        functools.partial(_forces, forcegp.StribeckJointFriction),
+        lambda: {"coulomb": 0.1, "static": 0.2, "stribeck_velocity": 0.1},
+    ),
+    "constant": (functools.partial(_forces, forcegp.ConstantJointForce), lambda: {"values": 0.1}),
+    "armature": (functools.partial(_forces, forcegp.Armature), lambda: {"inertia": 0.1}),
+    "rotor": (functools.partial(_forces, forcegp.RotorInertia), lambda: {"inertia": 0.1, "transmission": None}),
+    "named_prior": (named_prior, lambda: {"expression": "joint", "system": None}),
+    "JointForces": (
+        functools.partial(_prior, forcegp.JointForces),
+        lambda: {"inputs": ("q",), "kernel": "linear", "angles": "plain"},
+    ),
+    "JointFriction": (functools.partial(_prior, forcegp.JointFriction), lambda: {"joints": None, "kernel": "friction"}),
+    "PeriodicJointForces": (
+        functools.partial(_prior, forcegp.PeriodicJointForces),
+        lambda: {"period": 6.28, "joints": None},
+    ),
+    "ToolForces": (
+        functools.partial(_prior, forcegp.ToolForces),
+        lambda: {
+            "frame": "hand",
+            "point": (0.0, 0.0, 0.0),
+            "axes": "world",
+            "inputs": ("velocity",),
+            "torque": False,
+            "contact": 0,
+            "kernel": "linear",
+        },
+    ),
+    "ContactFriction": (
+        functools.partial(_prior, forcegp.ContactFriction),
+        lambda: {
+            "contact": 0,
+            "axes": "isotropic",
+            "load": False,
+            "viscous": False,
+            "inputs": ("velocity",),
+            "kernel": None,
+        },
+    ),
+    "Payload": (functools.partial(_prior, forcegp.Payload), lambda: {"frame": "hand", "moments": True}),
+    "Inducing": (functools.partial(_engine, forcegp.Inducing), lambda: {"points": 5, "tolerance": 0.02, "refine": 0}),
+    "Iterative": (
+        functools.partial(_engine, forcegp.Iterative),
+        lambda: {"points": None, "tolerance": 1e-4, "iterations": 20, "memory": None},
+    ),
+    "Preparation": (
+        lambda **k: forcegp.Preparation(**k).apply(INPUTS.free),
+        lambda: {"cutoff": 20.0, "order": 2, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
+    ),
+    "evaluate": (forcegp.evaluate, lambda: {"posterior": INPUTS.posterior, "dataset": INPUTS.data}),
+    "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "system": None, "preparation": None}),
+    "identify_analytical": (
+        forcegp.identify_analytical,
+        lambda: {
+            "dataset": INPUTS.free,
+            "system": None,
+            "friction": ("viscous",),
+            "rotors": None,
+            "inertias": "consistent",
+            "likelihood": "torque",
+            "prior_strength": 1.0,
+            "robust": False,
+            "rows": 50,
+        },
+    ),
+    "split_named": (forcegp.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
+    "ColumnMapping": (
+        forcegp.ColumnMapping,
+        lambda: {
+            "time": "t",
+            "q": ("q",),
+            "u": ("u",),
+            "joints": ("a",),
+            "unit": {},
+            "sign": {},
+            "step": None,
+            "headerless": (),
+        },
+    ),
+    "ImportOptions": (
+        forcegp.ImportOptions,
+        lambda: {"gap": None, "resample": "auto", "rate": None, "start": None, "end": None, "most_rows": 10},
+    ),
+    "KukaSurfaceConfig": (
+        forcegp.KukaSurfaceConfig,
+        lambda: {
+            "seconds": 1.0,
+            "seed": 0,
+            "noise": 0.1,
+            "surface": "plane",
+            "friction": None,
+            "tool_point": (0.0, 0.0, 0.1),
+            "patch_x": (0.0, 0.25),
+            "press": None,
+            "null_space_joints": (2,),
+        },
+    ),
+    "WeakForm": (forcegp.WeakForm, lambda: {"seconds": 0.1, "nodes": 6, "signal": "q", "order": 2}),
+    "Coefficients": (forcegp.Coefficients, lambda: {"force": "viscous", "joints": None, "start": None}),
+    "load_posterior": (models.load_posterior, lambda: {"path": INPUTS.folder / "carried", "contacts": None}),
+    "Dataset.load": (forcegp.Dataset.load, lambda: {"path": INPUTS.folder / "train.h5"}),
+}
+
+
+@dataclass(frozen=True)
+class Call:
+    """The call with the arguments number `where` replaced by these values, by name."""
+
+    call: str
+    changes: dict[int, str]
+    more: str
+
+
+CASES = st.builds(
+    Call,
+    st.sampled_from(tuple(CALLS)),
+    st.dictionaries(st.integers(0, 11), st.sampled_from(tuple(MADE)), min_size=1, max_size=2),
+    st.sampled_from(("",) * 20 + ("none_such",)),
+)
+
+
+def check(case: Call, folder: Path) -> None:
+    """A ForceGPError, TypeError for an argument that is unknown, or finite numbers."""
+    function, arguments = CALLS[case.call]
+    given = arguments()
+    names = list(given)
+    for where, made in case.changes.items():
+        given[names[where % len(names)]] = MADE[made]()
+    if case.more:
+        given[case.more] = 1
+        try:
+            function(**given)
+        except TypeError:
+            return
+        except forcegp.errors.ForceGPError:
+            return
+        raise DefectError("an argument that nobody has was taken")
+    with allowed():
+        require_numbers(function(**given))
+
+
+def require_numbers(result: Any) -> None:
+    """Fail for results with numbers that are not finite."""
+    parts = result if isinstance(result, tuple) else (result,)
+    for part in parts:
+        for value in (part, *(getattr(part, name, None) for name in ("mean", "covariance", "q", "v", "a"))):
+            if isinstance(value, torch.Tensor) and not bool(torch.isfinite(value).all()):
+                raise DefectError("numbers that are not finite")
+
+
+TARGET = Target(CASES, check, fast=150, nightly=6000)

@@ -1,0 +1,151 @@
+"""Command lines: any command with any option, numbers and texts of any kind, files of another kind, bytes as names."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from hypothesis import strategies as st
+from tests.fuzz.made import INPUTS
+from tests.fuzz.oracle import CANARY, DefectError, Target, require_ended_well
+from tests.fuzz.values import WORDS, hostile_pickle
+
+from forcegp.cli.arguments import COMMANDS, parse_arguments
+from forcegp.errors import ForceGPError
+
+FILES = ("train.h5", "test.h5", "bare.h5", "arm.urdf", "log.csv", "log.yaml", "log.npz", "log.mcap")
+PATHS = st.sampled_from(
+    (
+        *FILES,
+        "carried",
+        "network",
+        "nowhere",
+        "train.h5/x",
+        ".",
+        "..",
+        "",
+        "/",
+        "/dev/null",
+        "hostile.pkl",
+        "loop",
+        "a" * 300,
+    )
+    + (
+        "nowhere/x.h5",
+        "\udcff.h5",
+        "x\udcff",
+        "x\x00y",
+        "\u202ex",
+        "-",
+        "-x",
+        "~",
+        "out.h5",
+        "out",
+        "carried/model.json",
+    )
+)
+SMALL = ("--points", "6", "--iterations", "2", "--restarts", "1")
+VALID = {
+    "import": (
+        "import",
+        "log.csv",
+        *["--time", "time", "--q", "q_{joints}", "--v", "v_{joints}", "--u", "u_{joints}"],
+        "--joints",
+        "shoulder,elbow",
+        "--out",
+        "out.h5",
+    ),
+    "check": ("check", "test.h5"),
+    "prepare": ("prepare", "test.h5", "--cutoff", "20", "--out", "out.h5"),
+    "fit": ("fit", "train.h5", *SMALL, "--out", "out"),
+    "compare": ("compare", "train.h5", "--prior", "joint", *SMALL),
+    "identify": ("identify", "test.h5", "--model", "least-squares", "--out", "out"),
+    "evaluate": ("evaluate", "carried", "train.h5"),
+    "rollout": ("rollout", "carried", "train.h5", "--starts", "1", "--seconds", "0.02", "--out", "out"),
+    "validate": ("validate", "test.h5", "--models", "none-such", "--out", "out"),
+    "simulate": ("simulate", "none-such", "--out", "out.h5"),
+    "demo": ("demo", "--seconds", "0"),
+    "reproduce": ("reproduce", "none-such", "--out", "out"),
+}
+"""Command lines that are done at once, or refused at once."""
+LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
+"""Nobody may ask for so many seconds of simulation, say, in a test."""
+OPTIONS = {
+    name: sorted(
+        {"--" + item.name.replace("_", "-") for item in fields(kind)} | {"--help", "--no-checks", "--no-hyperprior"}
+    )
+    for name, (kind, _) in COMMANDS.items()
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """A valid command line with other words: at `where` % its length, `how` is done with `word`."""
+
+    command: str
+    edits: list[tuple[int, str, str, str]]
+
+
+@st.composite
+def lines(draw: st.DrawFn) -> Line:
+    command = draw(st.sampled_from(tuple(COMMANDS)))
+    options = st.sampled_from(OPTIONS[command]) | st.sampled_from(OPTIONS[command]) | WORDS
+    how = st.sampled_from(("option", "option", "option", "replace", "replace", "path", "drop", "insert"))
+    edit = st.tuples(st.integers(0, 40), how, options, WORDS | PATHS)
+    return Line(command, draw(st.lists(edit, min_size=1, max_size=4)))
+
+
+def words_of(case: Line) -> list[str]:
+    """The words after `forcegp`."""
+    words = list(VALID[case.command])
+    for where, how, option, value in case.edits:
+        place = where % len(words)
+        match how:
+            case "option":
+                words += [option, value]
+            case "replace" | "path":
+                words[place] = value
+            case "drop":
+                del words[place]
+            case _:
+                words.insert(place, value)
+        words = words or ["fit"]
+    return words
+
+
+def check_words(case: Line, folder: Path) -> None:
+    """A command, or InvalidInput of one line."""
+    words = [word for word in words_of(case) if word not in ("--help", "-h", "--version")]
+    try:
+        command = parse_arguments(words)
+        before = Path.cwd()
+        try:
+            os.chdir(folder)
+            command.check_paths()
+        finally:
+            os.chdir(before)
+    except OSError:
+        pass  # `main` reports it
+    except ForceGPError as error:
+        if not str(error).strip():
+            raise DefectError("refused without a reason") from None
+
+
+def check(case: Line, folder: Path) -> None:
+    """The whole command."""
+    words = words_of(case)
+    if words[0] in ("simulate", "demo", "reproduce", "validate") and words[0] == case.command:
+        words = [word for word in words if word not in LARGE] + ["--none-such", "1"]  # a run takes seconds to hours
+    for name in (*FILES, "carried", "network"):
+        source = INPUTS.folder / name
+        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, folder / name)
+    (folder / "hostile.pkl").write_bytes(hostile_pickle())
+    (folder / "loop").symlink_to("loop")
+    require_ended_well(words, folder)
+    assert not (folder / CANARY).exists()
+
+
+WORDS_TARGET = Target(lines(), check_words, fast=100, nightly=2000)
+TARGET = Target(lines(), check, fast=20, nightly=1500)

@@ -1,0 +1,74 @@
+"""What the fuzzed commands and functions are given where they are given nothing wrong, made once."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from tests.data.samples import dataset
+from tests.models.arm import URDF, arm_data, arm_system
+from tests.recordings.log_files import (
+    motion,
+    table,
+    write_bag2,
+    write_hdf5,
+    write_lerobot,
+    write_matlab5,
+    write_matlab73,
+    write_parquet,
+    write_text,
+)
+
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import IndependentGP, NeuralNetwork, Noise, StructuredGP, save_posterior
+from forcegp.priors.named import named_prior
+from forcegp.robots import Robot
+
+MODELS = ("structured", "carried", "independent", "network")
+QUICK = OptimizerOptions(iterations=2)
+INPUTS: Any = SimpleNamespace(folder=None)
+"""`folder` with the files below, `data`, `posterior`, `predictor`; filled by `make`."""
+LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.parquet", "log.mcap", "lerobot")
+
+
+def make(folder: Path) -> None:
+    """train.h5, test.h5, arm.urdf, the models, logs of two joints with their mappings."""
+    import numpy as np
+
+    data = arm_data(14, 5)
+    free = arm_data(60, 6, arm_system(0))
+    structured = StructuredGP(
+        data.system, named_prior("joint") + named_prior("joint-friction"), noise=Noise(0.05, 0.02, learn=True)
+    ).fit(data, points=8, restarts=1, options=QUICK)
+    plain = StructuredGP(data.system).fit(data, points=8, restarts=1, options=QUICK)
+    heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.9"'))
+    models = {
+        "structured": structured,
+        "carried": plain.with_system(MechanicalSystem(heavier, data.system.contacts, data.system.known_forces)),
+        "independent": IndependentGP(data.system).fit(data, points=8, restarts=1, options=QUICK),
+        "network": NeuralNetwork(data.system, width=4, steps=2).fit(data),
+    }
+    for name, model in models.items():
+        save_posterior(model, folder / name)
+    data.save(folder / "train.h5")
+    free.save(folder / "test.h5")
+    dataclasses.replace(data, system=None, truth={}, noise_std=None).save(folder / "bare.h5")
+    (folder / "arm.urdf").write_text(URDF)
+    rows = motion(60)
+    write_text(folder / "log.csv", table(rows))
+    np.savez(folder / "log.npz", **rows)
+    write_matlab5(folder / "log.mat", rows)
+    write_matlab73(folder / "log73.mat", rows)
+    write_hdf5(folder / "log.h5", rows)
+    write_parquet(folder / "log.parquet", table(rows))
+    write_lerobot(folder / "lerobot", rows)
+    next(write_bag2(folder / "bag", rows).glob("*.mcap")).rename(folder / "log.mcap")
+    (folder / "log.yaml").write_text(
+        "time: time\nq: q_{joints}\nv: v_{joints}\nu: u_{joints}\njoints: shoulder,elbow\n"
+    )
+    INPUTS.folder, INPUTS.data, INPUTS.posterior, INPUTS.free = folder, data, plain, free
+    INPUTS.other = dataset()
+    INPUTS.predictor = plain.predictor(compile=False)

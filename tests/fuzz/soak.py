@@ -1,0 +1,75 @@
+"""Learning on for a long time: what a posterior has become after many updates, against one fit to the rows it holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+from pathlib import Path
+
+import numpy as np
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.inference import OptimizerOptions
+from forcegp.models import Posterior, StructuredGP
+
+BUDGET = 8
+POOL = 400
+"""Rows that are shown again and again, each time in a different company."""
+
+
+def start() -> tuple[Posterior, list]:
+    """A posterior of a few rows, and single rows to learn from."""
+    data = arm_data(POOL, 1, arm_system(0))
+    posterior = StructuredGP(data.system).fit(
+        data.rows(slice(0, BUDGET)), restarts=1, options=OptimizerOptions(iterations=8)
+    )
+    return posterior, [data.rows([k]) for k in range(POOL)]
+
+
+def drift(posterior: Posterior) -> float:
+    """The largest difference of a mean or covariance to conditioning on its rows at once, relative to the largest."""
+    training = posterior.training
+    fresh = posterior.model.condition(
+        training, posterior.parameters, posterior.result, {"widening": posterior.widening}
+    )
+    states = tuple(torch.tensor(x) for x in _states())
+    mine, theirs = posterior.predict(*states), fresh.predict(*states)
+    return max(
+        float((getattr(mine, name) - getattr(theirs, name)).abs().max() / getattr(theirs, name).abs().max())
+        for name in ("mean", "covariance")
+    )
+
+
+def predictor_error(posterior: Posterior) -> float:
+    """The largest difference of the means of its predictor to `predict`, relative to the largest."""
+    states = tuple(torch.tensor(x) for x in _states())
+    mean = posterior.predict(*states).mean
+    predictor = posterior.predictor(compile=False)
+    there = torch.stack([predictor.mean(*(x[k] for x in states)) for k in range(len(mean))])
+    return float((there - mean).abs().max() / mean.abs().max())
+
+
+def memory() -> int:
+    """Bytes that this process holds now."""
+    status = Path("/proc/self/statm")
+    if status.exists():
+        return int(status.read_text().split()[1]) * resource.getpagesize()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def tensors(posterior: Posterior) -> int:
+    """Numbers that its rows and those that standardise hold: they must not become more."""
+    rows = posterior.training
+    return sum(
+        getattr(part, item.name).numel()
+        for part in (rows, rows.reference)
+        if part is not None
+        for item in dataclasses.fields(part)
+        if isinstance(getattr(part, item.name), torch.Tensor)
+    )
+
+
+def _states() -> tuple[np.ndarray, ...]:
+    test = arm_data(5, 2, arm_system(0))
+    return test.q, test.v, test.u

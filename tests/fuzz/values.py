@@ -1,0 +1,292 @@
+"""Values that nobody expects: numbers, texts, JSON of any shape, and edits of JSON, bytes and XML."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import random
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from typing import Any
+
+from hypothesis import strategies as st
+from tests.fuzz.oracle import CANARY
+
+NUMBERS = ("0", "-0", "1", "-1", "2", "0.5", "1e400", "-1e400", "1e308", "1e-320", "nan", "NaN", "inf", "-inf")
+NUMBERS += (
+    "10000000000000000000000000",
+    "-9223372036854775809",
+    "1.5",
+    "1_000",
+    "0x10",
+    "1,5",
+    "٣",
+    "1e5000",
+    "+",
+    ".",
+)
+TEXTS = (
+    "",
+    " ",
+    "x",
+    "q",
+    "a,b",
+    ",",
+    "=",
+    ":",
+    "é",
+    "\u202e",
+    "🤖",
+    "a" * 5000,
+    "../..",
+    "/dev/null",
+    "%s",
+    "{}",
+    "{x}",
+)
+TEXTS += (
+    "[",
+    "-",
+    "--",
+    "none",
+    "auto",
+    "null",
+    "true",
+    "\t",
+    "a\nb",
+    "'",
+    '"',
+    "\\",
+    "*",
+    "**",
+    "$HOME",
+    "~",
+    "q_{joints}",
+)
+WORDS = st.sampled_from(NUMBERS + TEXTS)
+
+SCALARS = st.sampled_from(
+    (
+        None,
+        True,
+        False,
+        0,
+        -0.0,
+        1,
+        -1,
+        2,
+        10**30,
+        2**63,
+        1.5,
+        1e308,
+        -1e308,
+        1e-320,
+        float("nan"),
+        float("inf"),
+        "",
+        "x",
+        "nan",
+        "1",
+        "\x00",
+        "\ud800",
+        "é",
+        "q",
+        "rad",
+        "analytical",
+        "joint",
+        "x" * 300,
+    )
+)
+JSON = st.recursive(
+    SCALARS, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3), max_leaves=6
+)
+RAW = ("@deep", "@digits")
+"""Stand for JSON that `json.dumps` does not write: nested 100,000 times, and a number of 5000 digits."""
+
+
+@dataclass(frozen=True)
+class JsonEdit:
+    """`how` is done at the entry number `where` of a document."""
+
+    where: int
+    how: str
+    value: Any = None
+
+
+JSON_EDITS = st.builds(
+    JsonEdit,
+    st.integers(0, 2000),
+    st.sampled_from(("set", "set", "set", "delete", "add", "another")),
+    JSON | st.sampled_from(RAW),
+)
+
+
+def edited_json(document: Any, edits: list[JsonEdit]) -> str:
+    """The text of the document after these edits, which may no longer be JSON."""
+    document = json.loads(json.dumps(document))
+    for edit in edits:
+        holders = list(_entries(document))
+        if not holders:
+            break
+        holder, key = holders[edit.where % len(holders)]
+        match edit.how:
+            case "set":
+                holder[key] = edit.value
+            case "delete":
+                del holder[key]
+            case "another":
+                other, name = holders[(7 * edit.where + 3) % len(holders)]
+                holder[key] = json.loads(json.dumps(other[name]))
+            case _:
+                if isinstance(holder, dict):
+                    holder["extra"] = edit.value
+                else:
+                    holder.append(edit.value)
+    text = json.dumps(document)
+    return text.replace('"@deep"', "[" * 100_000 + "]" * 100_000).replace('"@digits"', "9" * 5000)
+
+
+def _entries(node: Any):
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in list(items):
+        yield node, key
+        if not (isinstance(value, list) and len(value) > 30):  # thousands of numbers alike
+            yield from _entries(value)
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What happens to the bytes of a file; all of it is drawn from `seed`."""
+
+    seed: int
+    how: str
+
+
+DAMAGE = st.builds(
+    Damage,
+    st.integers(0, 2**31),
+    st.sampled_from(("flip", "flip", "cut", "lose", "insert", "ones", "empty", "random", "twice", "pickle", "zeros")),
+)
+
+
+def damaged(content: bytes, damage: Damage) -> bytes:
+    """The content after the damage."""
+    generator = random.Random(damage.seed)
+    place = generator.randrange(len(content) + 1)
+    count = generator.choice((1, 4, 40, 1000))
+    match damage.how:
+        case "flip" if content:
+            place = min(place, len(content) - 1)
+            return content[:place] + bytes([content[place] ^ (1 << generator.randrange(8))]) + content[place + 1 :]
+        case "cut":
+            return content[:place]
+        case "lose":
+            return content[:place] + content[place + count :]
+        case "insert":
+            return content[:place] + generator.randbytes(count) + content[place:]
+        case "ones":
+            return content[:place] + b"\xff" * 8 + content[place + 8 :]
+        case "zeros":
+            return content[:place] + b"\x00" * count + content[place + count :]
+        case "empty":
+            return b""
+        case "random":
+            return generator.randbytes(count)
+        case "twice":
+            return content + content
+        case "pickle":
+            return hostile_pickle()
+        case _:
+            return content
+
+
+class Hostile:
+    """Makes a folder where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        import os
+
+        return os.mkdir, (CANARY,)
+
+
+def hostile_pickle() -> bytes:
+    """A pickle that makes a folder where it is read."""
+    return pickle.dumps(Hostile())
+
+
+@dataclass(frozen=True)
+class XmlEdit:
+    """`how` is done at the element number `where` of an XML file."""
+
+    where: int
+    how: str
+    name: str
+    value: str
+
+
+XML_EDITS = st.builds(
+    XmlEdit,
+    st.integers(0, 500),
+    st.sampled_from(("drop", "twice", "attribute", "attribute", "attribute", "lose", "tag", "text", "into", "swap")),
+    st.sampled_from(("name", "value", "xyz", "rpy", "link", "type", "mass", "ixx", "lower", "upper", "effort", "x")),
+    st.sampled_from(
+        NUMBERS
+        + TEXTS
+        + ("0 0 0", "1 2", "1 0 0 0", "nan 0 0", "1e200 0 0", "base", "upper", "mimic", "floating", "fixed")
+    ),
+)
+PROLOGUES = {
+    "none": b"",
+    "punycode": b'<?xml version="1.0" encoding="punycode"?>',
+    "utf-7": b'<?xml version="1.0" encoding="utf-7"?>',
+    "idna": b'<?xml version="1.0" encoding="idna"?>',
+    "zlib": b'<?xml version="1.0" encoding="zlib"?>',
+    "rot13": b'<?xml version="1.0" encoding="rot13"?>',
+    "undefined": b'<?xml version="1.0" encoding="undefined"?>',
+    "unicode_escape": b'<?xml version="1.0" encoding="unicode_escape"?>',
+    "utf-16": b'<?xml version="1.0" encoding="utf-16"?>',
+    "nothing": b'<?xml version="1.0" encoding=""?>',
+    "NUL": b'<?xml version="1.0" encoding="\x00"?>',
+    "version": b'<?xml version="1e400"?>',
+    "mark": b"\xff\xfe",
+    "bomb": b'<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">'
+    + b"".join(b'<!ENTITY %c "%s">' % (c, b"&%c;" % (c - 1) * 10) for c in range(98, 108))
+    + b"]><r>&k;</r>",
+    "external": b'<!DOCTYPE r [<!ENTITY a SYSTEM "secret.txt">]>',
+    "deep": b"<a>" * 50_000,
+}
+
+
+def edited_xml(text: str, edits: list[XmlEdit]) -> str:
+    """The text after these edits."""
+    root = ET.fromstring(text)
+    for edit in edits:
+        elements = list(root.iter())
+        element = elements[edit.where % len(elements)]
+        parents = {child: parent for parent in elements for child in parent}
+        parent = parents.get(element)
+        match edit.how:
+            case "drop" if parent is not None:
+                parent.remove(element)
+            case "twice" if parent is not None:
+                parent.append(element)
+            case "attribute":
+                own = list(element.attrib)
+                element.set(own[edit.where % len(own)] if own else edit.name, _xml(edit.value))
+            case "lose" if element.attrib:
+                del element.attrib[sorted(element.attrib)[edit.where % len(element.attrib)]]
+            case "tag":
+                element.tag = edit.name
+            case "text":
+                element.text = _xml(edit.value)
+            case "into":
+                other = ET.SubElement(element, edit.name)
+                other.set(edit.name, _xml(edit.value))
+            case "swap":
+                other = elements[(3 * edit.where + 1) % len(elements)]
+                element.attrib, other.attrib = other.attrib, element.attrib
+    return ET.tostring(root, encoding="unicode")
+
+
+def _xml(value: str) -> str:
+    return value.replace("\x00", "")
