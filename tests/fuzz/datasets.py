@@ -173,5 +173,5 @@ def check_commands(case: DataFile, folder: Path) -> None:
     require_ended_well(words[number % 3].split(), folder)
 
 
-TARGET = Target(CASES, check, fast=100, nightly=4000)
-COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=800)
+TARGET = Target(CASES, check, fast=100, nightly=3000)
+COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=1500)

@@ -72,7 +72,9 @@ def search(target: Target, folder: Path, count: int) -> None:
     def one(case: Any) -> None:
         nonlocal ran
         ran += 1
-        own = Path(tempfile.mkdtemp(dir=folder))
+        top = Path(tempfile.mkdtemp(dir=folder))
+        own = top / "some" / "folders" / "deep"
+        own.mkdir(parents=True)
         try:
             with limited(), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of numbers that overflow, say
@@ -83,7 +85,7 @@ def search(target: Target, folder: Path, count: int) -> None:
                 told = "".join(traceback.format_exception(error)[-4:])
                 defects[key] = text, told
         finally:
-            shutil.rmtree(own, ignore_errors=True)
+            shutil.rmtree(top, ignore_errors=True)
 
     one()
     found = "\n\n".join(f"--- {key}\ncase: {text[:3000]}\n{told[:4000]}" for key, (text, told) in defects.items())
@@ -141,9 +143,10 @@ def snapshot(folder: Path) -> dict[str, str]:
 
 def require_ended_well(words: list[str], folder: Path) -> int:
     """Run a command line there: 0, or 2 with one line and nothing written; returns the code, raises DefectError."""
-    before = snapshot(folder)
+    top = folder.parents[2]  # so that what ".." names is seen, too
+    before = snapshot(top)
     done = run_here(*words, folder=folder)
-    after = snapshot(folder)
+    after = snapshot(top)
     own = [line for line in done.stderr.splitlines() if line.startswith("forcegp: ")]
     if done.returncode not in (0, 2) or "Traceback" in done.stderr or "Exception ignored" in done.stderr:
         raise DefectError(f"exit {done.returncode}: {own or done.stderr[-600:]}")
@@ -156,5 +159,5 @@ def require_ended_well(words: list[str], folder: Path) -> int:
     lost = {name for name, digest in before.items() if after.get(name) != digest}
     if lost and "--overwrite" not in words:
         raise DefectError(f"changed its inputs: {lost}")
-    require_no_code(folder)
+    require_no_code(top)
     return done.returncode

@@ -30,9 +30,8 @@ def start() -> tuple[Posterior, list]:
 def drift(posterior: Posterior) -> float:
     """The largest difference of a mean or covariance to conditioning on its rows at once, relative to the largest."""
     training = posterior.training
-    fresh = posterior.model.condition(
-        training, posterior.parameters, posterior.result, {"widening": posterior.widening}
-    )
+    settings = {"widening": posterior.widening}
+    fresh = posterior.model.condition(training, posterior.parameters, posterior.result, settings)
     states = tuple(torch.tensor(x) for x in _states())
     mine, theirs = posterior.predict(*states), fresh.predict(*states)
     return max(

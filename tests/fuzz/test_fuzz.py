@@ -11,6 +11,7 @@ TARGETS = {
     "stored models": stored.TARGET,
     "robot files": robots.TARGET,
     "datasets": datasets.TARGET,
+    "datasets of commands": datasets.COMMANDS_TARGET,
     "mappings": mappings.TARGET,
     "logs": logs.TARGET,
     "words": command_lines.WORDS_TARGET,

@@ -20,6 +20,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import dataset_first, require_rows
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
+from forcegp.robots.real_numbers import whole_number
 
 Inertias = Literal["consistent", "free"]
 Likelihood = Literal["torque", "acceleration"]
@@ -86,7 +87,8 @@ def identify_analytical(
             raise InvalidInput(
                 f"prior_strength is {prior_strength}; it must be > 0, since data never determine all of it."
             )
-        if rows < 1:
+        require_type("robust", robust, bool)
+        if whole_number("rows", rows, 0) < 1:
             raise InvalidInput(f"rows is {rows}; it must be at least 1.")
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(rows, len(dataset))).astype(int))
     q, v, u, a = (getattr(dataset, name)[chosen] for name in ("q", "v", "u", "a"))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import (
     Armature,
     ConstantJointForce,
@@ -170,6 +170,7 @@ class JointTerms:
     Raises InvalidInput for other names.
     """
 
+    @usable_arguments("identify_analytical")
     def __init__(
         self,
         system: MechanicalSystem,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -51,7 +52,7 @@ class OptimizerOptions:
 
     @usable_arguments("OptimizerOptions")
     def __post_init__(self) -> None:
-        if self.iterations < 0 or self.adam_steps < 0:
+        if min(map(operator.index, (self.iterations, self.adam_steps))) < 0:
             raise InvalidInput(f"iterations={self.iterations} and adam_steps={self.adam_steps} must be >= 0")
         if not (
             self.tolerance >= 0

@@ -16,7 +16,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
@@ -140,6 +140,7 @@ class Posterior(Summary, ABC):
         Raises InvalidInput for wrong shapes or values that are not finite, and inside `torch.func.vmap`, whose batch
         the leading dimensions are; NumericalError where the result is not finite.
         """
+        require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         q, v, u = states
         blocks = [

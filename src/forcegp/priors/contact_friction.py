@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expected_friction import ExpectedFriction
 from forcegp.priors.expressed_kernels import ExpressedKernels
@@ -67,6 +67,7 @@ class ContactFriction(ExpressedKernels):
 
     @usable_arguments("ContactFriction")
     def __post_init__(self) -> None:
+        require_type("load", self.load, bool)
         if self.axes not in AXES or not is_contact_number(self.contact):
             raise InvalidInput(
                 f"ContactFriction has axes {self.axes!r} and contact {self.contact!r}; give 'isotropic' or 'two-axis', "

@@ -76,7 +76,7 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
         elif key == "headerless":
             values[key] = tuple(_whole(number) for number in (value if isinstance(value, list) else [value]))
         elif key == "step":
-            values[key] = _numbers(key, value)[0]
+            values[key] = _number(key, value)
         elif key == "side_by_side":
             if not isinstance(value, bool):
                 raise InvalidInput(f"side_by_side is {value!r}; give true or false.")
