@@ -46,10 +46,9 @@ VALID = {
 """Command lines that are done at once, or refused at once."""
 LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
 """Nobody may ask for so many seconds of simulation, say, in a test."""
+MORE = {"--help", "--no-checks", "--no-hyperprior"}
 OPTIONS = {
-    name: sorted(
-        {"--" + item.name.replace("_", "-") for item in fields(kind)} | {"--help", "--no-checks", "--no-hyperprior"}
-    )
+    name: sorted({"--" + item.name.replace("_", "-") for item in fields(kind) if item.name != "debug"} | MORE)
     for name, (kind, _) in COMMANDS.items()
 }
 

@@ -54,7 +54,7 @@ ARRAYS = {
     "big ends": lambda x: x.astype(">f8"),
     "record": lambda x: np.zeros(x.shape, [("a", "f8"), ("b", "i4")]),
 }
-MOTIONS = {"preparation": {"cutoff": "x"}}, {"preparation": 5}, {"preparation": {"delay": [None]}}, {"preparation": []}
+MOTIONS = {"import": 5}, {"import": {"rows": []}}, {"config": []}, {"preparation": {"cutoff": "x"}}, {"preparation": 5}, {"preparation": {"delay": [None]}}, {"preparation": []}
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _apply(file: h5py.File, change: Change) -> None:
         case "text":
             file[name] = json.dumps(value).replace("@deep", "")
         case "motion":
-            file[name] = json.dumps({"preparation": value, "source": value})
+            file[name] = json.dumps({"preparation": value, "source": value, "import": value, "windows": value})
         case "names":
             file[name] = [item.replace("\0", "") for item in value] or np.zeros(0)
         case "edit":

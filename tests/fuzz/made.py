@@ -39,7 +39,7 @@ def make(folder: Path) -> None:
     import numpy as np
 
     data = arm_data(14, 5)
-    free = arm_data(60, 6, arm_system(0))
+    free = arm_data(80, 6, arm_system(0))
     structured = StructuredGP(
         data.system, named_prior("joint") + named_prior("joint-friction"), noise=Noise(0.05, 0.02, learn=True)
     ).fit(data, points=8, restarts=1, options=QUICK)

@@ -3,9 +3,14 @@
 Day by day other cases, and 40 times as many at night. What was found stands in `test_found.py` by name.
 """
 
+import numpy as np
 import pytest
+import yaml
 from tests.fuzz import arguments, command_lines, datasets, logs, mappings, robots, stored
-from tests.fuzz.oracle import search
+from tests.fuzz.oracle import CANARY, require_ended_well, search
+from tests.fuzz.values import Hostile, hostile_pickle
+
+pytestmark = pytest.mark.usefixtures("unchecked")
 
 TARGETS = {
     "stored models": stored.TARGET,
@@ -34,3 +39,25 @@ def test_random_inputs_of_tonight(name, tmp_path):
 def test_there_are_as_many_as_promised():
     assert sum(target.fast for target in TARGETS.values()) >= 500
     assert sum(target.nightly for target in TARGETS.values()) >= 20_000
+
+
+def test_what_would_run_code_does_not(tmp_path, monkeypatch):
+    """And would, with the libraries as they are."""
+    monkeypatch.chdir(tmp_path)
+    code = f"q: !!python/object/apply:os.mkdir [{CANARY}]\n"
+    yaml.unsafe_load(code)
+    (tmp_path / CANARY).rmdir()
+    np.savez("log.npz", q=np.array([Hostile()], object), time=np.zeros(1))
+    with np.load("log.npz", allow_pickle=True) as file:
+        file["q"]
+    (tmp_path / CANARY).rmdir()
+    folder = tmp_path / "some" / "folders" / "deep"
+    folder.mkdir(parents=True)
+    (folder / "log.npz").write_bytes((tmp_path / "log.npz").read_bytes())
+    (folder / "log.csv").write_text("time,q\n0,0\n1,1\n")
+    (folder / "log.pkl").write_bytes(hostile_pickle())
+    flags = ["--time", "time", "--q", "q", "--u", "0", "--joints", "a", "--out", "o.h5"]
+    for log in ("log.npz", "log.pkl"):
+        assert require_ended_well(["import", log, *flags], folder) == 2
+    (folder / "log.yaml").write_text(code)
+    assert require_ended_well(["import", "log.csv", "--out", "o.h5"], folder) == 2

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, unknown_name_message, usable_arguments
 from forcegp.inference.conjugate_gradients import Iteration
 from forcegp.inference.inducing import InducingPosterior
 from forcegp.inference.iterative import IterativePosterior
@@ -267,6 +267,7 @@ class Choice:
     reason: str
 
 
+@usable_arguments("engine")
 def engine_of(given: Engine | str) -> Engine | None:
     """The engine of that name, or itself; None for "auto". Raises InvalidInput for anything else."""
     if isinstance(given, Engine):

@@ -250,7 +250,7 @@ class MechanicalSystem(Summary):
         """The system that `to_json` stored."""
         try:
             stored = json.loads(text)
-        except (json.JSONDecodeError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:  # also numbers of 5000 digits
             raise FileFormatError(f"stored system is not JSON: {error}") from None
         if not isinstance(stored, dict):
             raise FileFormatError(f"stored system is a {type(stored).__name__}, expected a JSON object")

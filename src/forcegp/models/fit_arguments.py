@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
 from forcegp.data.dataset_arguments import require_rows
-from forcegp.errors import DataWarning, InvalidInput, require_type
+from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.noise import Noise
 from forcegp.robots.real_numbers import whole_number
@@ -122,6 +122,7 @@ def check_search_numbers(restarts: int, seed: int) -> None:
     whole_number("seed", seed, 0)
 
 
+@usable_arguments("start")
 def first_start(
     moments: Mapping[str, Tensor], given: Mapping[str, Tensor], fixed: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, require_type
+from forcegp.errors import InvalidInput, require_type, usable_arguments
 
 ACCELERATION = "noise.log_acceleration"
 FORCE = "noise.log_force"
@@ -46,6 +46,7 @@ class Noise:
     measured_torque: bool = False
     from_data: bool = False
 
+    @usable_arguments("Noise")
     def __post_init__(self) -> None:
         for name in ("learn", "measured_torque", "from_data"):
             require_type(name, getattr(self, name), bool)

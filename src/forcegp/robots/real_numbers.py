@@ -45,7 +45,7 @@ def real_tensor(name: str, given: Any, device: torch.device) -> Tensor:
     if not isinstance(given, Tensor):
         return torch.tensor(real_array(name, given).astype(np.float64), device=device)
     if given.dtype == torch.bool or given.is_complex() or given.is_meta or given.layout != torch.strided:
-        raise InvalidInput(f"{name} must be a dense tensor of real numbers; given: {given.dtype}, {given.layout}.")
+        raise InvalidInput(f"{name} must be a tensor of real numbers; given: {given.dtype} on {given.device}.")
     return given.to(torch.float64)  # itself where it is
 
 

@@ -42,6 +42,7 @@ class Search:
     @usable_arguments("fit")
     def __post_init__(self) -> None:
         check_search_numbers(1 if self.restarts is None else self.restarts, self.seed)
+        require_type("hyperprior", self.hyperprior, bool)
         if self.options is not None:
             require_type("options", self.options, OptimizerOptions)
         if PHYSICAL in (self.start or {}):

@@ -1,0 +1,179 @@
+"""What random inputs found, by name: each ended in an error in forcegp itself, or in one that was not forcegp's."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from tests.cli.test_import import FLAGS
+from tests.durability.commands import FEW
+from tests.fuzz.arguments import CALLS
+from tests.fuzz.made import INPUTS
+from tests.fuzz.oracle import require_ended_well
+
+import forcegp
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, UnreadableRobotFile
+from forcegp.file_digests import write_digests
+from forcegp.mechanics import MechanicalSystem
+from forcegp.recordings.mapping_file import read_mapping
+
+pytestmark = pytest.mark.usefixtures("unchecked")
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A folder so deep that `require_ended_well` may look above it."""
+    folder = tmp_path / "some" / "folders" / "deep"
+    folder.mkdir(parents=True)
+    return folder
+
+
+# ---------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize("encoding", ["punycode", "undefined", "rot13", "zlib", "idna", "\x00", ""])
+def test_encodings_that_are_no_text_are_refused(tmp_path, encoding):
+    text = f'<?xml version="1.0" encoding="{encoding}"?><robot name="\xe4\xff"><link name="a"/></robot>'
+    (tmp_path / "arm.urdf").write_bytes(text.encode("latin-1"))
+    with pytest.raises(UnreadableRobotFile, match="save the URDF as UTF-8"):
+        forcegp.Robot.from_urdf(tmp_path / "arm.urdf")
+
+
+@pytest.mark.parametrize("where", ["header", "row"])
+def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, where):
+    long = "1" * 140_000
+    header, row = ("time,q_a,u_a" + f",{long}" * (where == "header")), "0,0," + ("0" if where == "header" else long)
+    (place / "log.csv").write_text(f"{header}\n{row}\n0.1,0,0\n")
+    words = ["import", "log.csv", "--time", "time", "--q", "q_a", "--u", "u_a", "--joints", "a", "--out", "o.h5"]
+    assert require_ended_well(words, place) == 2
+
+
+@pytest.mark.parametrize("stated", [{"cutoff": "x"}, 5, [], {"delay": [None]}, {"cutoff": None, "order": {}}])
+@pytest.mark.parametrize(
+    "words", ["check data.h5", "prepare data.h5 --cutoff 20 --out o.h5", f"fit data.h5 {FEW} --out o"]
+)
+def test_metadata_of_another_kind_ends_in_one_line_or_does_not_matter(place, stated, words):
+    data = INPUTS.free
+    data.save(place / "data.h5")
+    with h5py.File(place / "data.h5", "r+") as file:
+        del file["metadata"]
+        file["metadata"] = json.dumps({"preparation": stated})
+    require_ended_well(words.split(), place)
+
+
+@pytest.mark.parametrize(
+    "words", ["check bad\udcff.h5", "fit train.h5 --out bad\udcff", "import bad\udcff.csv --out o.h5"]
+)
+def test_names_that_are_no_text_are_refused_in_one_line(place, words):
+    (place / "train.h5").write_bytes((INPUTS.folder / "train.h5").read_bytes())
+    for name in ("bad\udcff.h5", "bad\udcff.csv"):
+        (place / name).write_bytes(b"x")
+    assert require_ended_well([*words.split(), *FLAGS * words.startswith("import")], place) == 2
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[" * 100_000, '{"kind": ' + "9" * 5000 + "}", '{"kind": []}', '{"kind": {}}', '{"kind": "structured-gp"}'],
+    ids=["deep", "digits", "list", "object", "no version"],
+)
+def test_documents_of_any_shape_are_refused(tmp_path, content):
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("tensors.safetensors", "robot.urdf"):
+        (run / name).write_bytes((INPUTS.folder / "structured" / name).read_bytes())
+    (run / "model.json").write_text(content)
+    write_digests(run)
+    with pytest.raises(FileFormatError, match=r"model\.json"):
+        forcegp.load_posterior(run)
+
+
+@pytest.mark.parametrize("text", ["q: !!timestamp x\n", "step: []\n", "step: [1, 2]\n", "- " * 5000 + "a"])
+def test_mappings_of_any_shape_are_refused(tmp_path, text):
+    (tmp_path / "log.yaml").write_text(text)
+    with pytest.raises(FileFormatError, match=r"log\.yaml"):
+        read_mapping(tmp_path / "log.yaml")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"urdf": ' + "9" * 5000 + "}"], ids=["deep", "digits"])
+def test_systems_of_any_shape_are_refused(text):
+    with pytest.raises(FileFormatError, match="stored system"):
+        MechanicalSystem.from_json(text)
+
+
+# ---------------------------------------------------------------- arguments
+
+WRONG = {
+    "curve": {"latent": 1},
+    "curve ": {"features": np.ones((1, 1, 1, 3))},
+    "components": {"covariance": np.array(["a", "b"])},
+    "predict": {"covariance": np.ones((3, 3))},
+    "predict ": {"q": torch.ones(3, device="meta")},
+    "predict  ": {"q": torch.ones(2, 3).to_sparse()},
+    "predictor": {"tolerance": "0.1"},
+    "predictor ": {"covariance": np.ones(3)},
+    "predictor()": {"q": "abc"},
+    "rollout": {"baumgarte": 3},
+    "Dataset": {"units": 5},
+    "Dataset ": {"joint_names": 5},
+    "Dataset  ": {"system": ()},
+    "Dataset.rows": {"index": torch.ones(3, requires_grad=True)},
+    "Dataset.load": {"path": 7},
+    "load_posterior": {"path": 7},
+    "Robot.from_urdf": {"path": 7},
+    "Robot.from_urdf ": {"path": "a\0b"},
+    "Robot.from_urdf_text": {"text": None},
+    "Robot.from_urdf_text ": {"inertias": np.ones((3, 3))},
+    "Robot.from_urdf_text  ": {"locked": 5},
+    "with_armature": {"armature": torch.ones(2, 3).to_sparse()},
+    "MechanicalSystem": {"contacts": torch.tensor(1.0)},
+    "MechanicalSystem ": {"baumgarte": 5.0},
+    "OptimizerOptions": {"iterations": None},
+    "OptimizerOptions ": {"adam_steps": 1.5},
+    "OptimizerOptions  ": {"memory": "x"},
+    "fit": {"options": "fast"},
+    "fit ": {"start": 1},
+    "fit  ": {"start": ["a"]},
+    "fit   ": {"learning_points": "10"},
+    "fit    ": {"hyperprior": torch.ones(3)},
+    "fit     ": {"engine": np.zeros(3, [("a", "f8")])},
+    "Noise": {"learn": torch.ones(3)},
+    "Noise ": {"acceleration": torch.ones(3, device="meta")},
+    "StructuredGP": {"mean": np.ones(3)},
+    "IndependentGP": {"inputs": np.zeros(3, [("a", "f8")])},
+    "JointForces": {"angles": np.ones(3)},
+    "ContactFriction": {"load": np.ones(3)},
+    "ContactFriction ": {"axes": np.ones(3)},
+    "Payload": {"moments": np.ones(3)},
+    "named_prior": {"expression": 5},
+    "Preparation": {"order": 2, "trim": 10**30, "delay": 10**30},
+    "Preparation ": {"cutoff": np.ones(3)},
+    "check": {"preparation": np.ones(3)},
+    "identify_analytical": {"friction": 5},
+    "identify_analytical ": {"rows": 1.5},
+    "identify_analytical  ": {"robust": np.ones(3)},
+    "identify_analytical   ": {"prior_strength": "x"},
+    "identify_analytical    ": {"likelihood": np.ones(3)},
+    "split_named": {"text": 5},
+    "split_named ": {"guard": {}},
+    "ColumnMapping": {"step": "x"},
+    "ColumnMapping ": {"unit": 5},
+    "ImportOptions": {"gap": "x"},
+    "ImportOptions ": {"most_rows": None},
+    "KukaSurfaceConfig": {"null_space_joints": None},
+    "WeakForm": {"signal": np.ones(3)},
+    "Coefficients": {"joints": 5},
+}
+
+
+@pytest.mark.parametrize("call", WRONG)
+def test_values_of_another_kind_are_refused_in_one_sentence(call):
+    function, arguments = CALLS[call.strip()]
+    with pytest.raises(ForceGPError) as refused:
+        function(**{**arguments(), **WRONG[call]})
+    assert str(refused.value).strip()
+
+
+def test_the_sentence_names_what_was_called():
+    with pytest.raises(InvalidInput, match=r"OptimizerOptions was given a value of another kind: .*; see help"):
+        forcegp.inference.OptimizerOptions(iterations=None)
