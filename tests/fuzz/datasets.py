@@ -54,7 +54,13 @@ ARRAYS = {
     "big ends": lambda x: x.astype(">f8"),
     "record": lambda x: np.zeros(x.shape, [("a", "f8"), ("b", "i4")]),
 }
-MOTIONS = {"import": 5}, {"import": {"rows": []}}, {"config": []}, {"preparation": {"cutoff": "x"}}, {"preparation": 5}, {"preparation": {"delay": [None]}}, {"preparation": []}
+OTHERS = (
+    *({"preparation": value} for value in ({"cutoff": "x"}, 5, [], {"delay": [None]}, {"why": []}, {"earlier": 5})),
+    *({"import": value} for value in (5, [1], {"recordings": 5}, {"recordings": [1]}, {"recordings": [{"gaps": 5}]})),
+    *({"import": {"episodes": value}} for value in (5, [5], [{"recording": []}])),
+    {"config": []},
+)
+"""Metadata that look like ours."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +75,8 @@ class Change:
 CHANGES = st.one_of(
     st.builds(Change, st.sampled_from(NAMES), st.sampled_from(tuple(ARRAYS))),
     st.builds(Change, st.sampled_from(NAMES), st.sampled_from(("delete", "group", "soft link", "external", "swap"))),
-    st.builds(Change, st.sampled_from(NAMES), st.just("text"), JSON | st.sampled_from(MOTIONS)),
-    st.builds(Change, st.just("metadata"), st.just("text"), st.sampled_from(MOTIONS) | st.dictionaries(WORDS, JSON)),
+    st.builds(Change, st.sampled_from(NAMES), st.just("text"), JSON | st.sampled_from(OTHERS)),
+    st.builds(Change, st.just("metadata"), st.just("text"), st.sampled_from(OTHERS) | st.dictionaries(WORDS, JSON)),
     st.builds(Change, st.just("metadata"), st.just("motion"), JSON),
     st.builds(Change, st.sampled_from(ATTRIBUTES), st.just("attribute"), SCALARS),
     st.builds(Change, st.just("joint_names"), st.just("names"), st.lists(WORDS, max_size=4)),

@@ -13,7 +13,7 @@ import torch
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 from tests.fuzz.made import INPUTS, MODELS
-from tests.fuzz.oracle import DefectError, Target, allowed, require_no_code
+from tests.fuzz.oracle import DefectError, Target, allowed, require_ended_well, require_no_code
 from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, XML_EDITS, Damage, damaged, edited_json, edited_xml
 
 from forcegp import load_posterior
@@ -150,4 +150,13 @@ def check(case: Stored, folder: Path) -> None:
     require_no_code(folder)
 
 
+def check_commands(case: Stored, folder: Path) -> None:
+    """The same models under the commands that read models."""
+    apply(case, folder)
+    shutil.copyfile(INPUTS.folder / "train.h5", folder / "train.h5")
+    rolled = "rollout run train.h5 --starts 1 --seconds 0.02 --out o" if len(repr(case)) % 3 == 0 else ""
+    require_ended_well((rolled or "evaluate run train.h5").split(), folder)
+
+
+COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=1500)
 TARGET = Target(CASES, check, fast=100, nightly=4000)

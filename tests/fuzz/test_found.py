@@ -1,6 +1,7 @@
 """What random inputs found, by name: each ended in an error in forcegp itself, or in one that was not forcegp's."""
 
 import json
+import shutil
 
 import h5py
 import numpy as np
@@ -9,11 +10,13 @@ import torch
 from tests.cli.test_import import FLAGS
 from tests.durability.commands import FEW
 from tests.fuzz.arguments import CALLS
+from tests.fuzz.datasets import OTHERS
 from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import require_ended_well
+from tests.models.arm import URDF
 
 import forcegp
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, UnreadableRobotFile
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
 from forcegp.file_digests import write_digests
 from forcegp.mechanics import MechanicalSystem
 from forcegp.recordings.mapping_file import read_mapping
@@ -40,6 +43,11 @@ def test_encodings_that_are_no_text_are_refused(tmp_path, encoding):
         forcegp.Robot.from_urdf(tmp_path / "arm.urdf")
 
 
+def test_a_joint_beyond_the_moon_is_refused():
+    with pytest.raises(InvalidNumber, match=r"xyz \[1e\+200, 0.0, 0.0\]"):
+        forcegp.Robot.from_urdf_text(URDF.replace('xyz="0 0 0.25"', 'xyz="1e200 0 0"'))
+
+
 @pytest.mark.parametrize("where", ["header", "row"])
 def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, where):
     long = "1" * 140_000
@@ -49,17 +57,16 @@ def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, wh
     assert require_ended_well(words, place) == 2
 
 
-@pytest.mark.parametrize("stated", [{"cutoff": "x"}, 5, [], {"delay": [None]}, {"cutoff": None, "order": {}}])
-@pytest.mark.parametrize(
-    "words", ["check data.h5", "prepare data.h5 --cutoff 20 --out o.h5", f"fit data.h5 {FEW} --out o"]
-)
-def test_metadata_of_another_kind_ends_in_one_line_or_does_not_matter(place, stated, words):
+@pytest.mark.parametrize("stated", OTHERS, ids=json.dumps)
+@pytest.mark.parametrize("command", ["check", "prepare", "fit"])
+def test_metadata_of_another_kind_do_not_matter(place, stated, command):
     data = INPUTS.free
     data.save(place / "data.h5")
     with h5py.File(place / "data.h5", "r+") as file:
         del file["metadata"]
-        file["metadata"] = json.dumps({"preparation": stated})
-    require_ended_well(words.split(), place)
+        file["metadata"] = json.dumps(stated)
+    more = {"check": "", "prepare": "--cutoff 20 --out o.h5", "fit": f"{FEW} --no-checks --out o"}
+    assert require_ended_well([command, "data.h5", *more[command].split()], place) == 0
 
 
 @pytest.mark.parametrize(
@@ -88,7 +95,9 @@ def test_documents_of_any_shape_are_refused(tmp_path, content):
         forcegp.load_posterior(run)
 
 
-@pytest.mark.parametrize("text", ["q: !!timestamp x\n", "step: []\n", "step: [1, 2]\n", "- " * 5000 + "a"])
+@pytest.mark.parametrize(
+    "text", ["q: !!timestamp x\n", "step: []\n", "step: [1, 2]\n", "step: !!int ''\n", "- " * 5000 + "a"]
+)
 def test_mappings_of_any_shape_are_refused(tmp_path, text):
     (tmp_path / "log.yaml").write_text(text)
     with pytest.raises(FileFormatError, match=r"log\.yaml"):
@@ -99,6 +108,24 @@ def test_mappings_of_any_shape_are_refused(tmp_path, text):
 def test_systems_of_any_shape_are_refused(text):
     with pytest.raises(FileFormatError, match="stored system"):
         MechanicalSystem.from_json(text)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [{"data": {"episodes": value}} for value in (5, [[]], ["x"], {"a": 1}, None)]
+    + [{"widening": value} for value in ("x", -1.0, float("nan"), None)]
+    + [{"rows_added": "x"}],
+    ids=str,
+)
+def test_settings_of_another_kind_are_refused(tmp_path, stated):
+    run = tmp_path / "run"
+    shutil.copytree(INPUTS.folder / "structured", run)
+    document = json.loads((run / "model.json").read_text())
+    document["settings"] |= stated
+    (run / "model.json").write_text(json.dumps(document))
+    write_digests(run)
+    with pytest.raises(FileFormatError, match=r"model\.json"):
+        forcegp.load_posterior(run)
 
 
 # ---------------------------------------------------------------- arguments

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -61,7 +62,10 @@ def sampling_findings(inputs: CheckInput) -> list[Finding]:
                 numbers={"relative_deviation": spread},
             )
         )
-    return [*found, *_repeated(inputs), *_imported(log.metadata)]
+    found += _repeated(inputs)
+    with contextlib.suppress(AttributeError, TypeError, ValueError):  # somebody else's metadata
+        found += _imported(log.metadata)
+    return found
 
 
 def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> list[Finding]:

@@ -173,6 +173,9 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         names = document["joint_names"]
         if not all(isinstance(name, str) for name in names) or not isinstance(settings.get("data", {}), dict):
             raise ValueError("joint_names or the data of its settings are of another type")
+        numbers = [settings.get("rows_added", 0), *(settings.get("data") or {}).get("episodes", ())]
+        if {int(number) for number in numbers} and not 0.0 < float(settings.get("widening", 1.0)) < float("inf"):
+            raise ValueError("its widening is no positive number")
     except (KeyError, TypeError, ValueError, RuntimeError, ForceGPError) as error:
         raise FileFormatError(f"{path / 'model.json'} is incomplete or damaged: {error}") from None
     if document.get("units") != _plain(units_for(system.robot)):

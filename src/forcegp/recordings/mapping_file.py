@@ -44,7 +44,7 @@ def read_mapping(path: Path) -> ColumnMapping:
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
-    with reading(path, "YAML", yaml.YAMLError, RecursionError, AttributeError):  # !!timestamp x
+    with reading(path, "YAML", yaml.YAMLError, AttributeError, IndexError):  # !!timestamp x, !!int ''
         if path.stat().st_size > LARGEST:
             raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)  # a SafeLoader

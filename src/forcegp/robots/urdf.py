@@ -28,6 +28,7 @@ from forcegp.errors import (
 )
 from forcegp.robots.spatial import rotation_from_rpy, transform
 
+FARTHEST = 1e9  # m; squares of larger numbers overflow
 MOVABLE = ("revolute", "continuous", "prismatic")
 UNSUPPORTED = {
     "floating": "fix the base in the world (type 'fixed'): floating bases are not supported",
@@ -250,8 +251,8 @@ def _joint(
                 f"correct the name or add the link. Links: {', '.join(sorted(links))}"
             )
     origin = _origin(_optional_child(element, "origin", place), place)
-    if not np.isfinite(origin).all():
-        raise InvalidNumber(f"{place}: <origin> xyz {origin[:3, 3].tolist()} is not finite; give a position in m.")
+    if not (np.abs(origin) < FARTHEST).all():
+        raise InvalidNumber(f"{place}: <origin> xyz {origin[:3, 3].tolist()} is not finite or far; give metres.")
     axis = _vector(_optional_child(element, "axis", place), "xyz", (1.0, 0.0, 0.0), place)
     length = float(np.linalg.norm(axis))
     if kind in MOVABLE and not (math.isfinite(length) and length > 0.0):
