@@ -25,8 +25,8 @@ class Baumgarte:
     def __post_init__(self) -> None:
         for name in ("omega", "zeta"):
             value = getattr(self, name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
-                raise InvalidInput(f"Baumgarte {name} is {value!r}; it must be a finite number >= 0.")
+            if not (isinstance(value, int | float) and 0 <= value < 1e15):  # its square must not overflow
+                raise InvalidInput(f"Baumgarte {name} is {value!r}; it must be a finite number >= 0 (and < 1e15).")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expressed_kernels import ExpressedKernels
 from forcegp.priors.force_prior import Scaling
@@ -63,6 +63,7 @@ class ToolForces(ExpressedKernels):
     contact: int = 0
     kernel: str = "linear + squared-exponential"
 
+    @usable_arguments("ToolForces")
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", chosen_inputs("ToolForces", self.inputs, TOOL_INPUTS))
         check_kernel(self.kernel)

@@ -83,8 +83,8 @@ def initial_weights(shapes: Mapping[str, tuple[int, ...]], generator: torch.Gene
 def check_numbers(counts: Mapping[str, object], rate: object) -> None:
     """Raises InvalidInput naming the first count that is not a whole number above 0, or a rate that is not above 0."""
     for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise InvalidInput(f"{name}={value!r} must be a whole number above 0")
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < 2**31:
+            raise InvalidInput(f"{name}={value!r} must be a whole number above 0 (and below 2**31)")
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
         raise InvalidInput(f"rate={rate!r} must be above 0 and finite")
 
