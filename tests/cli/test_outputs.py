@@ -37,7 +37,7 @@ FOLDERS = {
     "demo": "demo --out OUT",
 }
 STORES = {
-    "validate": "validate arm.h5 --overwrite --out OUT",
+    "validate": "validate arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
     "reproduce": "reproduce fig2b --out OUT",
     "docs": "reproduce fig2b --out runs --docs OUT",
 }
