@@ -177,7 +177,7 @@ class TestJson:
         (tmp_path / "link").symlink_to("pipe")
         (tmp_path / "loop").symlink_to("loop")
         for name in ("pipe", "link", "loop"):
-            with pytest.raises(InvalidInput, match="it is (not a regular file|a link that leads back to itself)"):
+            with pytest.raises(InvalidInput, match=r"it is (not a regular file|a link that leads back to itself)"):
                 write_text(tmp_path / name, "new")
             with (
                 pytest.raises(InvalidInput, match=r"cannot write .*; choose another name"),
