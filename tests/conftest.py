@@ -14,6 +14,7 @@ THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # numpy and torch read them at import
     os.environ[variable] = str(THREADS)
 
+import jaxtyping
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
@@ -47,6 +48,14 @@ def shared() -> Callable[[str], Path]:
         return found
 
     return path
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Without the types of signatures checked, as users have it: forcegp's own checks speak, integers are numbers."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

@@ -49,12 +49,11 @@ WRONG = [
     ("fit damaged.h5 --out run", "damaged.h5 is damaged"),
     ("fit text.h5 --out run", "text.h5 is not an HDF5 file"),
     ("fit no_robot.h5 --out run", "does not carry its robot; add --robot"),
-    ("fit no_noise.h5 --out run", "does not state its noise; add --noise"),
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --robot missing.urdf --out run", "missing.urdf: no such file"),
-    ("fit arm.h5 --points 1 --out run", "points=1 is not between 2 and the 20 rows"),
+    ("fit arm.h5 --points 1 --out run", "--points 1 must be an integer from 2 to 20, the rows"),
     ("fit arm.h5 --seed -1 --out run", "--seed is -1; it must be at least 0"),
-    ("fit arm.h5 --restarts 0 --out run", "restarts=0"),
+    ("fit arm.h5 --restarts 0 --out run", "--restarts 0 must be"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
     ("fit arm.h5 --noise -0.1 --out run", "give a positive, finite standard deviation"),
     ("fit arm.h5 --contact plane --out run", "is not FRAME@x,y,z:SURFACE"),
@@ -81,7 +80,6 @@ WRONG = [
     ("fit arm.h5 --model ensemble --noise loud --out run", "--noise is 'loud'"),
     ("fit arm.h5 --model ensemble --points 9 --out run", "needs 10 rows; there are 9"),
     ("fit arm.h5 --model ensemble --iterations 0 --out run", "steps=0 must be a whole number above 0"),
-    ("fit no_noise.h5 --model independent-gp --out run", "does not state its noise; add --noise"),
     ("fit arm.h5 --force-noise 0 --out run", "Noise force is 0.0; give a positive"),
     ("fit arm.h5 --model ensemble --force-noise 0.1 --out run", "--force-noise means nothing to --model ensemble"),
     (
@@ -224,8 +222,10 @@ def test_known_forces_replace_those_of_the_dataset(folder):
 
 
 @pytest.mark.parametrize(
-    ("noise", "learned", "file"), [("learned", True, "no_noise.h5"), ("0.2", False, "no_noise.h5")]
+    ("noise", "learned", "file"),
+    [("learned", True, "no_noise.h5"), ("0.2", False, "no_noise.h5"), ("dataset", True, "no_noise.h5")],
 )
+@pytest.mark.filterwarnings("ignore:the dataset does not state the noise")
 def test_noise_is_learned_or_given(folder, noise, learned, file):
     assert main(["fit", file, *QUICK, "--noise", noise, "--out", "run"]) == 0
     posterior = load_posterior("run")

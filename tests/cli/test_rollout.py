@@ -99,7 +99,7 @@ WRONG = [
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte strong", "--baumgarte is 'strong'; give none, OMEGA"),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte 1,2,3", "--baumgarte is '1,2,3'"),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte -1", "Baumgarte omega is -1.0"),
-    ("rollout run arm.h5 --starts 1 --seconds 0.05 --samples -1", "samples is -1"),
+    ("rollout run arm.h5 --starts 1 --seconds 0.05 --samples -1", "--samples=-1 must be an integer of at least 0"),
     ("rollout missing arm.h5", "missing does not exist"),
     ("rollout run missing.h5", "missing.h5 is not a file"),
 ]

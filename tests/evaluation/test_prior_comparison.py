@@ -208,7 +208,7 @@ def test_of_equally_many_functions_that_with_the_fewest_parameters():
 
 WRONG = [
     ({"priors": {"friction": JointFriction()}}, "nothing to compare friction; give two priors or more"),
-    ({"points": 81}, "points=81 is not between 2 and the 80 rows"),
+    ({"points": 81}, "points=81` must be an integer from 2 to 80, the rows"),
     ({"block_seconds": 100.0}, "fall into 1 stretches of 100 s, too few"),
     ({"block_seconds": 0.0}, "must be positive and finite"),
     ({"noise": Noise((0.1, 0.2))}, "prior 'anything': Noise has 2 values for 3 joints"),

@@ -161,7 +161,7 @@ class ModelConformance:
         model = self.make(data.system)
         with pytest.raises(InvalidInput, match="joints shoulder, elbow; the robot has pan, lift, bend"):
             model.fit(samples.dataset())
-        with pytest.raises(InvalidInput, match="points=61 is not between"):
+        with pytest.raises(InvalidInput, match="points=61` must be an integer from 2 to 60"):
             model.fit(data, points=61)
         with pytest.raises(InvalidInput, match="seed=-1"):
             model.fit(data, seed=-1)

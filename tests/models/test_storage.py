@@ -3,10 +3,12 @@
 import json
 import os
 import random
+import re
 import shutil
 import stat
 import subprocess
 import sys
+from typing import get_type_hints
 
 import pytest
 import torch
@@ -17,8 +19,9 @@ from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.file_digests import SUMS, write_digests
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
-from forcegp.models import IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
+from forcegp.models import IndependentGP, Noise, Posterior, StructuredGP, load_posterior, save_posterior
 from forcegp.models.storage import FORMAT_VERSION
+from forcegp.models.structured.components import Components, Curve
 from forcegp.robots import Robot
 
 FILES = {"model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS"}
@@ -350,3 +353,26 @@ def test_a_model_of_accelerations_cannot_move(data):
     fitted = IndependentGP(data.system).fit(data, points=8)
     with pytest.raises(InvalidInput, match="cannot move to another"):
         fitted.with_system(data.system.with_contacts(()))
+
+
+def test_editors_see_what_a_loaded_model_offers():
+    loaded = get_type_hints(load_posterior)["return"]
+    offered = {"components": Components, "curve": Curve, "with_contacts": Posterior, "with_robot": Posterior}
+    for name, kind in offered.items():
+        assert get_type_hints(getattr(loaded, name))["return"] is kind
+
+
+@pytest.mark.nightly
+def test_pyright_sees_what_a_loaded_model_offers(tmp_path, repository):
+    code = """from forcegp import load_posterior
+state = [0.0], [0.0], [0.0]
+reveal_type(load_posterior("run").components(*state)["joint-friction"].joint_force.std)
+reveal_type(load_posterior("run").curve("pan").mean)
+reveal_type(load_posterior("run").predict(*state)[0].unknown_force)
+"""
+    (tmp_path / "use.py").write_text(code)
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, tmp_path / "use.py"]
+    environment = {**os.environ, "PYTHONPATH": str(repository / "src")}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    found = re.findall(r'Type of ".*" is "(.*)"', done.stdout)
+    assert found == ["Tensor", "Tensor", "Gaussian | None"], done.stdout

@@ -33,7 +33,8 @@ def at_once(posterior, data):
     first = posterior.training
     whole = type(first).of(data, torch.device("cpu"))
     whole = dataclasses.replace(whole, reference=first)
-    return posterior.model.condition(whole, posterior.parameters, posterior.result, {})
+    settings = {"widening": posterior.widening}
+    return posterior.model.condition(whole, posterior.parameters, posterior.result, settings)
 
 
 def assert_same(one, other, data, tolerance=1e-8):
@@ -247,7 +248,7 @@ def posterior():
 
 @pytest.mark.parametrize("budget", [1, 0, -3, True])
 def test_budgets_that_mean_nothing_are_refused(posterior, budget):
-    with pytest.raises(InvalidInput, match="2 or more"):
+    with pytest.raises(InvalidInput, match="must be an integer of at least 2"):
         posterior.update(arm_data(2, seed=17), budget)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -46,11 +48,7 @@ def estimated_gravity(
 
 def with_gravity(robot: Robot, gravity: Float[np.ndarray, "3"]) -> Robot:
     """The same robot under other gravity [m/s^2]."""
-    made = Robot.from_urdf_text(
-        robot.urdf_text,
-        source=robot.source,
-        gravity=[float(value) for value in gravity],
-        armature=robot.armature.cpu(),
-        locked=robot.locked,
-    )
-    return made if robot.device.type == "cpu" else made.to(robot.device)
+    along = torch.as_tensor(gravity, dtype=robot.tree.gravity.dtype, device=robot.device)
+    fall = torch.zeros_like(robot.tree.fall)
+    fall[:, 3, 0] = along
+    return replace(robot, tree=replace(robot.tree, gravity=along, fall=fall))

@@ -34,6 +34,15 @@ EXPLAINED = 0.1
 """Where no more than this remains in any joint there is nothing to explain."""
 
 MAX_CORRECTIONS = 4
+ALL_TRIED = 3
+"""Joints up to which the motion of every one is tried in other directions and places."""
+
+GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
+"""Gear ratios that are tried."""
+
+NEARLY = 3.0
+"""Factor either way that wrong masses explain."""
+
 TILTED = np.deg2rad(15.0)
 """Angle from which a direction of gravity is reported."""
 
@@ -93,7 +102,7 @@ def _explains(now: Hypothesis, best: Hypothesis) -> bool:
 def _candidates(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     yield from _torque_signs(now, given, inputs.names)
     yield from _torque_places(now, given, inputs.names)
-    yield from _degrees(now, given, inputs)
+    yield from _motion_units(now, given, inputs)
     yield from _motion_signs(now, given, inputs.names)
     yield from _motion_places(now, given, inputs.names)
     yield from _gravity(now, given)
@@ -156,27 +165,50 @@ def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
     yield replace(better, finding=finding)
 
 
-def _degrees(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
-    """All angles in degrees."""
+def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+    """Angles in degrees, or positions of one joint before its gear."""
     largest = np.abs(now.rows.q * inputs.rotates).max()
-    if largest < 1.0:
-        return  # less than a degree of motion is not worth the question
-    finding = Finding(
-        severity="wrong",
-        subject="degrees",
-        seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken for "
-        "radians.",
-        remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
-        joints=tuple(name for name, turns in zip(inputs.names, inputs.rotates, strict=True) if turns),
-    )
-    factor = np.where(inputs.rotates, DEGREE, 1.0)
-    yield _hypothesis(now.robot, now.correction.motion(np.arange(len(factor)), factor), given, finding=finding)
+    places = np.arange(len(inputs.names))
+    if largest > 1.0:  # less than a degree of motion is not worth the question
+        for turned in [inputs.rotates, *(inputs.rotates & (places == joint) for joint in places)]:
+            alone = turned is not inputs.rotates
+            if not turned.any() or (alone and (inputs.rotates.sum() == 1 or len(places) > ALL_TRIED)):
+                continue
+            finding = Finding(
+                severity="wrong",
+                subject="degrees",
+                seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
+                "for radians.",
+                remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
+                joints=tuple(inputs.names[joint] for joint in _places(turned)),
+            )
+            correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
+            yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)
+    for joint, name in enumerate(inputs.names):
+        if not now.fit.unexplained[joint] > STILL_UNEXPLAINED / 2:
+            continue
+        for ratio in GEARS:
+            finding = Finding(
+                severity="wrong",
+                subject="motion unit",
+                seen=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
+                "look like those of a motor before its gear.",
+                remedy="Divide the motion of this joint by its gear ratio (forcegp import --unit, or a factor).",
+                joints=(name,),
+                numbers={"factor": ratio},
+            )
+            correction = now.correction.motion(places, np.where(places == joint, 1.0 / ratio, 1.0))
+            slower = _hypothesis(now.robot, correction, given, finding=finding, cost=0.7, concerns=(joint,))
+            if 1.0 / NEARLY < slower.fit.factor[joint] < NEARLY:  # else any small motion with a large factor would do
+                yield slower
 
 
 def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
     """The motion of one joint, or all of that joint, in the other direction."""
     places = np.arange(len(names))
     for joint, name in enumerate(names):
+        if not _worth(now, joint):
+            continue
         turned = np.where(places == joint, -1.0, 1.0)
         motion = now.correction.motion(places, turned)
         for seen, correction in (
@@ -198,6 +230,8 @@ def _motion_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
     ones = np.ones(len(names))
     for one in range(len(names)):
         for other in range(one + 1, len(names)):
+            if not _worth(now, one) or not _worth(now, other):
+                continue
             order = np.arange(len(names))
             order[[one, other]] = order[[other, one]]
             motion = now.correction.motion(order, ones)
@@ -235,11 +269,16 @@ def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
             subject="gravity",
             seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
             f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",
-            remedy=f"Give --gravity={text.replace(' ', '')}.",
+            remedy=f"Give `gravity`={text.replace(' ', '')}.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
         cost = 1.5 if index == len(directions) - 1 else 1.0  # a base along its axes is the likelier one
         yield _hypothesis(with_gravity(now.robot, gravity), now.correction, given, finding=finding, cost=cost)
+
+
+def _worth(now: Hypothesis, joint: int) -> bool:
+    """Whether an error in this joint's own motion is possible: of many joints only those that fit badly are tried."""
+    return len(now.fit.unexplained) <= ALL_TRIED or bool(now.fit.unexplained[joint] > EXPLAINED)
 
 
 def _places(chosen: np.ndarray) -> tuple[int, ...]:

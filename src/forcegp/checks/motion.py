@@ -32,6 +32,9 @@ UNEXPLAINED = 0.3
 FEW = 0.05
 """Share below which a factor is meant seriously."""
 
+ROUNDING = 1e-20
+"""Of the mean square velocity of all joints."""
+
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2
 """Time steps by which v must be late or early to be reported."""
@@ -47,7 +50,7 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
     found = []
     for name, source, what, derivative in (("v", "q", "velocity", "dq/dt"), ("a", "v", "acceleration", "dv/dt")):
-        if name == "a" and found:
+        if name == "a" and any(finding.severity != "ok" for finding in found):
             break  # of wrong velocities nothing better can come
         fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
         findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
@@ -83,8 +86,9 @@ def _compared(data: Dataset, name: str, source: str, joint: int) -> tuple[float,
         return None
     values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
     power = np.square(values).sum(axis=1)
-    if not np.square(slopes).sum() > 0.0 or not power.min() > 0.0:
-        return None
+    least = ROUNDING * max(float(np.square(getattr(data, name)).mean()), float(np.square(slopes).mean())) * len(slopes)
+    if not np.square(slopes).sum() > least or not power.min() > least:
+        return None  # a joint that stands still
     factor = values @ slopes / np.square(slopes).sum()
     unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
     best = int(np.argmin(unexplained))

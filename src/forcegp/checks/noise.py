@@ -7,15 +7,48 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from forcegp.checks.check_input import CheckInput
+from forcegp.checks.check_input import CheckInput, white_noise
 from forcegp.checks.findings import Finding, plain
 
 MUCH = 0.2
 """Noise relative to the spread of the signal from which a filter is worth its name."""
 
 
+STATED_OFF = 3.0
+"""Factor either way between stated and seen noise of the acceleration that is reported."""
+
+FAR_OFF = 10.0
+
 LARGE_TORQUE = 0.5
 """Noise times M, relative to the spread of the torque."""
+
+
+def stated_noise_findings(inputs: CheckInput) -> list[Finding]:
+    """`noise_std` against the noise that the acceleration of successive rows shows."""
+    log = inputs.log
+    stated, seen = log.noise_level, white_noise(log)
+    if stated is None or seen is None:
+        return []
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = seen / stated
+    off = np.flatnonzero((ratio > STATED_OFF) | (ratio < 1.0 / STATED_OFF))
+    if not len(off):
+        return []
+    joint = int(off[np.argmax(np.abs(np.log(ratio[off])))])
+    small = ratio[joint] > 1.0
+    return [
+        Finding(
+            severity="wrong" if ratio[joint] > FAR_OFF else "look",
+            subject="noise_std",
+            seen=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
+            f"show noise of {seen[joint]:.3g}: {ratio[joint] if small else 1.0 / ratio[joint]:.3g} times as "
+            f"{'much' if small else 'little'}.",
+            remedy="Learn it (forcegp fit --noise learned), or state what was measured."
+            + ("" if small else " Noise that a filter made smooth does not show between rows: then leave it."),
+            joints=tuple(inputs.names[k] for k in off),
+            numbers={"stated": plain(stated), "seen": plain(seen)},
+        )
+    ]
 
 
 def noise_findings(inputs: CheckInput) -> list[Finding]:

@@ -9,18 +9,26 @@ from typing import Any
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput
+from forcegp.checks.contacts import contact_findings
 from forcegp.checks.excitation import excitation_findings
 from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings
-from forcegp.checks.noise import noise_findings, numbers_of, torque_noise
+from forcegp.checks.noise import noise_findings, numbers_of, stated_noise_findings, torque_noise
+from forcegp.checks.parameters import parameter_findings
 from forcegp.checks.robot_model import robot_findings
 from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
+
+BEFORE_A_FIT = frozenset(
+    ("contact", "noise_std", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
+     "joint zero", "gravity", "dead torque")
+)  # fmt: skip
+"""Subjects that a fit reports also where a person should judge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,23 +104,67 @@ def check(
 
     Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
     """
+    require_type("dataset", dataset, Dataset)
     system = dataset.system if system is None else system
+    if system is not None:
+        require_type("system", system, MechanicalSystem)
+    _require_same_joints(dataset, system)
+    inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
+    findings, comparison = _findings(inputs, system)
+    if inputs.robot is not None:
+        findings += robot_findings(inputs.robot)
+    if inputs.prepared is not None:
+        findings += [*excitation_findings(inputs), *noise_findings(inputs)]
+    return CheckReport(findings=_sorted(findings), inputs=inputs, comparison=comparison)
+
+
+def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tuple[Finding, ...]:
+    """What of `check` is cheap enough before every fit, worst first: only what would make the fit wrong.
+
+    From a few stretches of the log and without a filter, so that it takes a tenth of a second; rows out of order and
+    short logs are taken, of which less can be checked. Raises InvalidInput for a robot with other joints.
+    """
+    system = dataset.system if system is None else system
+    _require_same_joints(dataset, system)
+    findings, _ = _findings(CheckInput.quick(dataset, system), system)
+    said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
+    if dataset.nv > 1:  # friction of one joint can look like a delay
+        said = [each for each in said if each.subject != "delay" or len(each.joints) > 1]
+    return _sorted([*said, *(each for each in findings if each.severity == "wrong")])
+
+
+def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list[Finding], Hypothesis | None]:
+    """What is looked for in every log, and the comparison of torques, where there is one."""
+    findings = [*signal_findings(inputs), *stated_noise_findings(inputs)]
+    if inputs.log.time_ordered:
+        findings = [*sampling_findings(inputs), *findings, *motion_findings(inputs)]
+    contacts = contact_findings(inputs, system)
+    findings += contacts
+    comparison = None
+    if inputs.compared is None:
+        return findings, comparison
+    if inputs.robot is None or inputs.contacts:
+        return [*findings, not_compared(inputs)], comparison
+    if inputs.log.u.any() and not contacts:
+        comparison, corrections = best_hypothesis(inputs)
+        compared = torque_findings(inputs, comparison)
+        noise = inputs.compared_noise
+        if noise is not None and not any(
+            each.subject == "torque unit" and each.severity == "wrong" for each in compared
+        ):
+            numbers = parameter_findings(comparison.robot, comparison.rows, noise)
+            compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
+        findings += [*corrections, *compared]
+    return findings, comparison
+
+
+def _require_same_joints(dataset: Dataset, system: MechanicalSystem | None) -> None:
     if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
         raise InvalidInput(
             f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
             f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
         )
-    inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
-    findings = [*sampling_findings(inputs), *signal_findings(inputs), *motion_findings(inputs)]
-    comparison = None
-    if inputs.robot is not None:
-        findings += robot_findings(inputs.robot)
-    if inputs.prepared is not None:
-        if inputs.robot is None or inputs.contacts:
-            findings.append(not_compared(inputs))
-        elif dataset.u.any():
-            comparison, corrections = best_hypothesis(inputs)
-            findings += [*corrections, *torque_findings(inputs, comparison)]
-        findings += [*excitation_findings(inputs), *noise_findings(inputs)]
-    ordered = sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
-    return CheckReport(findings=tuple(ordered), inputs=inputs, comparison=comparison)
+
+
+def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:
+    return tuple(sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity)))

@@ -8,8 +8,16 @@ import numpy as np
 
 from forcegp.checks.check_input import CheckInput, consecutive
 from forcegp.checks.findings import Finding, listed
+from forcegp.data import Dataset
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
+EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
+ROUNDING = 1e-12
+"""Of the largest value of any joint."""
+
+HELD_STEPS = 0.5
+"""Share of equal successive values from which on a signal is one that moves in steps, such as a held command."""
+
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
 MOVES = 0.2
@@ -28,7 +36,7 @@ COARSE = {"q": 1e-3, "v": 1e-2, "u": 1e-2}
 
 def signal_findings(inputs: CheckInput) -> list[Finding]:
     """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
-    found = [*_leaps(inputs), *_constant(inputs)]
+    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs)]
     for name in QUANTITY:
         found += [finding for joint in range(inputs.log.nv) for finding in _frozen(inputs, name, joint)]
     found += [finding for joint in range(inputs.log.nv) for finding in _clipped(inputs, joint)]
@@ -55,11 +63,31 @@ def _leaps(inputs: CheckInput) -> Iterator[Finding]:
             )
 
 
+def _dropped(inputs: CheckInput) -> Iterator[Finding]:
+    """Rows of a signal that were lost and read 0."""
+    lost = {name: rows for name, rows in inputs.dropped.items() if rows.any()}
+    if not lost:
+        return
+    rows = np.logical_or.reduce([each.any(axis=1) for each in lost.values()])
+    first = int(np.flatnonzero(rows)[0])
+    joints = np.logical_or.reduce([each.any(axis=0) for each in lost.values()])
+    yield Finding(
+        severity="wrong",
+        subject="drop-outs",
+        seen=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
+        f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
+        f"{inputs.log.time[first]:.3f} s.",
+        remedy="They were not measured: leave these rows out, and look at the logger.",
+        joints=tuple(inputs.names[joint] for joint in np.flatnonzero(joints)),
+        numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
+    )
+
+
 def _constant(inputs: CheckInput) -> Iterator[Finding]:
     log = inputs.log
     for name, quantity in QUANTITY.items():
         values = getattr(log, name)
-        dead = [joint for joint in range(log.nv) if np.ptp(values[:, joint]) == 0.0]
+        dead = [joint for joint in range(log.nv) if still(log, name)[joint]]
         if not dead:
             continue
         names = tuple(inputs.names[joint] for joint in dead)
@@ -75,14 +103,21 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
             else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         )
         passive = name == "u" and not values[:, dead].any()
+        rests = still(log, "v") & still(log, "q")
         yield Finding(
-            severity="look" if passive or len(dead) == log.nv else "wrong",
+            severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
             subject="constant channel",
             seen=seen,
             remedy=remedy,
             joints=names,
             numbers={"quantity": name},
         )
+
+
+def still(log: Dataset, name: str) -> np.ndarray:
+    """Which joints' signal never changes, up to rounding."""
+    values = getattr(log, name)
+    return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
 def _runs(same: np.ndarray) -> tuple[int, int]:
@@ -96,28 +131,44 @@ def _runs(same: np.ndarray) -> tuple[int, int]:
 
 
 def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
-    """A channel that stands still, to the last digit, while the joint's other channels do not."""
+    """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
     values = getattr(log, name)[:, joint]
-    if np.ptp(values) == 0.0:
+    follows = consecutive(log)[:-1]
+    held = np.diff(values) == 0
+    if np.ptp(values) == 0.0 or (name == "u" and held.mean() > HELD_STEPS):
         return []
     others = np.zeros(len(log) - 1, dtype=bool)
     for other in QUANTITY:
         if other != name:
             others |= np.diff(getattr(log, other)[:, joint]) != 0
-    moves = np.abs(log.v[:, joint]) > MOVES * np.sqrt(np.square(log.v[:, joint]).mean())
+    seconds = np.diff(log.time)
+    step = float(np.median(seconds[follows]))
+    # a velocity that stands still at rest is right, also where the position is noisy; a joint that sticks while its
+    # velocity is an estimate does not jump afterwards; and noise about rest goes nowhere
+    speed = log.v[1:, joint] if name != "v" else np.where(follows, np.diff(log.q[:, joint]), 0.0) / step
+    moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-        moves = np.ones(len(log), dtype=bool) if name == "v" else moves
-        if name == "v":
-            others &= np.diff(log.q[:, joint]) != 0
-    start, length = _runs((np.diff(values) == 0) & others & consecutive(log)[:-1] & moves[1:])
-    step = float(np.median(np.diff(log.time)[consecutive(log)[:-1]]))
-    if length < FROZEN_ROWS or length * step < FROZEN_SECONDS or _is_extreme(values, values[start]):
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], held & others & follows, [False]]).astype(int)))
+    longest = (0, 0)
+    for start, stop in edges.reshape(-1, 2):
+        length = int(stop - start)
+        if length > longest[1] and length >= FROZEN_ROWS and length * step >= FROZEN_SECONDS:
+            gone = np.cumsum(speed[start:stop]) * step
+            sticks = name == "q" and stop < len(held) and abs(values[stop + 1] - values[start]) < 0.5 * abs(gone[-1])
+            if (
+                moves[start:stop].mean() > 0.5
+                and np.ptp(gone) > 0.25 * np.abs(speed[start:stop]).sum() * step
+                and not sticks
+            ):
+                longest = (int(start), length)
+    start, length = longest
+    if not length or _is_extreme(values, values[start]):
         return []
     return [
         Finding(
-            severity="wrong",
+            severity="look" if name == "u" and values[start] == 0.0 else "wrong",
             subject="frozen channel",
             seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
             f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.findings import Finding, listed, plain
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
@@ -28,7 +28,7 @@ SAME = 0.1
 """Spread of factors of joints that share a unit."""
 
 UNEXPLAINED = 0.5
-LEAST_DELAY = 0.25
+LEAST_DELAY = 0.75
 """Time steps below which a delay is not reported."""
 
 MUCH = 0.5
@@ -134,7 +134,9 @@ def _unexplained(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
 
 def _delays(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
     assert inputs.compared is not None
-    data = log.correction.applied(inputs.compared)
+    if inputs.prepared is None:
+        return []  # without an order
+    data = log.correction.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.compared)
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:
@@ -190,5 +192,5 @@ def not_compared(inputs: CheckInput) -> Finding:
         severity="look",
         subject="torque",
         seen="not compared with inverse dynamics: no robot was given.",
-        remedy="Add --robot ARM.urdf.",
+        remedy="Give the robot: `system`.",
     )

@@ -47,6 +47,11 @@ class Command(ABC):
     json: Json
     debug: Debug
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The names of its fields, which are those of its options."""
+        return tuple(vars(self))
+
     def check_paths(self) -> None:
         """Refuse inputs that do not exist and outputs that would destroy an input or another output.
 

@@ -78,6 +78,7 @@ class Compare(LearningOptions):
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
         priors = self._priors(system)
+        self._check(terminal, dataset, system)
         dataset, rows_note = self._rows(dataset, system)
         test = None if self.test is None else forcegp.Dataset.load(self.test)
         comparison = self._compare(terminal, dataset, system, priors, test)
@@ -166,9 +167,7 @@ class Compare(LearningOptions):
                 f"Next: forcegp fit {self.data} --prior {_quoted(preferred)} --points {comparison.points} --out run"
             )
         table = columns(title, header, rows, long_names=True)
-        unfinished = ", ".join(score.name for score in comparison.scores if not score.converged)
-        warning = [Text(f"Not converged: {unfinished}; give more --iterations.")] if unfinished else []
-        return [table, Text(comparison.verdict), *warning, Text(following)]
+        return [table, Text(comparison.verdict), Text(following)]
 
     def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best

@@ -86,6 +86,7 @@ class Evaluate(Command):
             "model": posterior.description,
             "points": len(posterior.training),
             **evaluation.to_dict(),
+            "warnings": [terminal.worded(warning) for warning in evaluation.warnings],
             "forces": forces.to_dict(),
             "normal_force_rests_on_prior": rests_on_prior,
         }

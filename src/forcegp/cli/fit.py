@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import forcegp
+import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
 import forcegp.robots
@@ -55,6 +56,7 @@ class Fit(ModelOptions):
         start = time.monotonic()
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
+        self._check(terminal, dataset, system)
         rows_note = None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)
@@ -66,6 +68,8 @@ class Fit(ModelOptions):
         command._write(posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)
+        for doubt in forcegp.evaluation.unfinished_search(posterior):
+            terminal.warn(doubt)
         terminal.show(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 

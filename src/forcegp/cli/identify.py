@@ -67,6 +67,7 @@ class Identify(IdentifyOptions):
         begin = time.monotonic()
         dataset = forcegp.Dataset.load(self.data)
         system, added = with_learned_forces(self._system(dataset), learn)
+        self._check(terminal, dataset, system)
         dataset, rows_note = self._rows(dataset, system)
         prior = forcegp.NoForces() if self.model == "analytical" else forcegp.JointForces()
         model = forcegp.StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))

@@ -35,8 +35,8 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     system = command._system(dataset)
     with terminal.progress("identifying", may_end_early=True) as report:
         found = forcegp.identify_analytical(
-            system,
             dataset,
+            system,
             friction=friction,
             rotors=None if command.rotors == "none" else cast(Any, command.rotors),
             inertias=cast(Any, INERTIAS[command.model]),
@@ -50,7 +50,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     content = {"model": command.model, **found.to_dict(), "cpu_seconds": time.process_time() - begin}
     for name, rows in (("training", dataset), ("test", test)):
         if rows is not None:
-            before = forcegp.analytical.residual_scores(*forcegp.analytical.motion_residuals(system, rows), rows)
+            before = forcegp.analytical.residual_scores(*forcegp.analytical.motion_residuals(rows, system), rows)
             content[name] = {"before": before, "after": found.scores(rows)}
     try:
         identified, why_not = found.system, None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,11 +11,15 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 import forcegp
+import forcegp.checks
 from forcegp.cli.backend_options import BackendOptions
 from forcegp.cli.command import DATASET
 from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.findings_line import findings_in_one_line
 from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.terminal import Terminal
+from forcegp.errors import ContactWarning
 
 KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
 
@@ -28,7 +33,8 @@ class LearningOptions(BackendOptions, RobotOptions):
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
     """The folder to write."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
-    """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
+    """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
+    where it does not)."""
     force_noise: Annotated[
         float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
     ] = None
@@ -61,8 +67,18 @@ class LearningOptions(BackendOptions, RobotOptions):
     rows: Annotated[RowsChoice, arg(metavar="auto|in-contact|all")] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
+    checks: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
+
+    def _check(self, terminal: Terminal, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> None:
+        """One line on what would spoil the model; contacts are not warned of again by the fit."""
+        if self.checks:
+            line = findings_in_one_line(forcegp.checks.quick_check(dataset, system), self.data)
+            if line is not None:
+                terminal.warn(line)
+        warnings.simplefilter("ignore", ContactWarning)
 
     def _system(self, dataset: forcegp.Dataset) -> forcegp.MechanicalSystem:
         """What is known: the dataset's own system, with what the options replace."""

@@ -16,6 +16,7 @@ from typing import NoReturn
 from forcegp import __version__
 from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.command import Command
+from forcegp.cli.option_names import with_option_names
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError, NotEnoughMemory
 
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
-        with Terminal(json=command.json) as terminal:
+        with Terminal(json=command.json, options=command.options) as terminal, warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
             _require_address_space()
@@ -56,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except ForceGPError as error:
-        return _fail(str(error), USER_ERROR, debug)
+        return _fail(with_option_names(str(error), command.options if command else ()), USER_ERROR, debug)
     except OSError as error:
         return _fail(f"{error}{_REMEDIES.get(error.errno or 0, '')}", USER_ERROR, debug)
     except MemoryError as error:

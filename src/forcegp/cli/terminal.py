@@ -7,18 +7,26 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
 from typing import Any, Protocol
 
 from rich.console import Console, RenderableType
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from forcegp.cli.option_names import with_option_names
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
 
+
+UNLIMITED = 10_000
+FOLDED = 16
+"""Columns that are left to long names, which are folded."""
 
 LEAST_SHARE = 0.02
 """Of the work that must be done before the remaining time is guessed from it."""
@@ -36,10 +44,12 @@ class Terminal:
 
     With `json`, the process's stdout is pointed at stderr until the result is printed, so that nothing a library prints
     (not even from C) can stand before or after the one JSON object; it is put back at the end of the context.
+    `options` are the command's, by which notes and warnings of the library name arguments.
     """
 
-    def __init__(self, *, json: bool) -> None:
+    def __init__(self, *, json: bool, options: Collection[str] = ()) -> None:
         self.json = json
+        self.options = options
         self._stdout: int | None = None
 
     # rich is imported when something is shown, so that --help and errors come at once
@@ -82,18 +92,24 @@ class Terminal:
                 stdout.write(text)
 
     def show(self, *renderables: RenderableType) -> None:
-        """Print the result; nothing with --json."""
+        """Print the result; nothing with --json. A table that needs more columns than there are gets them."""
         if not self.json:
             for renderable in renderables:
-                self.out.print(renderable)
+                needed = _columns_needed(self.out, renderable)
+                console = self.out if needed <= self.out.width else Console(highlight=False, width=needed)
+                console.print(renderable)
 
     def note(self, text: str) -> None:
         """Report on stderr what was done."""
-        self.err.print(text, style="dim", markup=False)
+        self.err.print(self.worded(text), style="dim", markup=False)
 
     def warn(self, text: str) -> None:
         """Print a warning on stderr."""
-        self.err.print(f"warning: {' '.join(text.split())}", style="yellow", markup=False)
+        self.err.print(f"warning: {' '.join(self.worded(text).split())}", style="yellow", markup=False)
+
+    def worded(self, text: str) -> str:
+        """A sentence of the library in terms of this command's options."""
+        return with_option_names(text, self.options)
 
     @contextmanager
     def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[ProgressCallback]:
@@ -120,6 +136,16 @@ class Terminal:
                 bars.update(task, completed=done, total=total, note=note and f"  {note}", remaining=remaining)
 
             yield report
+
+
+def _columns_needed(console: Console, renderable: RenderableType) -> int:
+    """Columns without which a table of numbers would cut them: a number without its end is a wrong number."""
+    if not isinstance(renderable, Table) or not any(column.no_wrap for column in renderable.columns):
+        return 0
+    wide = console.options.update(width=UNLIMITED)
+    folded = [column for column in renderable.columns if not column.no_wrap]
+    names = [Measurement.get(console, wide, cell).maximum for column in folded for cell in column.cells]
+    return Measurement.get(console, wide, renderable).maximum - max(0, max(names, default=0) - FOLDED)
 
 
 class _PlainProgress:

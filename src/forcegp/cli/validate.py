@@ -132,7 +132,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             rows,
             recording,
             system,
-            forcegp.split_named(self.split, rows, self.guard),
+            forcegp.split_named(rows, self.split, self.guard),
             horizons=horizons,
             friction=friction_laws(self.friction),
             **{name: getattr(self, name) for name in SAME},

@@ -1,5 +1,6 @@
 from .blocks import time_blocks as time_blocks
 from .contact_detection import contact_rows as contact_rows, rows_in_contact as rows_in_contact
+from .contact_evidence import ContactDoubt as ContactDoubt, contact_doubts as contact_doubts
 from .dataset import Dataset as Dataset
 from .delay import Delay as Delay, estimate_delay as estimate_delay
 from .farthest_points import farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows

@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder
 from forcegp.data import units_for
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.file_digests import SUMS, added_files, require_unchanged, write_digests
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
@@ -59,6 +59,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         one to which files were added.
     ContactError: a surface of the system holds code.
     """
+    require_type("posterior", posterior, Posterior)
     path = Path(path)
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         if not overwrite:

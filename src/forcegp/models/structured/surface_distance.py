@@ -1,4 +1,4 @@
-"""How far the training points are from the surfaces that they should touch."""
+"""Whether the rows bear out the contacts: how far they are from the surfaces, and what their accelerations show."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import warnings
 
 import torch
 
-from forcegp.errors import ContactError, DataWarning
+from forcegp.data import Dataset, contact_doubts
+from forcegp.errors import ContactError, ContactWarning, DataWarning
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.training_data import TrainingData
 
@@ -36,3 +37,11 @@ def check_distance(system: MechanicalSystem, training: TrainingData) -> None:
                 DataWarning,
                 stacklevel=4,
             )
+
+
+def warn_of_contacts(system: MechanicalSystem, dataset: Dataset) -> None:
+    """Warn where rows contradict the contacts, which a model would learn away as a force (`contact_doubts`)."""
+    for doubt in contact_doubts(dataset, system):
+        if doubt.numbers.get("distance", 0.0) > FAR_FROM_SURFACE:
+            continue  # check_distance refuses the rows or warns
+        warnings.warn(str(doubt), ContactWarning, stacklevel=4)

@@ -1,0 +1,350 @@
+"""Logs of two-joint robots, and what goes wrong with such logs: each corruption is a function of a clean log.
+
+`python -m tests.checks.corruptions` prints which of them `check` and `fit` report, over robots and seeds.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from tests.checks.logs import column, exchanged
+
+from forcegp.checks import check, quick_check
+from forcegp.cli.findings_line import findings_in_one_line
+from forcegp.data import Dataset
+from forcegp.errors import ForceGPError
+from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.robots import Robot
+
+DEGREES = 180.0 / np.pi
+
+
+def two_links(
+    lengths: tuple[float, float] = (0.4, 0.3),
+    masses: tuple[float, float] = (1.5, 0.8),
+    axes: tuple[str, str] = ("0 1 0", "0 1 0"),
+    kinds: tuple[str, str] = ("continuous", "continuous"),
+    elbow: tuple[float, float] | None = None,
+    **options: object,
+) -> Robot:
+    """Two links that hang down at q = 0, with the centre of mass of each in its middle."""
+    x, z = (0.0, -lengths[0]) if elbow is None else elbow
+    at = f"{x} 0 {z}"
+    limits = '<limit lower="-9" upper="9" effort="900" velocity="90"/>'
+    links = "".join(
+        f'<link name="link{k + 1}"><inertial><origin xyz="0.01 0 {-length / 2}"/><mass value="{mass}"/>'
+        f'<inertia ixx="{mass * length**2 / 12 + 1e-3}" iyy="{mass * length**2 / 12 + 1e-3}" izz="{mass * 2e-3}"'
+        ' ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for k, (length, mass) in enumerate(zip(lengths, masses, strict=True))
+    )
+    joints = "".join(
+        f'<joint name="joint{k + 1}" type="{kinds[k]}"><parent link="{("base", "link1")[k]}"/>'
+        f'<child link="link{k + 1}"/>'
+        f'<axis xyz="{axes[k]}"/><origin xyz="{("0 0 0", at)[k]}"/>{limits}</joint>'
+        for k in range(2)
+    )
+    text = f'<robot name="two"><link name="base"/>{links}{joints}</robot>'
+    return Robot.from_urdf_text(text, **options)  # type: ignore[arg-type]
+
+
+ROBOTS: Mapping[str, Callable[[], Robot]] = {
+    "planar": two_links,
+    "heavy": lambda: two_links((0.4, 0.5), (6.0, 3.0)),
+    "spatial": lambda: two_links((0.4, 0.35), (2.0, 1.2), ("0 0 1", "0 1 0"), elbow=(0.4, -0.1)),
+    "geared": lambda: two_links((0.5, 0.3), (3.0, 2.0), armature=(0.15, 0.05)),
+    "crane": lambda: two_links((0.4, 0.4), (4.0, 1.0), ("0 0 1", "0 1 0"), ("prismatic", "continuous")),
+}
+
+
+def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: str = "a") -> Dataset:
+    """Sums of sines with friction that nobody modelled; noise on `a` alone (simulated), or on q, v and u (logged)."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(round(seconds * rate)) / rate
+    omega = 2 * np.pi * generator.uniform(0.1, 1.0, (5, 1, 2))
+    size, phase = generator.uniform(0.1, 0.3, (5, 1, 2)), generator.uniform(0, 2 * np.pi, (5, 1, 2))
+    angle = omega * time[:, None] + phase
+    q, v = (size * np.sin(angle)).sum(0), (size * omega * np.cos(angle)).sum(0)
+    a = (-size * omega**2 * np.sin(angle)).sum(0)
+    u = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
+    u = u + np.std(u, axis=0) * (0.05 * v + 0.1 * np.tanh(v / 0.05))
+    noise_std = None
+    if noise == "a":
+        noise_std = np.full(2, 0.1)
+        a = a + noise_std * generator.normal(size=a.shape)
+    elif noise == "qvu":
+        q, v = q + 2e-5 * generator.normal(size=q.shape), v + 3e-4 * generator.normal(size=v.shape)
+        u = u + 0.01 * np.std(u, axis=0) * generator.normal(size=u.shape)
+        a = np.gradient(v, time, axis=0, edge_order=2)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, system=MechanicalSystem(robot), noise_std=noise_std)
+
+
+LINE = Plane((1.0, 0.0, 0.0), 0.35)
+POINT = (0.0, 0.0, -0.3)
+
+
+def on_a_line(
+    seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: float = 0.1, push: float = 8.0
+) -> Dataset:
+    """A planar arm whose tip stays on the line x = 0.35 m, pushed against it, with friction along the line."""
+    robot = two_links()
+    generator = np.random.default_rng(seed)
+    time = np.arange(round(seconds * rate)) / rate
+    omega, phase = 2 * np.pi * generator.uniform(0.15, 0.8, (4, 1)), generator.uniform(0, 2 * np.pi, (4, 1))
+    size = generator.uniform(0.02, 0.05, (4, 1))
+    z = -0.4 + (size * np.sin(omega * time + phase)).sum(0)
+    dz, ddz = (
+        (size * omega * np.cos(omega * time + phase)).sum(0),
+        (-size * omega**2 * np.sin(omega * time + phase)).sum(0),
+    )
+    # the tip lies at -(l1 sin q1 + l2 sin(q1 + q2)), -(l1 cos q1 + l2 cos(q1 + q2)) in x and z
+    reach = np.hypot(0.35, z)
+    bend = np.arccos((reach**2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))
+    first = np.arctan2(-0.35, -z) - np.arctan2(0.3 * np.sin(bend), 0.4 + 0.3 * np.cos(bend))
+    q = np.stack([first, bend], axis=1)
+    tensors = torch.tensor(q)
+    J = robot.kinematics(tensors, 0 * tensors).frame_jacobian("link2", POINT)[:, [0, 2]].numpy()
+    v = np.linalg.solve(J, np.stack([0 * z, dz], axis=1)[..., None])[..., 0]
+    bias = robot.kinematics(tensors, torch.tensor(v)).frame_bias_acceleration("link2", POINT)[:, [0, 2]].numpy()
+    a = np.linalg.solve(J, (np.stack([0 * z, ddz], axis=1) - bias)[..., None])[..., 0]
+    force = push * (1.0 + 0.4 * np.sin(1.7 * time + seed))
+    u = robot.inverse_dynamics(tensors, torch.tensor(v), torch.tensor(a)).numpy()
+    u = u + force[:, None] * J[:, 0] + 3.0 * dz[:, None] * J[:, 1]
+    noisy = a + noise * generator.normal(size=a.shape)
+    system = MechanicalSystem(robot, (Contact("link2", POINT, LINE),))
+    stated = np.full(2, noise) if noise else None
+    return Dataset(q=q, v=v, u=u, a=noisy, time=time, system=system, noise_std=stated)
+
+
+def at(data: Dataset, names: str, sign: list[float]) -> Dataset:
+    """Signals times one factor per joint."""
+    return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
+
+
+def degrees(data: Dataset) -> list[float]:
+    """Factors that turn radians into degrees, and leave metres."""
+    assert data.system is not None
+    return [1.0 if joint.type == "prismatic" else DEGREES for joint in data.system.robot.joints]
+
+
+def late(data: Dataset, names: str, seconds: float) -> Dataset:
+    """Signals of all joints, logged late."""
+    moved = {
+        name: np.stack([np.interp(data.time - seconds, data.time, x) for x in getattr(data, name).T], axis=1)
+        for name in names
+    }
+    return replace(data, **moved)
+
+
+def other_robot(data: Dataset, **changes: object) -> Dataset:
+    """The system states another robot than the one that was recorded: attributes of the URDF times factors."""
+    assert data.system is not None
+    robot = data.system.robot
+    text = robot.urdf_text
+    gravity = changes.pop("gravity", robot.gravity.tolist())
+    for find, by in changes.pop("text", ()):  # type: ignore[attr-defined]
+        assert find in text, find
+        text = text.replace(find, by)
+    made = Robot.from_urdf_text(text, gravity=gravity, armature=robot.armature)  # type: ignore[arg-type]
+    return replace(data, system=data.system.with_robot(made))
+
+
+def scaled(data: Dataset, masses: tuple[float, float] = (1.0, 1.0), length: float = 1.0) -> Dataset:
+    """With masses (and inertias) of the links, and the distance between the joints, times a factor in the URDF."""
+    import xml.etree.ElementTree as ElementTree
+
+    assert data.system is not None
+    robot = data.system.robot
+    root = ElementTree.fromstring(robot.urdf_text)
+    for name, factor in zip(("link1", "link2"), masses, strict=True):
+        inertial = root.find(f"link[@name='{name}']/inertial")
+        assert inertial is not None
+        for tag in ("mass", "inertia"):
+            element = inertial.find(tag)
+            assert element is not None
+            for key, value in element.attrib.items():
+                element.set(key, str(float(value) * factor))
+    origin = root.find("joint[@name='joint2']/origin")
+    assert origin is not None
+    origin.set("xyz", " ".join(str(float(x) * length) for x in origin.get("xyz", "").split()))
+    text = ElementTree.tostring(root, encoding="unicode")
+    made = Robot.from_urdf_text(text, gravity=robot.gravity.tolist(), armature=robot.armature)
+    return replace(data, system=data.system.with_robot(made))
+
+
+def recorded_under(data: Dataset, gravity: tuple[float, float, float]) -> Dataset:
+    """The same motion under another gravity than the system states."""
+    assert data.system is not None
+    robot = data.system.robot
+    there = Robot.from_urdf_text(robot.urdf_text, gravity=gravity, armature=robot.armature)
+    tensors = [torch.tensor(x) for x in (data.q, data.v, data.a)]
+    change = there.inverse_dynamics(*tensors) - robot.inverse_dynamics(*tensors)
+    return replace(data, u=data.u + change.numpy())
+
+
+def dropped(data: Dataset, names: str, share: float, seed: int = 0) -> Dataset:
+    """A share of the rows set to zero, in bursts of a few rows."""
+    generator = np.random.default_rng(seed)
+    lost = np.zeros(len(data), dtype=bool)
+    while lost.mean() < share:
+        start = generator.integers(1, len(data) - 4)
+        lost[start : start + generator.integers(1, 4)] = True
+    return replace(data, **{name: np.where(lost[:, None], 0.0, getattr(data, name)) for name in names})
+
+
+def held(x: np.ndarray) -> np.ndarray:
+    rows = np.arange(len(x))
+    start, stop = int(0.3 * len(x)), int(0.3 * len(x)) + max(25, len(x) // 25)
+    return np.where((rows > start) & (rows < stop), x[start], x)
+
+
+def moved(data: Dataset, by: tuple[float, float, float]) -> Dataset:
+    """With every contact point elsewhere on its link."""
+    assert data.system is not None
+    contacts = [replace(each, point=tuple(np.add(each.point, by))) for each in data.system.contacts]
+    return replace(data, system=data.system.with_contacts(contacts), truth={})
+
+
+def without_contacts(data: Dataset) -> Dataset:
+    assert data.system is not None
+    return replace(data, system=data.system.with_contacts(()), truth={})
+
+
+def invented(data: Dataset) -> Dataset:
+    """A contact through which the middle of the motion passes."""
+    assert data.system is not None
+    robot = data.system.robot
+    q = torch.tensor(data.q)
+    pose = robot.kinematics(q, 0 * q).frame_pose("link2").numpy()
+    offset = float(np.median((pose[:, :3, :3] @ np.array(POINT) + pose[:, :3, 3])[:, 0]))
+    return replace(data, system=data.system.with_contacts([Contact("link2", POINT, Plane((1.0, 0.0, 0.0), offset))]))
+
+
+Corruption = Callable[[Dataset], Dataset]
+CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
+    "degrees": (lambda d: at(d, "qva", degrees(d)), "degrees|velocity"),
+    "q in degrees": (lambda d: at(d, "q", degrees(d)), "degrees|velocity|jumps"),
+    "v in degrees": (lambda d: at(d, "v", degrees(d)), "velocity"),
+    "a in degrees": (lambda d: at(d, "a", degrees(d)), "acceleration"),
+    "u in mNm": (lambda d: at(d, "u", [1000.0] * 2), "torque unit"),
+    "motor side of gears, u": (lambda d: at(d, "u", [1 / 50, 1 / 100]), "torque unit"),
+    "motor side of one gear, u": (lambda d: at(d, "u", [1.0, 1 / 30]), "torque unit"),
+    "motor side of a gear, q v a": (lambda d: at(d, "qva", [1.0, 6.0]), "motion|gear"),
+    "motor currents": (lambda d: at(d, "u", [1 / 0.07, 1 / 0.11]), "torque unit"),
+    "torque constant 30 % off": (lambda d: at(d, "u", [1.0, 1.3]), "torque constant|torque unit|mass"),
+    "torque constant 30 % low": (lambda d: at(d, "u", [0.7, 1.0]), "torque constant|torque unit|mass"),
+    "torque sign of one": (lambda d: at(d, "u", [1, -1]), "torque sign"),
+    "torque sign of all": (lambda d: at(d, "u", [-1, -1]), "torque sign"),
+    "motion sign of one": (lambda d: at(d, "qva", [-1, 1]), "sign"),
+    "axis of one": (lambda d: at(d, "qvau", [1, -1]), "sign"),
+    "velocity sign": (lambda d: at(d, "v", [1, -1]), "velocity"),
+    "acceleration sign": (lambda d: at(d, "a", [-1, 1]), "acceleration"),
+    "torques exchanged": (lambda d: exchanged(d, "u", [1, 0]), "joints exchanged"),
+    "motions exchanged": (lambda d: exchanged(d, "qva", [1, 0]), "joints exchanged"),
+    "joints exchanged": (lambda d: exchanged(d, "qvau", [1, 0]), "joints exchanged"),
+    "velocities exchanged": (lambda d: exchanged(d, "v", [1, 0]), "velocity"),
+    "torques 20 ms late": (lambda d: late(d, "u", 0.02), "delay"),
+    "torques 20 ms early": (lambda d: late(d, "u", -0.02), "delay"),
+    "velocities 20 ms late": (lambda d: late(d, "v", 0.02), "velocity"),
+    "gravity upside down": (lambda d: recorded_under(d, (0, 0, 9.81)), "gravity"),
+    "gravity of a wall": (lambda d: recorded_under(d, (9.81, 0, 0)), "gravity"),
+    "recorded without gravity": (lambda d: recorded_under(d, (0, 0, 0)), "gravity"),
+    "gravity not stated": (lambda d: other_robot(d, gravity=(0, 0, 0)), "gravity"),
+    "masses doubled": (lambda d: scaled(d, (2.0, 2.0)), "mass"),
+    "a mass doubled": (lambda d: scaled(d, (1.0, 2.0)), "mass"),
+    "a mass halved": (lambda d: scaled(d, (0.5, 1.0)), "mass|torque unit|inertia"),
+    "length .4 -> .6": (lambda d: scaled(d, length=1.5), "length"),
+    "length .4 -> .25": (lambda d: scaled(d, length=0.625), "length"),
+    "3 % of all rows zero": (lambda d: dropped(d, "qvau", 0.03), "zero|drop"),
+    "3 % of torques zero": (lambda d: dropped(d, "u", 0.03), "zero|drop"),
+    "3 % of q zero": (lambda d: dropped(d, "q", 0.03), "zero|drop|velocity"),
+    "frozen position": (lambda d: column(d, "q", 1, held), "frozen"),
+    "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
+    "saturation": (lambda d: column(d, "u", 0, lambda x: np.clip(x, *np.quantile(x, [0.1, 0.9]))), "saturation"),
+    "noise_std 100 times too small": (lambda d: replace(d, noise_std=np.full(2, 1e-3)), "noise"),
+    "noise_std 100 times too large": (lambda d: replace(d, noise_std=np.full(2, 10.0)), "noise"),
+    "encoder zero off by .4": (lambda d: replace(d, q=d.q + np.array([0.0, 0.4])), "zero"),
+    "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "dead torque|constant"),
+    "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
+    "coarse positions": (lambda d: replace(d, q=d.q.round(2)), "resolution"),
+}
+CONTACT_CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
+    "contact 2 cm sideways": (lambda d: moved(d, (0.02, 0.0, 0.0)), "contact"),
+    "contact missing": (without_contacts, "contact"),
+}
+
+
+UNSEEN: Mapping[str, tuple[str, ...]] = {
+    "crane": ("length .4 -> .6", "length .4 -> .25", "gravity of a wall"),  # these change no torque, or a constant
+}
+
+
+def cases(seed: int) -> Mapping[str, Dataset]:
+    """The clean logs of one seed."""
+    settings = np.random.default_rng(seed)
+    made = {
+        f"{name}, {noise}": clean(
+            robot(), seed, rate=float(settings.choice([100.0, 200.0, 500.0])), seconds=float(settings.uniform(6, 15)),
+            noise=noise,
+        )
+        for name, robot in ROBOTS.items()
+        for noise in ("a", "qvu")
+    }  # fmt: skip
+    return made
+
+
+def named(said: str, words: str) -> bool:
+    return any(word in said.lower() for word in words.split("|"))
+
+
+def said_by_check(data: Dataset) -> str:
+    found = check(data).findings
+    return "\n".join(f"[{each.severity}] {each.subject}: {each.seen}" for each in found if each.severity != "ok")
+
+
+def said_by_fit(data: Dataset) -> str:
+    """The line that `forcegp fit` prints, or why it refuses these rows."""
+    assert data.system is not None
+    try:
+        q, v, u = (torch.tensor(getattr(data.rows([*range(0, len(data), 50)]), name)) for name in "qvu")
+        data.system.check_states(q, v, u)
+    except ForceGPError as error:
+        return str(error)
+    return findings_in_one_line(quick_check(data), Path("log.h5")) or ""
+
+
+def table(seeds: int, say: Callable[[Dataset], str], verbose: bool) -> None:
+    """Print how often each corruption is named, and what is said of the clean logs."""
+    counts: dict[str, list[int]] = {}
+    for seed in range(seeds):
+        logs = [(name, data, CORRUPTIONS) for name, data in cases(seed).items()]
+        logs += [("line", on_a_line(seed), CONTACT_CORRUPTIONS)]
+        for where, data, corruptions in logs:
+            free = {} if where == "line" else {"contact invented": (invented, "contact")}
+            before = say(data)
+            if before:
+                print(f"CLEAN {where} {seed}: {before}")
+            for name, (corrupt, words) in {**corruptions, **free}.items():
+                if name in UNSEEN.get(where.partition(",")[0], ()):
+                    continue
+                try:
+                    said = say(corrupt(data))
+                except Exception as error:  # a table of everything
+                    said = f"{type(error).__name__}: {error}"
+                new = "\n".join(line for line in said.splitlines() if line not in before)
+                hit = named(new, words)
+                counts.setdefault(name, []).append(hit)
+                if not hit and verbose:
+                    print(f"MISSED {name} | {where} {seed}: {new or '-'}")
+    for name, hits in counts.items():
+        print(f"{name:32s} {sum(hits):3d} of {len(hits)}")
+    shares = [np.mean(hits) for hits in counts.values()]
+    print(f"named in 9 of 10 logs or more: {sum(share >= 0.9 for share in shares)} of {len(shares)}")
+
+
+if __name__ == "__main__":
+    table(int(sys.argv[1]), said_by_fit if "fit" in sys.argv else said_by_check, "-v" in sys.argv)

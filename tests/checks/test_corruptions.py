@@ -1,0 +1,135 @@
+"""Every corruption of a two-joint log is named by `check`, and said in one line before a fit; clean logs are not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.checks.clean_logs import clean_logs, rests
+from tests.checks.corruptions import (
+    CONTACT_CORRUPTIONS,
+    CORRUPTIONS,
+    ROBOTS,
+    UNSEEN,
+    cases,
+    clean,
+    invented,
+    named,
+    on_a_line,
+    said_by_check,
+    said_by_fit,
+    scaled,
+    two_links,
+)
+
+from forcegp.checks import check, quick_check
+from forcegp.checks.parameters import parameter_findings
+from forcegp.cli.findings_line import findings_in_one_line
+
+ONLY_CHECK = ("coarse positions",)
+"""What a fit does not mention: real encoders are coarse."""
+
+
+def log_of(place: int):
+    """Robots, rates and kinds of noise in turn."""
+    name = ("planar", "heavy", "geared")[place % 3]
+    return clean(ROBOTS[name](), place, rate=(100.0, 250.0)[place % 2], seconds=7.0, noise=("a", "qvu")[place // 3 % 2])
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_a_corruption_is_named_by_check_and_before_a_fit(name):
+    corrupt, words = CORRUPTIONS[name]
+    data = corrupt(log_of(list(CORRUPTIONS).index(name)))
+    assert named(said_by_check(data), words), said_by_check(data)
+    line = said_by_fit(data)
+    assert "\n" not in line
+    assert name in ONLY_CHECK or named(line, words), line
+
+
+@pytest.mark.parametrize("name", CONTACT_CORRUPTIONS)
+def test_a_corrupted_contact_is_named_by_check_and_before_a_fit(name):
+    corrupt, words = CONTACT_CORRUPTIONS[name]
+    data = corrupt(on_a_line(3))
+    assert named(said_by_check(data), words)
+    assert named(said_by_fit(data), words)
+
+
+def test_an_invented_contact_is_named_by_check_and_before_a_fit():
+    data = invented(clean(two_links(), 2))
+    assert named(said_by_check(data), "contact")
+    assert named(said_by_fit(data), "contact")
+
+
+def test_clean_logs_raise_no_alarm():
+    for name, data in clean_logs(1):
+        assert not [each for each in check_if_long(data) if each.severity == "wrong"], name
+        assert findings_in_one_line(quick_check(data), Path("log.h5")) is None, name
+
+
+def check_if_long(data):
+    return check(data).findings if len(data) > 300 else ()
+
+
+def test_a_robot_that_rests_with_noisy_positions_is_not_frozen():
+    data = rests(two_links(), 0, jitter=0.02)
+    noisy = replace(data, q=data.q + 1e-5 * np.random.default_rng(0).normal(size=data.q.shape))
+    assert not check(noisy).of("frozen channel")
+
+
+def test_the_number_that_is_wrong_is_measured():
+    data = scaled(clean(two_links(), 0), length=1.5)
+    (found,) = [each for each in check(data).findings if each.subject == "lengths"]
+    assert found.numbers["value"] == pytest.approx(1 / 1.5, abs=0.03)
+    assert "0.402 instead of 0.6 m" in found.seen
+
+
+def test_noise_of_the_acceleration_does_not_make_masses_smaller():
+    data = clean(two_links(), 0, noise="none")
+    noise = np.array([8.0, 8.0])
+    noisy = replace(data, a=data.a + noise * np.random.default_rng(0).normal(size=data.a.shape))
+    assert data.system is not None
+    robot = data.system.robot
+    without = parameter_findings(robot, noisy, np.zeros(2))
+    assert [each.subject for each in without] == ["masses"]  # regression on noisy regressors is too small
+    assert parameter_findings(robot, noisy, noise) == []
+
+
+def test_short_and_unordered_logs_are_looked_at_too():
+    data = clean(two_links(), 0)
+    few = data.rows(np.random.default_rng(0).choice(len(data), 60, replace=False))
+    assert quick_check(few) == ()
+    assert next(each.subject for each in quick_check(replace(few, u=-few.u))) == "torque sign"
+    assert quick_check(data.rows(slice(0, 12))) == ()
+
+
+def test_drop_outs_are_counted_and_nothing_else_is_blamed():
+    data = clean(two_links(), 0)
+    lost = np.random.default_rng(1).choice(np.arange(1, len(data) - 1), 40, replace=False)
+    zero = {name: getattr(data, name).copy() for name in "qvua"}
+    for values in zero.values():
+        values[lost] = 0.0
+    report = check(replace(data, **zero))
+    (found,) = [each for each in report.findings if each.severity != "ok"]
+    assert found.subject == "drop-outs"
+    assert found.numbers["rows"] == pytest.approx(40, abs=6)  # a signal that passes 0 there is not seen to drop
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(3))
+def test_nine_of_ten_corruptions_are_named_on_all_robots(seed):
+    hits: dict[str, list[bool]] = {}
+    for where, data in cases(seed).items():
+        for name, (corrupt, words) in CORRUPTIONS.items():
+            if name not in UNSEEN.get(where.partition(",")[0], ()):
+                hits.setdefault(name, []).append(named(said_by_fit(corrupt(data)), words))
+    assert np.mean([np.mean(each) >= 0.8 for each in hits.values()]) > 0.9, {k: np.mean(v) for k, v in hits.items()}
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(2, 12))
+def test_clean_logs_raise_no_alarm_on_more_seeds(seed):
+    torch.manual_seed(seed)
+    for name, data in clean_logs(seed):
+        assert not [each for each in check_if_long(data) if each.severity == "wrong"], name
+        assert quick_check(data) == (), name

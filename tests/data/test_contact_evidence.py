@@ -1,0 +1,101 @@
+"""Contacts that the rows contradict: beside the point, invented, missing; and none where they are right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.checks.clean_logs import clean_logs
+from tests.checks.corruptions import clean, invented, moved, on_a_line, two_links, without_contacts
+
+from forcegp.data import Dataset, contact_doubts
+from forcegp.mechanics import Contact, MechanicalSystem, Plane
+
+
+def simulated(seed: int, surface: str = "plane", noise: float = 0.1, seconds: float = 10.0) -> Dataset:
+    pytest.importorskip("pybullet")
+    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=seconds, seed=seed, surface=surface, noise=noise))
+
+
+def kinds(data: Dataset, system: MechanicalSystem | None = None) -> list[str]:
+    return [doubt.kind for doubt in contact_doubts(data, system)]
+
+
+@pytest.fixture(scope="module")
+def sliding() -> Dataset:
+    return simulated(7)
+
+
+def test_a_point_two_centimetres_sideways_is_measured(sliding):
+    """The tool keeps its orientation, so that |A a - b| does not change: the place of the force does."""
+    assert kinds(sliding) == []
+    for shift in ((0.02, 0.0, 0.0), (0.0, -0.02, 0.0)):
+        (doubt,) = contact_doubts(moved(sliding, shift))
+        assert doubt.kind == "point"
+        assert doubt.numbers["shift"] == pytest.approx(0.02, abs=0.012)
+        assert sliding.system is not None
+        near = np.array(doubt.numbers["point"]) - np.array(sliding.system.contacts[0].point)
+        assert np.linalg.norm(near) < 0.012
+
+
+def test_a_missing_contact_is_found_with_its_normal(sliding):
+    (doubt,) = contact_doubts(without_contacts(sliding))
+    assert doubt.kind == "missing"
+    assert "1.00)" in doubt.seen
+    assert doubt.numbers["frame"] == "lbr_iiwa_link_7"
+
+
+def test_few_rows_are_enough_and_never_too_many(sliding):
+    chosen = np.random.default_rng(0).choice(len(sliding), 20, replace=False)
+    few = sliding.rows(chosen)
+    assert kinds(few) == []
+    assert kinds(moved(few, (0.02, 0.0, 0.0))) == ["point"]
+    assert kinds(few.rows(slice(0, 6))) == []
+
+
+def test_a_contact_without_a_force_is_doubted():
+    free = simulated(7, surface="none")
+    assert free.system is not None
+    height = Plane((0.0, 0.0, 1.0), 0.105)  # where the tool moves in the air
+    air = free.system.with_contacts([Contact("lbr_iiwa_link_7", (0.0, 0.0, 0.1), height)])
+    assert kinds(free) == []
+    assert kinds(free, air) == ["no force"]
+    assert kinds(free, air.with_contacts([replace(air.contacts[0], surface=Plane((0.0, 0.0, 1.0), 0.055))])) == ["off"]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_an_arm_on_a_line(noise):
+    data = on_a_line(4, noise=noise)
+    assert kinds(data) == []
+    assert kinds(moved(data, (0.02, 0.0, 0.0))) == ["off"]
+    assert kinds(without_contacts(data)) == ["missing"]
+    assert kinds(invented(clean(two_links(), 4))) == ["off"]
+
+
+def test_nothing_is_said_without_torques_and_of_a_single_joint():
+    data = on_a_line(4)
+    assert kinds(replace(data, u=0.0 * data.u)) == []
+    assert contact_doubts(replace(data, system=None)) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(10, 30))
+def test_clean_logs_of_many_seeds_are_not_doubted(seed):
+    for _, data in clean_logs(seed):
+        assert contact_doubts(data) == []
+    for surface in ("plane", "tilted", "sphere"):
+        for noise in (0.0, 0.1):
+            data = simulated(seed, surface, noise)
+            for rows in (data, data.rows(slice(None, None, len(data) // 20)), data.rows(slice(None, None, 240))):
+                assert kinds(rows) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_contacts_of_five_seeds_are_doubted(seed):
+    data, line = simulated(seed), on_a_line(seed)
+    for each in (data, line):
+        for shift in ((0.02, 0.0, 0.0), (0.0, 0.02, 0.0)) if each is data else ((0.02, 0.0, 0.0),):
+            assert kinds(moved(each, shift))
+        assert kinds(without_contacts(each)) == ["missing"]
