@@ -129,7 +129,8 @@ def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
         **dict.fromkeys(("power_removed", "acceleration_noise"), lambda value: all(map(_are_numbers, value.values()))),
     }
     try:
-        return report if all(fits(report[name]) for name, fits in shapes.items() if name in report) else {}
+        whole = all(fits(report[name]) for name, fits in shapes.items() if name in report)
+        return report if whole and isinstance(report, Mapping) else {}
     except (TypeError, AttributeError):
         return {}
 
