@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput, consecutive
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, listed
+from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
