@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.checks.successive_rows import (
+    FEW_JOINTS,
     consecutive,
     drop_outs,
     few_stretches,
@@ -36,9 +37,6 @@ LONGEST_TRIM = 0.1
 
 MOST_ROWS = 1000
 """Rows on which torques are compared: neighbouring rows hold the same information."""
-
-FEW_JOINTS = 3
-"""Of more joints, half as many rows."""
 
 QUICK_ROWS = 300
 """The same before a fit."""

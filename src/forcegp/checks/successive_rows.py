@@ -18,7 +18,10 @@ LEAST_JUMP = 0.02
 
 FEWEST_DROPS = 2
 
-STRETCHES, STRETCH_ROWS = 3, 500
+FEW_JOINTS = 3
+"""Of more joints, half as many rows."""
+
+STRETCHES, STRETCH_ROWS = 3, 400
 """How many stretches of how many rows are looked at before a fit, where a log is longer."""
 
 MOTION = 1.5
@@ -72,11 +75,12 @@ def mended_rows(dataset: Dataset, dropped: Mapping[str, np.ndarray]) -> Dataset:
 
 def few_stretches(dataset: Dataset) -> Dataset:
     """A few stretches of successive rows, evenly over the log, each an episode."""
-    if len(dataset) <= STRETCHES * STRETCH_ROWS:
+    length = STRETCH_ROWS if dataset.nv <= FEW_JOINTS else STRETCH_ROWS // 2
+    if len(dataset) <= STRETCHES * length:
         return dataset
-    starts = np.linspace(0, len(dataset) - STRETCH_ROWS, STRETCHES).astype(int)
-    rows = (starts[:, None] + np.arange(STRETCH_ROWS)).ravel()
-    pieces = np.repeat(np.arange(STRETCHES), STRETCH_ROWS)
+    starts = np.linspace(0, len(dataset) - length, STRETCHES).astype(int)
+    rows = (starts[:, None] + np.arange(length)).ravel()
+    pieces = np.repeat(np.arange(STRETCHES), length)
     _, numbers = np.unique(np.stack([pieces, dataset.episode[rows]]), axis=1, return_inverse=True)
     return replace(dataset.rows(rows), episode=numbers.ravel())
 
