@@ -49,7 +49,7 @@ def main(words: list[str]) -> None:
     if "multiarm" in names:
         published = multiarm_system(ViscousJointFriction([2.37142783e-4, 1.00000019e-5]))
         data = multiarm(folder, published)
-        force, acceleration = (x.cumsum(1) for x in motion_residuals(published, data))
+        force, acceleration = (x.cumsum(1) for x in motion_residuals(data, published))
         absolute = replace(data, a=data.a.cumsum(1))
         told(
             "multiarm, published, absolute angles", residual_scores(force, acceleration, absolute), "acceleration_nrmse"
@@ -69,10 +69,10 @@ def compared(
     name: str, system: MechanicalSystem, train: Dataset, test: Dataset, choices: tuple[dict[str, Any], ...], key: str
 ) -> None:
     """The system as given and every identification of it, by this score on the test rows."""
-    told(f"{name}, as given", residual_scores(*motion_residuals(system, test), test), key)
+    told(f"{name}, as given", residual_scores(*motion_residuals(test, system), test), key)
     for choice in choices:
         begin = time.process_time()
-        found = identify_analytical(system, train, **choice)
+        found = identify_analytical(train, system, **choice)
         seconds = time.process_time() - begin
         words = " ".join("+".join(v) if isinstance(v, tuple) else f"{k}={v}" for k, v in choice.items())
         state = "" if found.fit.settled else ", not settled"

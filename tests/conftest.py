@@ -4,14 +4,17 @@
 the time. `FORCEGP_TEST_THREADS=2` computes with two threads (`make test-processors`).
 """
 
+import contextlib
 import os
-from collections.abc import Callable
+import resource
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # numpy and torch read them at import
     os.environ[variable] = str(THREADS)
 
+import jaxtyping
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
@@ -45,3 +48,27 @@ def shared() -> Callable[[str], Path]:
         return found
 
     return path
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Without the types of signatures checked, as users have it: forcegp's own checks speak, integers are numbers."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def limited_file_size() -> Callable[[int], contextlib.AbstractContextManager[None]]:
+    """`with limited_file_size(count):` no file of this process can grow beyond `count` bytes, as on a full disk."""
+
+    @contextlib.contextmanager
+    def limited(count: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))  # Python ignores the signal: EFBIG is left
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited

@@ -18,13 +18,15 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 # The packages in the order in which data flows, and which packages each may import: the table of docs/architecture.md.
 PACKAGES = {
     "errors": set(),
+    "summary": set(),
     "atomic_files": {"errors"},
+    "file_digests": {"errors"},
     "codegen": {"errors"},
     "parallel": {"errors"},
     "jobs": {"errors", "atomic_files", "parallel"},
-    "robots": {"errors", "atomic_files", "codegen"},
-    "mechanics": {"errors", "robots"},
-    "data": {"errors", "atomic_files", "robots", "mechanics"},
+    "robots": {"errors", "summary", "atomic_files", "codegen"},
+    "mechanics": {"errors", "summary", "robots"},
+    "data": {"errors", "summary", "atomic_files", "robots", "mechanics"},
     "recordings": {"errors", "robots", "mechanics", "data"},
     "analytical": {"errors", "robots", "mechanics", "data"},
     "checks": {"errors", "robots", "mechanics", "data", "analytical"},
@@ -33,7 +35,9 @@ PACKAGES = {
     "integration": {"errors", "robots", "mechanics"},
     "models": {
         "errors",
+        "summary",
         "atomic_files",
+        "file_digests",
         "codegen",
         "parallel",
         "robots",

@@ -10,7 +10,15 @@ import sys
 import pytest
 
 from forcegp import atomic_files
-from forcegp.atomic_files import atomic_file, atomic_folder, read_json, remove_leftovers, write_json, write_text
+from forcegp.atomic_files import (
+    atomic_file,
+    atomic_folder,
+    read_json,
+    remove_leftovers,
+    require_writable,
+    write_json,
+    write_text,
+)
 from forcegp.errors import FileFormatError, InvalidInput
 
 FAILURES = [OSError(errno.ENOSPC, "no space"), KeyboardInterrupt()]
@@ -68,11 +76,12 @@ class TestFiles:
             assert (tmp_path / "note.txt").read_bytes() == text.encode()
         assert names(tmp_path) == ["note.txt"]
 
-    def test_the_temporary_name_lies_in_the_same_folder_and_is_hidden(self, tmp_path):
+    def test_the_temporary_name_lies_in_the_same_file_system_and_is_hidden(self, tmp_path):
         with atomic_file(tmp_path / "note.txt") as temporary:
             temporary.write_text("new")
-            assert temporary.parent == tmp_path
-            assert temporary.name.startswith(".note.txt.")
+            assert temporary.parent.parent == tmp_path
+            assert temporary.parent.name.startswith(".note.txt.")
+            assert temporary.name == "note.txt"
             assert not (tmp_path / "note.txt").exists()
 
     @pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
@@ -144,12 +153,70 @@ class TestJson:
         with pytest.raises(FileFormatError, match=r"a\.json is .*damaged.*; write it again\.$"):
             read_json(tmp_path / "a.json", "write it again")
 
+    @pytest.mark.parametrize("links", [True, False])
+    def test_without_overwrite_a_file_that_appears_meanwhile_stays(self, tmp_path, monkeypatch, links):
+        if not links:
+            monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EPERM, "no hard links")))
+        with atomic_file(tmp_path / "one.txt", overwrite=False) as temporary:
+            temporary.write_text("mine")
+        assert contents(tmp_path) == {"one.txt": "mine"}
+
+        def two_processes() -> None:
+            with atomic_file(tmp_path / "note.txt", overwrite=False) as temporary:
+                temporary.write_text("mine")
+                (tmp_path / "note.txt").write_text("of another process")
+
+        if links:
+            with pytest.raises(InvalidInput, match=r"note\.txt exists already; choose another name"):
+                two_processes()
+            assert contents(tmp_path) == {"one.txt": "mine", "note.txt": "of another process"}
+        assert not list(tmp_path.glob(".*"))
+
+    def test_what_is_no_regular_file_is_never_replaced(self, tmp_path):
+        os.mkfifo(tmp_path / "pipe")
+        (tmp_path / "link").symlink_to("pipe")
+        (tmp_path / "loop").symlink_to("loop")
+        for name in ("pipe", "link", "loop"):
+            with pytest.raises(InvalidInput, match=r"it is (not a regular file|a link that leads back to itself)"):
+                write_text(tmp_path / name, "new")
+            with (
+                pytest.raises(InvalidInput, match=r"cannot write .*; choose another name"),
+                atomic_folder(tmp_path / name),
+            ):
+                pass
+        assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+        assert sorted(names(tmp_path)) == ["link", "loop", "pipe"]
+
+    def test_a_link_to_nowhere_is_written_through(self, tmp_path):
+        (tmp_path / "link").symlink_to("real")
+        write_text(tmp_path / "link", "new")
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / "real").read_text() == "new"
+
+
+class TestTrial:
+    def test_leaves_nothing(self, tmp_path):
+        require_writable(tmp_path / "not" / "there" / "yet")
+        require_writable(tmp_path / "file")
+        assert not names(tmp_path)
+
+    def test_a_file_in_the_place_of_a_folder_is_noticed(self, tmp_path):
+        (tmp_path / "file").write_text("mine")
+        with pytest.raises(NotADirectoryError):
+            require_writable(tmp_path / "file" / "deep" / "run")
+        assert contents(tmp_path) == {"file": "mine"}
+
+    def test_a_full_disk_is_noticed(self, tmp_path, limited_file_size):
+        with limited_file_size(1000), pytest.raises(OSError, match="File too large"):
+            require_writable(tmp_path / "run")
+        assert not names(tmp_path)
+
 
 class TestFolders:
     def test_is_made_with_its_parents(self, tmp_path):
         with atomic_folder(tmp_path / "deep" / "er" / "model") as temporary:
             make_folder(temporary, one="1")
-            assert temporary.parent == tmp_path / "deep" / "er"
+            assert temporary.parent.parent == tmp_path / "deep" / "er"
         assert contents(tmp_path) == {"deep/er/model/one": "1"}
 
     def test_takes_the_place_of_an_old_one_when_it_is_complete(self, tmp_path):
@@ -169,17 +236,28 @@ class TestFolders:
         assert contents(tmp_path) == {"model/one": "old"}
         assert names(tmp_path) == ["model"]
 
+    def test_the_old_folder_is_exchanged_in_one_step_where_the_system_can(self, tmp_path, monkeypatch):
+        make_folder(tmp_path / "model", one="old")
+        for name in ("rename", "replace"):
+            monkeypatch.setattr(os, name, lambda *_: pytest.fail("there is a moment without a folder"))
+        with atomic_folder(tmp_path / "model") as temporary:
+            make_folder(temporary, one="new")
+        assert contents(tmp_path) == {"model/one": "new"}
+        assert names(tmp_path) == ["model"]
+
     @pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
     def test_the_old_folder_is_put_back_if_the_second_rename_fails(self, tmp_path, monkeypatch, error):
         make_folder(tmp_path / "model", one="old")
+        monkeypatch.setattr(atomic_files, "_swapped", lambda *_: False)
         break_renames_to(monkeypatch, tmp_path / "model", error)
         with pytest.raises(type(error)), atomic_folder(tmp_path / "model") as temporary:
             make_folder(temporary, one="new")
         assert contents(tmp_path) == {"model/one": "old"}
         assert names(tmp_path) == ["model"]
 
-    def test_the_old_folder_is_kept_aside_if_it_cannot_be_put_back(self, tmp_path, monkeypatch):
+    def test_the_old_folder_is_kept_aside_if_it_cannot_be_put_back_until_the_next_time(self, tmp_path, monkeypatch):
         make_folder(tmp_path / "model", one="old")
+        monkeypatch.setattr(atomic_files, "_swapped", lambda *_: False)
         rename = os.rename
 
         def broken(source, to):
@@ -187,12 +265,15 @@ class TestFolders:
                 raise OSError(errno.EIO, "the disk is gone")
             rename(source, to)
 
-        monkeypatch.setattr(os, "rename", broken)
-        with pytest.raises(OSError, match="the disk is gone"), atomic_folder(tmp_path / "model") as temporary:
-            make_folder(temporary, one="new")
+        with monkeypatch.context() as now:
+            now.setattr(os, "rename", broken)
+            with pytest.raises(OSError, match="the disk is gone"), atomic_folder(tmp_path / "model") as temporary:
+                make_folder(temporary, one="new")
         (kept,) = tmp_path.iterdir()
-        assert kept.suffix == ".old"
-        assert contents(kept) == {"one": "old"}
+        assert contents(kept / ".old") == {"model/one": "old"}
+        require_writable(tmp_path / "model")
+        assert contents(tmp_path) == {"model/one": "old"}
+        assert names(tmp_path) == ["model"]
 
     def test_without_overwrite_a_folder_that_appears_meanwhile_stays(self, tmp_path):
         def two_processes() -> None:
@@ -228,20 +309,45 @@ class TestFolders:
         assert steps[-1] == "rename"
 
 
-def test_a_killed_process_leaves_only_what_remove_leftovers_deletes(tmp_path):
+KILLED = (
+    "import os, signal, sys\n"
+    "from pathlib import Path\n"
+    "from forcegp.atomic_files import atomic_file, atomic_folder\n"
+    "folder = Path(sys.argv[1])\n"
+    "with atomic_folder(folder / 'model') as model, atomic_file(folder / 'note.txt') as note:\n"
+    "    model.mkdir(); (model / 'one').write_text('ne'); note.write_text('ne')\n"
+    "    with atomic_file(note) as inner:\n"
+    "        inner.write_text('n')\n"
+    "        print('there', flush=True)\n"
+    "        sys.stdin.readline()\n"
+    "        os.kill(os.getpid(), signal.SIGKILL)\n"
+)
+
+
+@pytest.mark.parametrize("how", ["by the next writer", "by remove_leftovers"])
+def test_what_a_killed_process_left_is_deleted_but_not_what_a_living_one_writes(tmp_path, how):
+    def clean() -> None:
+        for name in ("model", "note.txt"):
+            remove_leftovers(tmp_path) if how == "by remove_leftovers" else require_writable(tmp_path / name)
+
     make_folder(tmp_path / "model", one="old")
-    script = (
-        "import os, signal, sys\n"
-        "from pathlib import Path\n"
-        "from forcegp.atomic_files import atomic_file, atomic_folder\n"
-        "folder = Path(sys.argv[1])\n"
-        "with atomic_folder(folder / 'model') as model, atomic_file(folder / 'note.txt') as note:\n"
-        "    model.mkdir(); (model / 'one').write_text('ne'); note.write_text('ne')\n"
-        "    os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], check=False)
-    assert done.returncode < 0
-    assert len(list(tmp_path.iterdir())) == 3
-    assert contents(tmp_path / "model") == {"one": "old"}
-    remove_leftovers(tmp_path)
+    for name in (".note.txt.0123456789ab.tmp", "..note.txt.0123456789ab.tmp.ba9876543210.tmp"):
+        (tmp_path / name).write_text("left by a version before locks")
+    command = [sys.executable, "-c", KILLED, tmp_path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline()
+        clean()
+        assert len(names(tmp_path)) == 3, "the living one's were deleted"
+        writer.stdin.write(b"\n")
+    assert writer.returncode < 0
+    assert len(names(tmp_path)) == 3
+    clean()
+    assert contents(tmp_path) == {"model/one": "old"}
     assert names(tmp_path) == ["model"]
+
+
+@pytest.mark.parametrize("name", [".demo.0123456789ab.tmp/demo/train.h5", ".log.h5.0123456789ab.tmp/log.h5"])
+def test_git_ignores_what_is_being_written(repository, name):
+    if not (repository / ".git").exists():
+        pytest.skip("no checkout")
+    subprocess.run(["git", "check-ignore", "--quiet", name], cwd=repository, check=True)

@@ -1,15 +1,20 @@
-"""Files and folders that appear whole or not at all: written under a temporary name, then renamed.
+"""Files and folders that appear whole or not at all: written in a hidden folder beside them, then renamed.
 
-The temporary name lies in the same folder, because only a rename within one file system is atomic. Whatever is written
-gets the permissions that the umask allows, and whatever fails, Ctrl-C included, leaves the old file or folder as it was
-and nothing beside it. A process that is killed leaves a hidden `.NAME.*.tmp`, which `remove_leftovers` deletes.
+That folder, `.NAME.*.tmp`, lies beside the target, because only a rename within one file system is atomic. Whatever is
+written gets the permissions that the umask allows, and whatever fails, Ctrl-C included, leaves the old file or folder
+as it was and nothing beside it. A process that is killed leaves the hidden folder; whoever writes to the same name next
+deletes it. Its writer holds a lock in it, which ends with the process, so what is being written is never deleted.
+
+A symbolic link stays, and what it points to is replaced. What is neither a file nor a folder is never replaced.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
@@ -20,26 +25,37 @@ from typing import Any
 from forcegp.errors import FileFormatError, InvalidInput
 
 TEMPORARY = ".tmp"
+LOCK, OLD = ".lock", ".old"
+TRIAL = 2**16
+"""Bytes that `require_writable` writes."""
 
 
 @contextmanager
-def atomic_file(path: str | Path) -> Iterator[Path]:
+def atomic_file(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
     """A temporary path at which to write a file, which replaces `path` when the context ends without error.
 
-    Raises InvalidInput if the folder of `path` does not exist or `path` is a folder.
+    Raises InvalidInput if the folder of `path` does not exist, if `path` is a folder, a device or a pipe, and without
+    `overwrite` if it is there by then.
     """
     target = _target(path)
     if not target.parent.is_dir():
         raise InvalidInput(f"cannot write {path}: the folder {target.parent} does not exist; create it first.")
     if target.is_dir():
         raise InvalidInput(f"cannot write {path}: it is a folder; give a file name.")
-    temporary = _beside(target, TEMPORARY)
-    try:
+    if target.exists() and not target.is_file():
+        raise InvalidInput(f"cannot write {path}: it is not a regular file; choose another name.")
+    with _beside(target) as temporary:
         yield temporary
         _flush(temporary)
+        if not overwrite:
+            try:
+                os.link(temporary, target)  # unlike a rename, never over what another process has written meanwhile
+                return
+            except FileExistsError:
+                raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.") from None
+            except OSError:  # a file system without hard links
+                pass
         os.replace(temporary, target)
-    finally:  # also after KeyboardInterrupt; after the rename there is nothing of this name
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -47,14 +63,13 @@ def atomic_folder(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]
     """A temporary path at which to make a folder, which becomes `path` when the context ends without error.
 
     A folder that is there stays in place until the new one is complete. Without `overwrite` it stays for good and an
-    OSError is raised, unless it is empty. Raises InvalidInput if `path` is a file.
+    OSError is raised, unless it is empty. Raises InvalidInput if `path` is no folder.
     """
     target = _target(path)
     if target.exists() and not target.is_dir():
         raise InvalidInput(f"cannot write the folder {path}: it is a file; choose another name.")
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _beside(target, TEMPORARY)
-    try:
+    with _beside(target) as temporary:
         yield temporary
         for entry in (*temporary.rglob("*"), temporary):
             _flush(entry)
@@ -62,8 +77,18 @@ def atomic_folder(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]
             _exchange(temporary, target)
         else:
             temporary.rename(target)  # fails where another process has made the folder meanwhile
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def require_writable(path: str | Path) -> None:
+    """Write a little where `path` will be, and delete it: full and read-only disks are noticed before the work.
+
+    Raises OSError.
+    """
+    target = _target(path)
+    place = next(folder for folder in target.parents if folder.exists())
+    with _beside(place / target.name) as temporary:
+        temporary.write_bytes(bytes(TRIAL))
+        _flush(temporary)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -94,22 +119,65 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what killed processes left half written in a folder and those inside it, where no other one writes now."""
+    """Delete what killed processes left half written in a folder and those inside it."""
     for entry in list(folder.rglob(f".*{TEMPORARY}")):
-        if entry.is_dir():
-            shutil.rmtree(entry, ignore_errors=True)
-        else:
-            entry.unlink(missing_ok=True)
+        _remove_if_left(entry)
 
 
 def _target(path: str | Path) -> Path:
     """Where a rename has to end: a rename onto a symbolic link would replace the link, not what it points to."""
-    return Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise InvalidInput(f"cannot write {path}: it is a link that leads back to itself; choose another name.")
+    return target
 
 
-def _beside(target: Path, ending: str) -> Path:
-    # 40 characters of the name, so that the longest names that file systems allow do not become too long
-    return target.with_name(f".{target.name[:40]}.{secrets.token_hex(6)}{ending}")
+@contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    """A path of the same name in a hidden folder beside the target, which is there for as long as the context."""
+    from filelock import FileLock, Timeout  # 40 ms that only writing costs
+
+    name = target.name[:40]  # so that the longest names that file systems allow do not become too long
+    left = re.compile(rf"\.+{re.escape(name)}(\.[0-9a-f]{{12}}\{TEMPORARY})+")
+    with contextlib.suppress(OSError):  # a folder that may be written, but not listed
+        for entry in list(target.parent.iterdir()):
+            if left.fullmatch(entry.name):
+                _remove_if_left(entry)
+    while True:
+        hidden = target.with_name(f".{name}.{secrets.token_hex(6)}{TEMPORARY}")
+        hidden.mkdir()
+        lock = FileLock(hidden / LOCK)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:  # taken for a left-over by another process, before it was locked
+            continue
+        except BaseException:
+            shutil.rmtree(hidden, ignore_errors=True)
+            raise
+        break
+    try:
+        yield hidden / target.name
+    finally:
+        lock.release()
+        if target.exists() or not (hidden / OLD).exists():  # else the old folder is the only copy
+            shutil.rmtree(hidden, ignore_errors=True)
+
+
+def _remove_if_left(entry: Path) -> None:
+    """Delete a hidden folder, or the hidden file of an earlier version, unless the process that made it lives."""
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(entry / LOCK if entry.is_dir() else entry)
+    with contextlib.suppress(OSError, Timeout):  # being written, or not ours to delete
+        lock.acquire(blocking=False)
+        for old in (entry / OLD).glob("*"):  # killed between two renames
+            if not (entry.parent / old.name).exists():
+                old.rename(entry.parent / old.name)
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
+    lock.release()
 
 
 def _flush(path: Path) -> None:
@@ -129,16 +197,24 @@ def _flush(path: Path) -> None:
 
 
 def _exchange(new: Path, target: Path) -> None:
-    """Rename the new folder to `target`; the old one is renamed aside, and put back if that fails."""
-    aside = _beside(target, ".old")
+    """Put the new folder in the place of the old one, which lies in the hidden folder then and is deleted with it."""
+    if _swapped(new, target):
+        return
+    aside = new.parent / OLD / target.name
+    aside.parent.mkdir()
+    target.rename(aside)
     try:
-        target.rename(aside)
         new.rename(target)
     except BaseException:
-        if not target.exists():
-            aside.rename(target)
+        aside.rename(target)
         raise
-    finally:
-        if target.exists():  # else `aside` is the only copy
-            with contextlib.suppress(OSError):
-                shutil.rmtree(aside)
+
+
+def _swapped(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step, so that a kill leaves no moment without either, where the system can."""
+    if os.name == "nt":
+        return False
+    libc, names = ctypes.CDLL(None), (os.fsencode(one), os.fsencode(other))
+    if hasattr(libc, "renameat2"):  # Linux: relative to the current folder, RENAME_EXCHANGE
+        return libc.renameat2(-100, names[0], -100, names[1], 2) == 0
+    return hasattr(libc, "renamex_np") and libc.renamex_np(*names, 2) == 0  # macOS: RENAME_SWAP

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+Kind = TypeVar("Kind")
 
 
 class ForceGPError(Exception):
@@ -12,6 +15,10 @@ class ForceGPError(Exception):
 
 class InvalidInput(ForceGPError, ValueError):
     """An argument has a wrong shape, type or value."""
+
+
+class UnknownRow(InvalidInput, IndexError):
+    """A state that is not in a batch; also what ends a loop over one."""
 
 
 class RobotModelError(ForceGPError):
@@ -145,9 +152,25 @@ class ContactWarning(DataWarning):
     """The rows contradict the contacts that are stated: another point, no force, or a contact that is missing."""
 
 
-def unknown_name_message(kind: str, given: str, owner: str, valid: Iterable[str], *, cutoff: float = 0.6) -> str:
+def require_type(name: str, given: object, kind: type[Kind], example: str = "") -> Kind:
+    """The argument `name`, which is a `kind`; InvalidInput with an `example` for any other."""
+    if not isinstance(given, kind):
+        raise InvalidInput(f"{name} is a {type(given).__name__}; give a {kind.__name__}{example}")
+    return given
+
+
+def unknown_name_message(
+    kind: str,
+    given: str,
+    owner: str,
+    valid: Iterable[str],
+    *,
+    cutoff: float = 0.6,
+    synonyms: Mapping[str, str] | None = None,
+) -> str:
     """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Valid frames: ...`; `cutoff` as in difflib."""
     names = sorted(valid)
-    close = difflib.get_close_matches(given, names, n=1, cutoff=cutoff)
+    meant = (synonyms or {}).get(given.lower())
+    close = [meant] if meant in names else difflib.get_close_matches(given, names, n=1, cutoff=cutoff)
     hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"no {kind} {given!r} in {owner}{hint} Valid {kind}s: {', '.join(names) or '(none)'}"

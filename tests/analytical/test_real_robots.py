@@ -14,7 +14,7 @@ def test_published_numbers_of_a_pendulum_predict_its_motion(shared):
     folder = shared("realdata")
     system = multiarm_system(ViscousJointFriction([2.37142783e-4, 1.00000019e-5]))
     data = multiarm(folder, system)
-    _, residual = motion_residuals(system, data)
+    _, residual = motion_residuals(data, system)
     absolute = [x.cumsum(axis=1) for x in (residual, data.a)]
     nrmse = np.sqrt((absolute[0] ** 2).mean(0)) / absolute[1].std(0)
     np.testing.assert_allclose(nrmse, [0.0085, 0.0094], rtol=0.03)
@@ -26,8 +26,8 @@ def test_eleven_parameters_of_a_driven_pendulum_from_accelerations(shared):
     system = dfki_system(folder)
     train = dfki(folder, system, 143524, 143601, 143704, 144115)
     test = dfki(folder, system, 143339, 143747)
-    found = identify_analytical(system, train, rotors="rotor", likelihood="acceleration", rows=2000)
-    _, residual = motion_residuals(found.system, test)
+    found = identify_analytical(train, system, rotors="rotor", likelihood="acceleration", rows=2000)
+    _, residual = motion_residuals(test, found.system)
     nrmse = np.sqrt((residual**2).mean(0)) / test.a.std(0)
     assert (nrmse < [0.157, 0.112]).all()
 
@@ -38,12 +38,12 @@ def test_least_squares_of_a_manipulator_on_held_out_blocks(shared, inertias):
     folder = shared("realdata")
     system = panda_system(folder)
     train, test = panda(folder, system)
-    found = identify_analytical(system, train, friction=("viscous", "coulomb", "offset"), inertias=inertias)
+    found = identify_analytical(train, system, friction=("viscous", "coulomb", "offset"), inertias=inertias)
     assert found.base.rank == 43
     rms = np.array(found.scores(test)["force_rms"])
     assert (rms < [0.16, 0.25, 0.22, 0.22, 0.09, 0.06, 0.06]).all()
     if inertias == "consistent":  # a robot that can be written down predicts the same
-        force, _ = motion_residuals(found.system, test)
+        force, _ = motion_residuals(test, found.system)
         np.testing.assert_allclose(np.sqrt((force**2).mean(0)), rms, rtol=1e-9)
 
 
@@ -57,7 +57,7 @@ def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):
     train = dfki(folder, system, 143524, 143601, 143704, 144115)
     stuck = dfki(folder, system, 143906)
     found = identify_analytical(
-        system, train, friction=("viscous", "load"), rotors="rotor", likelihood="acceleration", rows=1000
+        train, system, friction=("viscous", "load"), rotors="rotor", likelihood="acceleration", rows=1000
     ).system
     offset, length = 0.1, 0.2
     sphere = Sphere((0.0, 0.0, 0.0), float(np.hypot(offset, length)))

@@ -79,7 +79,7 @@ def test_evaluate_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert "contact normal rest on the prior alone" in told
     names = {file.name for file in figures.iterdir()}
     pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png", "normal_force.png"}
-    assert names == pictures | {"evaluation.json", "config.json"}
+    assert names == pictures | {"evaluation.json", "config.json", "SHA256SUMS"}
     assert all((figures / name).read_bytes().startswith(PNG) for name in pictures)
     assert json.loads((figures / "evaluation.json").read_text())["rows"] == 480
     again = forcegp("evaluate", "run", "test.h5", "--plots", figures, folder=workshop)
@@ -124,7 +124,7 @@ def test_every_model_is_fitted_scored_and_shown_by_the_same_commands(workshop, f
     if model in DRAWN:
         pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png"}
         pictures |= set() if black_box else {"normal_force.png"}
-        assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json"}
+        assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json", "SHA256SUMS"}
     shown = forcegp("evaluate", run, "test.h5", "--every", 40, folder=workshop)
     assert shown.returncode == 0, shown.stderr
     assert summary["model"] in shown.stdout
@@ -172,7 +172,8 @@ def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path,
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo" / "notes.txt").write_text("mine")
     assert main(small) == 2
-    assert "--overwrite" in capfd.readouterr().err
+    assert "demo holds files that `forcegp demo` did not write (notes.txt)" in capfd.readouterr().err
+    assert (tmp_path / "demo" / "notes.txt").read_text() == "mine"
     (tmp_path / "demo" / "notes.txt").unlink()
     assert main([*small, "--seed", "5"]) == 0
     told = capfd.readouterr().out

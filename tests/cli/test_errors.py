@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import signal
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -47,12 +49,11 @@ WRONG = [
     ("fit damaged.h5 --out run", "damaged.h5 is damaged"),
     ("fit text.h5 --out run", "text.h5 is not an HDF5 file"),
     ("fit no_robot.h5 --out run", "does not carry its robot; add --robot"),
-    ("fit no_noise.h5 --out run", "does not state its noise; add --noise"),
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --robot missing.urdf --out run", "missing.urdf: no such file"),
-    ("fit arm.h5 --points 1 --out run", "points=1 is not between 2 and the 20 rows"),
+    ("fit arm.h5 --points 1 --out run", "--points 1 must be an integer from 2 to 20, the rows"),
     ("fit arm.h5 --seed -1 --out run", "--seed is -1; it must be at least 0"),
-    ("fit arm.h5 --restarts 0 --out run", "restarts=0"),
+    ("fit arm.h5 --restarts 0 --out run", "--restarts 0 must be"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
     ("fit arm.h5 --noise -0.1 --out run", "give a positive, finite standard deviation"),
     ("fit arm.h5 --contact plane --out run", "is not FRAME@x,y,z:SURFACE"),
@@ -64,7 +65,7 @@ WRONG = [
     ("fit arm.h5 --known-force wind --out run", "wind"),
     ("fit arm.h5 --out mine", "mine exists"),
     ("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"),
-    ("fit arm.h5 --out arm.h5 --overwrite", "was not written by `forcegp fit`"),
+    ("fit arm.h5 --out arm.h5 --overwrite", "arm.h5 would be written over arm.h5, which this command reads"),
     ("fit arm.h5", "--out"),
     ("fit arm.h5 --pionts 5 --out run", "--pionts, 5. Perhaps you meant: --points N."),
     ("fit arm.h5 --device cuda:999 --out run", "device 'cuda:999' cannot be used here; there is cpu"),
@@ -79,7 +80,6 @@ WRONG = [
     ("fit arm.h5 --model ensemble --noise loud --out run", "--noise is 'loud'"),
     ("fit arm.h5 --model ensemble --points 9 --out run", "needs 10 rows; there are 9"),
     ("fit arm.h5 --model ensemble --iterations 0 --out run", "steps=0 must be a whole number above 0"),
-    ("fit no_noise.h5 --model independent-gp --out run", "does not state its noise; add --noise"),
     ("fit arm.h5 --force-noise 0 --out run", "Noise force is 0.0; give a positive"),
     ("fit arm.h5 --model ensemble --force-noise 0.1 --out run", "--force-noise means nothing to --model ensemble"),
     (
@@ -96,7 +96,7 @@ WRONG = [
     ("simulate kuka-surface --out nowhere/a.h5", "folder nowhere does not exist"),
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
     ("simulate mars --out a.h5", "'mars'"),
-    ("demo --out mine --overwrite", "was not written by `forcegp demo`"),
+    ("demo --out mine", "was not written by `forcegp demo`"),
     ("learn arm.h5", "Available subcommands: demo, simulate, import, "),
     ("", "demo, simulate, import, "),
 ]
@@ -139,7 +139,7 @@ def test_a_run_of_another_robot_is_refused(folder, capfd):
     dataclasses.replace(Dataset.load("no_robot.h5"), joint_names=names).save("other.h5")
     capfd.readouterr()
     assert main(["evaluate", "run", "other.h5"]) == 2
-    assert "joints pan, lift, wrist; the model was trained on pan, lift, bend" in capfd.readouterr().err
+    assert "dataset are pan, lift, wrist, those of the model pan, lift, bend" in capfd.readouterr().err
 
 
 def test_robot_and_contact_replace_those_of_the_dataset(folder):
@@ -222,8 +222,10 @@ def test_known_forces_replace_those_of_the_dataset(folder):
 
 
 @pytest.mark.parametrize(
-    ("noise", "learned", "file"), [("learned", True, "no_noise.h5"), ("0.2", False, "no_noise.h5")]
+    ("noise", "learned", "file"),
+    [("learned", True, "no_noise.h5"), ("0.2", False, "no_noise.h5"), ("dataset", True, "no_noise.h5")],
 )
+@pytest.mark.filterwarnings("ignore:the dataset does not state the noise")
 def test_noise_is_learned_or_given(folder, noise, learned, file):
     assert main(["fit", file, *QUICK, "--noise", noise, "--out", "run"]) == 0
     posterior = load_posterior("run")
@@ -265,3 +267,13 @@ def test_a_box_becomes_a_sentence():
 │         Train on so many rows.         │
 ╰────────────────────────────────────────╯"""
     assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."
+
+
+def test_a_limit_of_the_address_space_is_refused_before_libraries_wait_in_it(folder):
+    limits = 'ulimit -v 800000; ulimit -t 60; exec "$0" "$@"'
+    command = ["bash", "-c", limits, sys.executable, "-m", "forcegp.cli", "fit", "arm.h5", "--out", "run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("forcegp: the address space is limited to 781 MiB (ulimit -v), and ")
+    assert done.stderr.endswith("MiB more are needed to begin with; raise the limit.\n")
+    assert done.stderr.count("\n") == 1

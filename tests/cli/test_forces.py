@@ -55,7 +55,7 @@ def test_every_force_that_the_truth_knows_is_scored_and_drawn(arm, forcegp, tmp_
     assert scores["normal_force_rests_on_prior"] is False
     assert scores["system"] == "model"
     pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png", "forces.png", "normal_force.png"}
-    assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json"}
+    assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json", "SHA256SUMS"}
     assert all((figures / name).read_bytes().startswith(PNG) for name in pictures)
 
 
@@ -77,7 +77,7 @@ def test_the_table_tells_errors_of_forces_and_what_the_normal_force_rests_on(arm
 def test_another_robot_and_contact_are_named_with_the_remedy_and_the_remedy_helps(arm, forcegp):
     default = forcegp("evaluate", "run", "other.h5", "--json", folder=arm)
     assert default.returncode == 0, default.stderr
-    (warning,) = json.loads(default.stdout)["warnings"]
+    (warning,) = [each for each in json.loads(default.stdout)["warnings"] if "not those of the data" in each]
     assert warning.startswith("the contacts and robot of the model are not those of the data")
     assert "--system data" in warning
     assert [line for line in default.stderr.splitlines() if "--system data" in line] == [f"warning: {warning}"]
@@ -85,7 +85,8 @@ def test_another_robot_and_contact_are_named_with_the_remedy_and_the_remedy_help
     there = forcegp("evaluate", "run", "other.h5", "--system", "data", "--json", folder=arm)
     assert there.returncode == 0, there.stderr
     scores, before = json.loads(there.stdout), json.loads(default.stdout)
-    assert (scores["system"], scores["warnings"]) == ("data", [])
+    assert scores["system"] == "data"
+    assert not any("not those of the data" in each for each in scores["warnings"])
     assert scores["mae_noise_free"] < 0.2 * before["mae_noise_free"]
     assert scores["constraint_error"] < 1e-9 < before["constraint_error"]
     data = Dataset.load(arm / "other.h5")
@@ -134,7 +135,8 @@ def test_a_robot_that_was_identified_stays_and_takes_the_contacts_of_the_data(ar
     done = forcegp(*words, folder=arm)
     assert done.returncode == 0, done.stderr
     same = forcegp("evaluate", tmp_path / "found", "test.h5", "--json", folder=arm)
-    assert json.loads(same.stdout)["warnings"] == []  # another mass is what was asked for
+    # another mass is what was asked for
+    assert not any("of the data" in each for each in json.loads(same.stdout)["warnings"])
     moved = forcegp("evaluate", tmp_path / "found", "other.h5", "--system", "data", "--json", folder=arm)
     assert moved.returncode == 0, moved.stderr
     assert "the robot stays the identified one" in moved.stderr

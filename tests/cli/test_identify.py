@@ -100,7 +100,7 @@ WRONG = [
     ("--learn hand:mass --model analytical --mean zero", "leave --mean zero out"),
     ("--learn hand:mass --prior-strength -1", "prior_strength is -1.0"),
     ("--learn hand:mass --noise loud", "--noise is 'loud'"),
-    ("--learn hand:mass --points 1", "points=1 is not between"),
+    ("--learn hand:mass --points 1", "--points 1 must be"),
     ("--learn hand:mass --learning-points 1", "learning_points is 1"),
     ("", "nothing to estimate; add --learn"),
 ]

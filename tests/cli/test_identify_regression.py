@@ -42,7 +42,7 @@ def test_a_consistent_robot_and_a_fit_that_begins_with_it(forcegp, folder):
     assert kept["parameters"]["coulomb.pan"]["identified"] == pytest.approx(0.8, abs=0.2)
     test = Dataset.load(folder / "test.h5")
     system = MechanicalSystem.from_json((folder / "found" / "system.json").read_text())
-    force, _ = motion_residuals(system, test)
+    force, _ = motion_residuals(test, system)
     np.testing.assert_allclose(np.sqrt((force**2).mean(0)), kept["test"]["after"]["force_rms"], rtol=1e-9)
     assert any(isinstance(known, ConstantJointForce) for known in system.known_forces)
     robot = Robot.from_urdf(folder / "found" / "identified.urdf")

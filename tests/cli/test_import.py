@@ -69,6 +69,12 @@ def test_an_existing_file_is_kept_unless_told_otherwise(forcegp, tmp_path):
     assert refused.returncode == 2
     assert "add --overwrite" in refused.stderr
     assert (tmp_path / "log.h5").read_text() == "years of work"
+    refused = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=tmp_path)
+    assert refused.returncode == 2
+    assert "log.h5 is not a dataset of forcegp, so it is not overwritten" in refused.stderr
+    assert (tmp_path / "log.h5").read_text() == "years of work"
+    (tmp_path / "log.h5").write_text("")
+    assert forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=tmp_path).returncode == 0
     done = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(Dataset.load(tmp_path / "log.h5")) == 200

@@ -28,7 +28,7 @@ def test_rollouts_are_compared_with_the_recording_and_written(workshop, forcegp,
     assert (summary["rows"], summary["steps"], summary["samples"]) == ([0, 100, 200], 60, 3)
     assert summary["baumgarte"] == {"omega": 10.0, "zeta": 1.0}
     assert (out / "rollout.png").read_bytes().startswith(PNG)
-    files = {"rollout.json", "rollout.h5", "rollout.png", "config.json"}
+    files = {"rollout.json", "rollout.h5", "rollout.png", "config.json", "SHA256SUMS"}
     assert {file.name for file in out.iterdir()} == files
     assert sorted(json.loads((out / "config.json").read_text())["files"]) == sorted(files)
 
@@ -99,7 +99,7 @@ WRONG = [
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte strong", "--baumgarte is 'strong'; give none, OMEGA"),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte 1,2,3", "--baumgarte is '1,2,3'"),
     ("rollout run arm.h5 --starts 1 --seconds 0.05 --baumgarte -1", "Baumgarte omega is -1.0"),
-    ("rollout run arm.h5 --starts 1 --seconds 0.05 --samples -1", "samples is -1"),
+    ("rollout run arm.h5 --starts 1 --seconds 0.05 --samples -1", "--samples=-1 must be an integer of at least 0"),
     ("rollout missing arm.h5", "missing does not exist"),
     ("rollout run missing.h5", "missing.h5 is not a file"),
 ]

@@ -128,7 +128,7 @@ WRONG = [
     (f"validate log.h5 {OUT} --cutoff 80", "cutoff is 80.0 Hz"),
     (f"validate log.h5 {OUT} --measured-torque", "needs a noise of the forces"),
     (f"validate log.h5 {OUT} --backend ray", "does not share files"),
-    ("validate log.h5 --out log.h5", "was not written by `forcegp validate`"),
+    ("validate log.h5 --out log.h5", "log.h5 would be written over log.h5"),
 ]
 
 

@@ -1,28 +1,40 @@
 """What all machine code shares: compilers, and tensors that carry no derivatives which the code would lose."""
 
 import ctypes
+import tempfile
 
 import pytest
 import torch
 from torch.autograd import forward_ad
 
+from forcegp.codegen.cpp_library import cpp_library
 from forcegp.codegen.native_code import CPP, C, compile_library, require_plain
 from forcegp.errors import CompilerError, InvalidInput
 
 SOURCES = {C: "double twice(double x) { return x + x; }"}
 SOURCES[CPP] = f'extern "C" {SOURCES[C]}'
+TEXTS = {"purpose": "a test", "elsewhere": "MOVE", "instead": "give up"}
+
+
+@pytest.fixture
+def broken_linker(tmp_path) -> str:
+    """A command that takes everything, ends well, and writes what no system can load."""
+    path = tmp_path / "broken"
+    path.write_text('#!/bin/sh\nwhile [ "$1" != -o ]; do shift; done\necho "no library" > "$2"\n')
+    path.chmod(0o700)
+    return str(path)
 
 
 @pytest.mark.parametrize("language", [C, CPP], ids=["C", "C++"])
 def test_a_text_becomes_a_library(language, tmp_path):
     path = tmp_path / "code.so"
     options = ("-fPIC", "-shared")
-    compile_library(language, SOURCES[language], options, path, purpose="a test", instead="give up")
-    twice = ctypes.CDLL(str(path)).twice
+    loaded = compile_library(language, SOURCES[language], options, path, "twice", **TEXTS)
+    twice = loaded.twice
     twice.restype, twice.argtypes = ctypes.c_double, [ctypes.c_double]
     assert twice(1.25) == 2.5
     with pytest.raises(CompilerError, match=rf"the {language.name.replace('+', '.')} compiler failed: .*or give up"):
-        compile_library(language, "no program", options, path, purpose="a test", instead="give up")
+        compile_library(language, "no program", options, path, "twice", **TEXTS)
 
 
 @pytest.mark.parametrize("language", [C, CPP], ids=["C", "C++"])
@@ -30,10 +42,46 @@ def test_without_a_compiler_the_error_names_those_looked_for(language, tmp_path,
     monkeypatch.delenv(language.variable, raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CompilerError) as raised:
-        compile_library(language, SOURCES[language], (), tmp_path / "x.so", purpose="a test", instead="give up")
+        compile_library(language, SOURCES[language], (), tmp_path / "x.so", "twice", **TEXTS)
     for text in (*language.commands, language.packages, language.variable, "a test needs", "or give up"):
         assert text in str(raised.value)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("language", [C, CPP], ids=["C", "C++"])
+def test_a_broken_linker_is_an_error_with_a_remedy(language, tmp_path, monkeypatch, broken_linker):
+    monkeypatch.setenv(language.variable, broken_linker)
+    with pytest.raises(CompilerError, match=rf"cannot be loaded .*MOVE.* by .*{language.variable}, or give up"):
+        compile_library(language, SOURCES[language], (), tmp_path / "x.so", "twice", **TEXTS)
+
+
+def test_a_library_without_the_function_is_refused(tmp_path):
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*thrice"):
+        compile_library(C, SOURCES[C], ("-fPIC", "-shared"), tmp_path / "x.so", "thrice", **TEXTS)
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ('gcc "', r"CC is 'gcc \"', which is no command \(No closing quotation\); correct it"),
+        ("{}/text", "compiler failed"),
+    ],
+)
+def test_a_command_that_is_none_is_an_error_with_a_remedy(tmp_path, monkeypatch, command, message):
+    (tmp_path / "text").write_bytes(b"\x00 no program")
+    (tmp_path / "text").chmod(0o700)
+    monkeypatch.setenv("CC", command.format(tmp_path))
+    with pytest.raises(CompilerError, match=message):
+        compile_library(C, SOURCES[C], (), tmp_path / "x.so", "twice", **TEXTS)
+
+
+def test_a_predictor_needs_a_folder_for_temporary_files(tmp_path, monkeypatch, broken_linker):
+    monkeypatch.setenv("CXX", broken_linker)
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*TMPDIR.*compile=False"):
+        cpp_library("// never compiled before", "sums")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    with pytest.raises(CompilerError, match=r"needs a folder for temporary files .*TMPDIR.*compile=False"):
+        cpp_library("// never compiled before", "sums")
 
 
 def test_only_tensors_with_hidden_derivatives_are_refused():

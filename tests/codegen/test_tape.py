@@ -150,10 +150,10 @@ def test_compiled_sums_are_those_of_torch(latents: int, count: int):
 def test_no_compiler_is_an_error_with_a_remedy(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(CompilerError, match=r"no-such-compiler.*CXX.*compile=False"):
-        cpp_library("// nothing that was compiled before")
+        cpp_library("// nothing that was compiled before", "values")
     monkeypatch.setenv("CXX", "false")
     with pytest.raises(CompilerError, match="compiler failed"):
-        cpp_library("// nor this")
+        cpp_library("// nor this", "values")
 
 
 def test_programs_are_small_arrays():

@@ -90,7 +90,7 @@ def test_length_names_and_a_short_text():
     assert data.nv == 2
     assert data.episodes == (0, 1)
     assert dataset(episode=None).episodes == (0,)
-    assert "40 rows" in repr(data)
+    assert "rows: 40" in repr(data)
     assert len(repr(data)) < 200
 
 

@@ -164,7 +164,7 @@ def test_what_a_delay_needs_is_said():
         estimate_delay(replace(arm_log(), system=arm_system()))
     with pytest.raises(DatasetError, match=r"rows lie more than 0.05 s from the ends.*at least 80"):
         estimate_delay(arm_log().rows(slice(0, 60)))
-    with pytest.raises(InvalidInput, match="has joints pan, lift, bend; the dataset has one, two"):
+    with pytest.raises(InvalidInput, match="the joints of dataset are one, two, those of arm pan, lift, bend"):
         estimate_delay(noisy()[0], arm_system().robot)
 
 

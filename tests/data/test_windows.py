@@ -137,7 +137,7 @@ def test_one_node_for_every_row_keeps_the_rows():
         (lambda: WeakForm(nodes=2.0), "nodes is 2.0"),
         (lambda: WeakForm(signal="a"), "signal is 'a'; allowed: 'q'"),
         (lambda: WeakForm(0.01).windows(sine(0.002 * np.arange(100))), "has 6 rows at steps of 0.002 s; at least 8"),
-        (lambda: WeakForm(0.02).windows(sine(0.002 * np.arange(100)), 99), "points=99 is not between 2 and the 9"),
+        (lambda: WeakForm(0.02).windows(sine(0.002 * np.arange(100)), 99), "points=99` must be an integer from 2 to 9"),
         (lambda: WeakForm(0.1, nodes=60).windows(sine(0.002 * np.arange(100))), "60 nodes for windows of 51 rows"),
     ],
 )

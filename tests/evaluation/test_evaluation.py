@@ -18,6 +18,11 @@ from forcegp.models import load_posterior, save_posterior
 ASKED_FOR = ("mae", "mae_noise_free", "rmse", "nlpd", "coverage_95", "constraint_error")
 
 
+def about(warnings, *topics) -> list[str]:
+    """The warnings that speak of one of the topics."""
+    return [warning for warning in warnings if any(topic in warning for topic in topics)]
+
+
 @pytest.fixture(scope="module")
 def evaluation(posterior, test_data) -> Evaluation:
     return evaluate(posterior, test_data)
@@ -53,7 +58,7 @@ def test_the_dictionary_holds_every_mean_beside_what_it_is_the_mean_of(evaluatio
     assert scores["constraint_error"] == pytest.approx(scores["constraint_error_per_contact"][0])
     assert scores["rows"] == 60
     assert scores["noise_floor"] == pytest.approx(NOISE * np.sqrt(2 / np.pi))
-    assert scores["warnings"] == []
+    assert about(scores["warnings"], "training rows", "noise std", "system") == []
 
 
 def test_learning_helps_and_the_constraint_holds(evaluation):
@@ -81,11 +86,13 @@ def test_a_larger_noise_of_the_data_counts_and_another_one_of_the_model_is_named
     prediction = posterior.predict(test_data.q[7], test_data.v[7], test_data.u[7])
     joint = multivariate_normal(prediction.mean.numpy(), prediction.covariance.numpy() + np.diag(std**2))
     assert predicted.negative_log_density[7] == pytest.approx(-joint.logpdf(test_data.a[7]), rel=1e-8)
-    (warning,) = evaluate(posterior, noisier).warnings
+    (warning,) = about(evaluate(posterior, noisier).warnings, "noise std")
     assert "the noise std of the model is 0.05, that of the data 0.15 (joint bend" in warning
     for factor in (0.7, 1.4):
-        assert evaluate(posterior, dataclasses.replace(test_data, noise_std=np.full(3, factor * NOISE))).warnings == ()
-    assert len(evaluate(posterior, dataclasses.replace(test_data, noise_std=np.full(3, 0.6 * NOISE))).warnings) == 1
+        other = dataclasses.replace(test_data, noise_std=np.full(3, factor * NOISE))
+        assert about(evaluate(posterior, other).warnings, "noise std") == []
+    other = dataclasses.replace(test_data, noise_std=np.full(3, 0.6 * NOISE))
+    assert len(about(evaluate(posterior, other).warnings, "noise std")) == 1
 
 
 def test_a_larger_noise_of_the_model_counts(posterior, test_data):
@@ -153,17 +160,19 @@ def test_training_rows_among_the_test_rows_are_counted(posterior, train, test_da
     mixed = dataclasses.replace(
         test_data, **{name: np.vstack([getattr(test_data, name)[:-2], getattr(train, name)[:2]]) for name in "qvua"}
     )
-    (warning,) = evaluate(posterior, mixed).warnings
+    (warning,) = about(evaluate(posterior, mixed).warnings, "training rows")
     assert "2 of 60 test rows have the very (q, v, u) of training rows (the first: row 58)" in warning
 
 
 def test_other_rows_of_the_training_recording_are_noticed(posterior, train, test_data):
     recorded = posterior.with_settings(data={"metadata": {"log": "monday"}, "episodes": [0]})
     same = dataclasses.replace(test_data, metadata={"log": "monday"})
-    (warning,) = evaluate(recorded, same).warnings
+    (warning,) = about(evaluate(recorded, same).warnings, "same recording")
     assert "same recording" in warning
-    assert evaluate(recorded, dataclasses.replace(test_data, metadata={"log": "tuesday"})).warnings == ()
-    assert evaluate(recorded, dataclasses.replace(same, episode=np.ones(60, int))).warnings == ()
+    tuesday = dataclasses.replace(test_data, metadata={"log": "tuesday"})
+    assert about(evaluate(recorded, tuesday).warnings, "same recording") == []
+    elsewhere = dataclasses.replace(same, episode=np.ones(60, int))
+    assert about(evaluate(recorded, elsewhere).warnings, "same recording") == []
 
 
 def test_data_of_another_robot_are_refused(posterior):

@@ -123,7 +123,7 @@ def test_data_of_other_joints_are_refused(friction, data):
         q=data.q[:, :2], v=data.v[:, :2], u=data.u[:, :2], a=data.a[:, :2], time=data.time,
         joint_names=("a", "b"), units=data.units,
     )  # fmt: skip
-    with pytest.raises(InvalidInput, match="joints a, b"):
+    with pytest.raises(InvalidInput, match="joints of dataset are a, b"):
         force_scores(friction, other)
 
 

@@ -100,7 +100,7 @@ def test_many_rows_are_conditioned_on_exactly_with_parameters_from_some(train, m
 
 def test_more_rows_than_memory_holds_are_refused_before_the_first_fit(train, monkeypatch):
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
-    with pytest.raises(NotEnoughMemory, match=r"N=40 rows .*fewer points"):
+    with pytest.raises(NotEnoughMemory, match=r"N=40 rows .*fewer `points`"):
         compare_priors(train, PRIORS, points=40, **QUICK)
 
 
@@ -208,7 +208,7 @@ def test_of_equally_many_functions_that_with_the_fewest_parameters():
 
 WRONG = [
     ({"priors": {"friction": JointFriction()}}, "nothing to compare friction; give two priors or more"),
-    ({"points": 81}, "points=81 is not between 2 and the 80 rows"),
+    ({"points": 81}, "points=81` must be an integer from 2 to 80, the rows"),
     ({"block_seconds": 100.0}, "fall into 1 stretches of 100 s, too few"),
     ({"block_seconds": 0.0}, "must be positive and finite"),
     ({"noise": Noise((0.1, 0.2))}, "prior 'anything': Noise has 2 values for 3 joints"),
@@ -229,7 +229,7 @@ def test_data_that_do_not_fit_are_refused_before_anything_is_fitted(train):
     with pytest.raises(InvalidInput, match="does not carry its robot"):
         compare_priors(dataclasses.replace(train, system=None), PRIORS, **how)
     other = dataclasses.replace(train, system=None, joint_names=("a", "b", "c"))
-    with pytest.raises(InvalidInput, match="the test data have joints a, b, c"):
+    with pytest.raises(InvalidInput, match="the joints of test are a, b, c"):
         compare_priors(train, PRIORS, test=other, **how)
     still = dataclasses.replace(train, v=np.zeros_like(train.v), truth={})
     with pytest.raises(InvalidInput, match="prior 'friction': latent"):

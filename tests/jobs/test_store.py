@@ -58,9 +58,9 @@ def test_a_half_written_job_is_named_and_kept(results, content):
 
 
 def test_another_configuration_and_a_later_format_are_refused(results):
-    with pytest.raises(InvalidInput, match=r"another preset \('smoke', not 'paper'\); choose another --out\.$"):
+    with pytest.raises(InvalidInput, match=r"another preset \('smoke', not 'paper'\); choose another `folder`\.$"):
         JobStore.open(results.folder, KIND, {"preset": "paper"})
-    with pytest.raises(InvalidInput, match=r"another preset .*choose another --out, or add --overwrite"):
+    with pytest.raises(InvalidInput, match=r"another preset .*choose another `folder`, or add `overwrite=True`"):
         JobStore.open(results.folder, KIND, {"preset": "paper"}, overwrite=False)
     with pytest.raises(InvalidInput, match=r"results with another points, preset \("):
         JobStore.open(results.folder, KIND, {"preset": "paper", "points": list(range(100))})

@@ -159,9 +159,9 @@ class ModelConformance:
 
     def test_wrong_data_and_numbers_are_refused(self, fitted, data, test):
         model = self.make(data.system)
-        with pytest.raises(InvalidInput, match="joints shoulder, elbow; the robot has pan, lift, bend"):
+        with pytest.raises(InvalidInput, match="dataset are shoulder, elbow, those of the robot pan, lift, bend"):
             model.fit(samples.dataset())
-        with pytest.raises(InvalidInput, match="points=61 is not between"):
+        with pytest.raises(InvalidInput, match="points=61` must be an integer from 2 to 60"):
             model.fit(data, points=61)
         with pytest.raises(InvalidInput, match="seed=-1"):
             model.fit(data, seed=-1)

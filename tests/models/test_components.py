@@ -46,7 +46,7 @@ class Dense:
     """All processes of PRIOR given the training data, from one joint covariance, written plainly."""
 
     def __init__(self, posterior, train):
-        self.kernels = list(posterior.latent.kernels)
+        self.kernels, self.widening = list(posterior.latent.kernels), posterior.widening
         dynamics = train.system.dynamics(*(torch.tensor(x) for x in (train.q, train.v, train.u)))
         self.scales = [z.square().mean(0).sqrt() for z in PRIOR.features(dynamics)]  # velocities keep their zero
         self.z, self.W = self.scaled(dynamics), dynamics.H @ PRIOR.mixing(dynamics)
@@ -75,7 +75,8 @@ class Dense:
             own.append(self.k(kernel, z[c], z[c]).diagonal())
         cross = torch.stack(cross, dim=1)
         mean = cross @ torch.linalg.solve(self.S, self.residual)
-        return mean, torch.diag_embed(torch.stack(own, -1)) - cross @ torch.linalg.solve(self.S, cross.mT)
+        covariance = torch.diag_embed(torch.stack(own, -1)) - cross @ torch.linalg.solve(self.S, cross.mT)
+        return mean, self.widening**2 * covariance
 
 
 @pytest.fixture(scope="module")

@@ -324,3 +324,9 @@ def test_estimates_at_the_limit_of_what_is_allowed_count_as_unknown():
     assert not at_limit.at_optimum
     assert "has not ended at a minimum" in at_limit.verdict
     assert at_limit.to_dict()["decrement"] is None
+
+
+def test_coefficients_can_be_learned_without_any_inertia():
+    model = StructuredGP(damped(damping=(0.1, 0.1, 0.1)))
+    found = model.identify(arm_data(20, 0), LEARN[1], restarts=1, options=OptimizerOptions(iterations=3))
+    assert set(found.identification.values) == {f"viscous-joint-friction.{name}" for name in ("pan", "lift", "bend")}

@@ -69,7 +69,9 @@ def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
     z = posterior.likelihood.standardization(prior.features(on_a_table.system.dynamics(*states)))[2]
     prior_variance = list(posterior.latent.kernels)[2](z, diag=True)
     torch.testing.assert_close(force.mean[:, 2], torch.zeros(12).double(), rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(force.variance[:, 2], prior_variance.detach(), rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(
+        force.variance[:, 2], posterior.widening**2 * prior_variance.detach(), rtol=1e-6, atol=0.0
+    )
 
 
 def test_along_the_surface_nothing_is_hidden(on_a_table):
@@ -188,7 +190,7 @@ def test_a_prior_that_does_not_fit_the_system_is_refused_before_any_data(data, p
     "prior", [ToolForces(), ContactFriction(), ToolForces("hand", axes="world", inputs=("load",))], ids=["a", "b", "c"]
 )
 def test_forces_of_a_contact_need_one(prior):
-    with pytest.raises(InvalidInput, match=r"no contact.*--contact"):
+    with pytest.raises(InvalidInput, match=r"no contact.*`contacts`"):
         StructuredGP(arm_system(contacts=0), prior)
     StructuredGP(arm_system(contacts=0), ToolForces("hand", axes="world"))
 
@@ -266,7 +268,7 @@ def test_known_forces_that_no_latent_can_carry_are_pointed_out(data, prior):
         fit(data, prior, mean="zero")
     assert len(caught) == 1
     assert f"but {np.sqrt(left / size):.0%} of the acceleration that they cause" in str(caught[0].message)
-    assert "take mean='analytical' (--mean analytical), or add a force on every joint" in str(caught[0].message)
+    assert "take `mean='analytical'`, or add a force on every joint" in str(caught[0].message)
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,13 @@
 
 import json
 import os
+import random
+import re
+import shutil
 import stat
 import subprocess
 import sys
+from typing import get_type_hints
 
 import pytest
 import torch
@@ -12,13 +16,15 @@ from safetensors.torch import load_file, save_file
 from tests.models.arm import URDF, arm_data, arm_system
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.file_digests import SUMS, write_digests
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
-from forcegp.models import IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
+from forcegp.models import IndependentGP, Noise, Posterior, StructuredGP, load_posterior, save_posterior
 from forcegp.models.storage import FORMAT_VERSION
+from forcegp.models.structured.components import Components, Curve
 from forcegp.robots import Robot
 
-FILES = {"model.json", "tensors.safetensors", "robot.urdf"}
+FILES = {"model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS"}
 OPTIONS = OptimizerOptions(iterations=3)
 
 
@@ -82,6 +88,64 @@ def test_nothing_is_overwritten_unasked_and_only_models_ever(posterior, run, tmp
     assert (other / "chapter.txt").read_text() == "mine"
 
 
+def test_files_that_a_user_put_there_are_never_deleted(posterior, run):
+    (run / "notes").mkdir()
+    (run / "notes" / "monday.txt").write_text("mine")
+    (run / "elsewhere").symlink_to("/nowhere")
+    with pytest.raises(FileFormatError, match=r"did not write there \(elsewhere, notes/monday\.txt\)"):
+        save_posterior(posterior, run, overwrite=True)
+    assert (run / "notes" / "monday.txt").read_text() == "mine"
+    (run / "notes" / "monday.txt").unlink()
+    (run / "elsewhere").unlink()
+    (run / SUMS).unlink()  # a folder of an earlier version
+    save_posterior(posterior, run, overwrite=True)
+    assert {path.name for path in run.iterdir()} == FILES
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_a_flipped_bit_in_any_file_is_noticed(run, name):
+    content = (run / name).read_bytes()
+    generator = random.Random(name)
+    for _ in range(40):
+        place, bit = generator.randrange(len(content)), 1 << generator.randrange(8)
+        (run / name).write_bytes(content[:place] + bytes([content[place] ^ bit]) + content[place + 1 :])
+        with pytest.raises(FileFormatError):
+            load_posterior(run)
+    (run / name).write_bytes(content)
+    load_posterior(run)
+
+
+def test_a_flipped_bit_does_not_make_a_model_one_of_before_digests(run):
+    document = (run / "model.json").read_text()
+    for version in range(1, 7):
+        stored = document.replace(f'"format_version": {FORMAT_VERSION}', f'"format_version": {version}')
+        assert stored != document
+        (run / "model.json").write_text(stored)
+        with pytest.raises(FileFormatError, match=r"model\.json is not as it was written"):
+            load_posterior(run)
+
+
+def test_digests_belong_to_the_format(run):
+    (run / SUMS).unlink()
+    with pytest.raises(FileFormatError, match="it has no SHA256SUMS; fit the model again"):
+        load_posterior(run)
+
+
+@pytest.mark.parametrize(
+    "line", ["", "0" * 64 + "  ../run/model.json\n", "0" * 64 + "  /dev/zero\n", "0" * 64 + "  pipe\n", "\udcff"]
+)
+def test_digests_that_lead_elsewhere_are_refused_without_reading(run, line):
+    os.mkfifo(run / "pipe")
+    (run / SUMS).write_bytes(line.encode("utf-8", "surrogateescape"))
+    with pytest.raises(FileFormatError, match=r"SHA256SUMS"):
+        load_posterior(run)
+
+
+@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="no sha256sum here")
+def test_the_digests_are_those_of_sha256sum(run):
+    subprocess.run(["sha256sum", "--check", "--strict", SUMS], cwd=run, check=True, capture_output=True)
+
+
 def test_an_interrupted_save_leaves_nothing(posterior, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
@@ -95,15 +159,12 @@ def test_an_interrupted_save_leaves_nothing(posterior, tmp_path, monkeypatch):
 @pytest.mark.parametrize("what", ["write", "rename"])
 def test_the_old_model_can_be_loaded_after_an_overwrite_that_failed(posterior, carried, run, monkeypatch, what):
     before = {file.name: file.read_bytes() for file in run.iterdir()}
-    rename = os.rename
 
-    def fail(data, *to):
-        if not to or str(to[0]) == str(run):
-            monkeypatch.undo()
-            raise OSError("disk full")
-        rename(data, *to)
+    def fail(*_):
+        monkeypatch.undo()
+        raise OSError("disk full")
 
-    monkeypatch.setattr(*(("forcegp.models.storage.save", fail) if what == "write" else (os, "rename", fail)))
+    monkeypatch.setattr({"write": "forcegp.models.storage.save", "rename": "forcegp.atomic_files._swapped"}[what], fail)
     with pytest.raises(OSError, match="disk full"):
         save_posterior(carried, run, overwrite=True)
     assert {file.name: file.read_bytes() for file in run.iterdir()} == before
@@ -142,12 +203,16 @@ def test_a_missing_or_damaged_file_is_named(run, name):
         ({"urdf_sha256": "0"}, "hash differs"),
         ({"units": {"q": "deg"}}, "units that are not those"),
         ({"settings": 5}, "incomplete or damaged"),
+        ({"settings": {"data": 5}}, "of another type"),
+        ({"joint_names": 5}, "incomplete or damaged"),
+        ({"joint_names": [1, 2, 3]}, "of another type"),
         ({"result": {"value": "abc"}}, "incomplete or damaged"),
     ],
 )
 def test_a_changed_document_is_refused(run, change, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | change))
+    write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)
 
@@ -186,6 +251,7 @@ def test_a_urdf_with_other_line_ends_comes_back(data, tmp_path):
 def test_tensors_of_another_type_shape_or_value_are_refused(run, name, damage):
     tensors = load_file(run / "tensors.safetensors")
     save_file(tensors | {name: damage(tensors[name]).contiguous()}, run / "tensors.safetensors")
+    write_digests(run)
     with pytest.raises(FileFormatError, match="tensors"):
         load_posterior(run)
 
@@ -241,6 +307,7 @@ def test_what_a_model_holds_is_declared_by_name(carried, run, tmp_path):
 def test_features_that_are_unknown_or_not_there_are_refused(posterior, run, features, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | {"features": features}))
+    write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)
 
@@ -249,6 +316,7 @@ def test_a_feature_that_is_there_must_be_declared(carried, tmp_path):
     save_posterior(carried, tmp_path / "run")
     file = tmp_path / "run" / "model.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"features": []}))
+    write_digests(file.parent)
     with pytest.raises(FileFormatError, match="declares no features and holds 'target'"):
         load_posterior(tmp_path / "run")
 
@@ -265,6 +333,7 @@ def test_a_damaged_target_is_named(carried, tmp_path, damage):
         document = json.loads(model.read_text())
         del document["target"]
         model.write_text(json.dumps(document))
+        write_digests(model.parent)
     with pytest.raises(FileFormatError, match=r"target\.urdf|'target'"):
         load_posterior(tmp_path / "run")
 
@@ -284,3 +353,26 @@ def test_a_model_of_accelerations_cannot_move(data):
     fitted = IndependentGP(data.system).fit(data, points=8)
     with pytest.raises(InvalidInput, match="cannot move to another"):
         fitted.with_system(data.system.with_contacts(()))
+
+
+def test_editors_see_what_a_loaded_model_offers():
+    loaded = get_type_hints(load_posterior)["return"]
+    offered = {"components": Components, "curve": Curve, "with_contacts": Posterior, "with_robot": Posterior}
+    for name, kind in offered.items():
+        assert get_type_hints(getattr(loaded, name))["return"] is kind
+
+
+@pytest.mark.nightly
+def test_pyright_sees_what_a_loaded_model_offers(tmp_path, repository):
+    code = """from forcegp import load_posterior
+state = [0.0], [0.0], [0.0]
+reveal_type(load_posterior("run").components(*state)["joint-friction"].joint_force.std)
+reveal_type(load_posterior("run").curve("pan").mean)
+reveal_type(load_posterior("run").predict(*state)[0].unknown_force)
+"""
+    (tmp_path / "use.py").write_text(code)
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, tmp_path / "use.py"]
+    environment = {**os.environ, "PYTHONPATH": str(repository / "src")}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    found = re.findall(r'Type of ".*" is "(.*)"', done.stdout)
+    assert found == ["Tensor", "Tensor", "Gaussian | None"], done.stdout

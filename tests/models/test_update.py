@@ -33,7 +33,8 @@ def at_once(posterior, data):
     first = posterior.training
     whole = type(first).of(data, torch.device("cpu"))
     whole = dataclasses.replace(whole, reference=first)
-    return posterior.model.condition(whole, posterior.parameters, posterior.result, {})
+    settings = {"widening": posterior.widening}
+    return posterior.model.condition(whole, posterior.parameters, posterior.result, settings)
 
 
 def assert_same(one, other, data, tolerance=1e-8):
@@ -247,14 +248,14 @@ def posterior():
 
 @pytest.mark.parametrize("budget", [1, 0, -3, True])
 def test_budgets_that_mean_nothing_are_refused(posterior, budget):
-    with pytest.raises(InvalidInput, match="2 or more"):
+    with pytest.raises(InvalidInput, match="must be an integer of at least 2"):
         posterior.update(arm_data(2, seed=17), budget)
 
 
 def test_other_joints_are_refused(posterior):
     text = posterior.system.robot.urdf_text.replace('"pan"', '"swing"')
     other = arm_data(3, seed=17, system=posterior.system.with_robot(Robot.from_urdf_text(text)))
-    with pytest.raises(InvalidInput, match="new rows have joints swing, lift, bend"):
+    with pytest.raises(InvalidInput, match="the joints of rows are swing, lift, bend"):
         posterior.update(other)
 
 

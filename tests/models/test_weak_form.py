@@ -176,7 +176,7 @@ def test_what_needs_single_rows_is_refused_with_a_remedy():
         sensor.fit_windows(data, HOW)
     with pytest.raises(InvalidInput, match=r"no observation 'weak' .*did you mean 'weak-form'"):
         model.fit_windows(data, "weak")
-    with pytest.raises(InvalidInput, match=r"points=99 is not between 2 and the \d+ windows of 0.1 s"):
+    with pytest.raises(InvalidInput, match=r"points=99` must be an integer from 2 to \d+, the windows of 0.1 s"):
         model.fit_windows(data, HOW, points=99)
 
 

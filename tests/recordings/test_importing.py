@@ -203,7 +203,7 @@ def test_wrapped_angles_are_continued_if_told_so(tmp_path):
     data["q"] = 9.0 * data["time"][:, None] / data["time"][-1] + np.array([0.0, 1.0])
     wrapped = {**data, "q": (data["q"] + np.pi) % (2 * np.pi) - np.pi}
     path = write_text(tmp_path / "log.csv", table(wrapped))
-    with pytest.raises(DatasetError, match="Add --unwrap"):
+    with pytest.raises(DatasetError, match="Add `unwrap`"):
         imported(path, tmp_path / "out.h5", NAMES)
     found = imported(path, tmp_path / "out.h5", NAMES, unwrap=True)
     np.testing.assert_allclose(found.q, data["q"], atol=1e-13)

@@ -237,8 +237,8 @@ def test_the_page_on_compiled_dynamics_runs(repository, tmp_path):
 
 
 def test_inputs_are_checked_as_those_of_the_robot(compiled):
-    with pytest.raises(InvalidInput, match=r"tau is torch\.float32; the dynamics needs float64"):
-        compiled.forward_dynamics(random(3), random(3), random(3).float())
+    with pytest.raises(InvalidInput, match=r"tau must be a tensor of real numbers; given: torch\.bool"):
+        compiled.forward_dynamics(random(3), random(3), random(3) > 0)
     with pytest.raises(InvalidInput, match=r"batch shapes do not broadcast: q \(2,\), inertials \(3,\)"):
         compiled.mass_matrix(random(2, 3), {"arm": random(3, 10)})
     with pytest.raises(InvalidInput, match="'base' of small is fixed in the world"):
@@ -283,6 +283,18 @@ def test_a_compiler_that_fails(robot, tmp_path, monkeypatch):
     with pytest.raises(CompilerError, match="the C compiler failed: false: exit code 1"):
         robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
     assert list((tmp_path / "dynamics").iterdir()) == []
+
+
+def test_what_cannot_be_loaded_never_enters_the_folder(robot, tmp_path, monkeypatch):
+    broken = tmp_path / "broken"
+    broken.write_text('#!/bin/sh\nwhile [ "$1" != -o ]; do shift; done\necho "no library" > "$2"\n')
+    broken.chmod(0o700)
+    monkeypatch.setenv("CC", str(broken))
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*robot\.compile\(folder=\.\.\.\)"):
+        robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
+    assert list((tmp_path / "dynamics").iterdir()) == []
+    monkeypatch.delenv("CC")
+    robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
 
 
 def test_folders_that_others_can_write_to(robot, tmp_path):

@@ -11,6 +11,7 @@ from tests.validation.moving_arm import given_system, moving_arm
 from forcegp.mechanics import Armature, MechanicalSystem
 from forcegp.models import StructuredGP
 from forcegp.priors import NoForces
+from forcegp.validation.page import _at_rest
 from forcegp.validation.scores import (
     LEVELS,
     acceleration_scores,
@@ -33,7 +34,7 @@ def scores(test_rows):
     """Of the URDF alone with a given noise: its prediction and its density are known in closed form."""
     system = given_system()
     posterior = StructuredGP(system, NoForces(), "analytical", tuple(SIGMA)).fit(test_rows, points=5)
-    return acceleration_scores(posterior, test_rows, mass_matrices(system, test_rows))
+    return acceleration_scores(posterior, test_rows, mass_matrices(test_rows, system))[0]
 
 
 def predicted(test_rows) -> np.ndarray:
@@ -94,7 +95,7 @@ def test_stretches_of_time_make_up_the_whole(scores, test_rows):
 def test_the_mass_matrix_counts_rotors(test_rows):
     system = given_system()
     with_rotors = MechanicalSystem(system.robot, (), (*system.known_forces, Armature((0.1, 0.2, 0.3))))
-    added = mass_matrices(with_rotors, test_rows) - mass_matrices(system, test_rows)
+    added = mass_matrices(test_rows, with_rotors) - mass_matrices(test_rows, system)
     assert np.allclose(added, np.diag([0.1, 0.2, 0.3]))
     change = force_errors(np.ones((len(test_rows), 3)), np.zeros((len(test_rows), 3)), added)
     assert np.allclose(change, [0.1, 0.2, 0.3])
@@ -113,3 +114,24 @@ def test_over_joints():
     assert over_joints("nrmse", [1.0, None, 3.0]) == 2.0
     assert over_joints("force_rms", [3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
     assert over_joints("nrmse", [None]) is None
+
+
+def test_no_acceleration_at_all_is_scored_beside_the_models(scores, test_rows):
+    """A wrist that hardly moves is predicted well by not moving: that is the score to beat."""
+    robot = given_system().robot
+    force = [robot.mass_matrix(q).numpy() @ a for q, a in zip(torch.tensor(test_rows.q), test_rows.a, strict=True)]
+    assert np.allclose(scores["force_rms_at_rest"], np.sqrt(np.square(force).mean(0)))
+
+
+@pytest.mark.parametrize(("best", "said"), [(0.05, False), (0.09, True)])
+def test_the_page_names_joints_where_the_score_says_nothing(best, said):
+    def spread(value):
+        return {"median": value, "least": value, "largest": value}
+
+    model = {
+        "force_rms_per_joint": [spread(0.1), spread(best)],
+        "force_rms_at_rest_per_joint": [spread(5.0), spread(0.1)],
+    }
+    (sentence,) = _at_rest({"one": model}, {"joint_names": ["elbow", "wrist"]})
+    assert sentence.startswith("Predicting no acceleration at all has elbow 5, wrist 0.1.")
+    assert ("At wrist the best model is hardly better" in sentence) is said

@@ -76,15 +76,15 @@ def test_whole_episodes_are_held_out_and_left_one_by_one():
 
 def test_splits_by_name():
     data = recording()
-    assert split_named("episodes:0,2", data)[0].held_out == (Stretch(0), Stretch(2))
-    assert len(split_named("leave-one-out", data)) == 3
-    assert len(split_named("fraction:0.6", data)[0].held_out) == 2
-    assert split_named("fraction:0.34:5", data) == split_named("fraction:0.34:5", data)
-    drawn = {split_named(f"fraction:0.34:{seed}", data)[0].held_out for seed in range(20)}
+    assert split_named(data, "episodes:0,2")[0].held_out == (Stretch(0), Stretch(2))
+    assert len(split_named(data, "leave-one-out")) == 3
+    assert len(split_named(data, "fraction:0.6")[0].held_out) == 2
+    assert split_named(data, "fraction:0.34:5") == split_named(data, "fraction:0.34:5")
+    drawn = {split_named(data, f"fraction:0.34:{seed}")[0].held_out for seed in range(20)}
     assert drawn == {(Stretch(0),), (Stretch(1),), (Stretch(2),)}
-    assert len(split_named("auto", data)[0].held_out) == 1
+    assert len(split_named(data, "auto")[0].held_out) == 1
     one = recording(60, 1)
-    (split,) = split_named("auto", one, guard=0.1)
+    (split,) = split_named(one, "auto", guard=0.1)
     assert (len(split.held_out), split.guard) == (2, 0.1)
     assert "5 consecutive blocks of equal duration, blocks 3 and 5 held out" in split.words
     assert "0.1 s" in split.words
@@ -93,11 +93,11 @@ def test_splits_by_name():
 def test_imported_episodes_answer_to_the_names_of_their_logs():
     listed = [{"recording": f"/logs/{name}.csv"} for name in ("run-143339", "run-143524", "run-143524")]
     data = recording(metadata={"import": {"episodes": listed}})
-    assert split_named("episodes:143339", data)[0].held_out == (Stretch(0),)
-    assert split_named("episodes:143524", data)[0].held_out == (Stretch(1), Stretch(2))
-    assert "run-143339.csv" in split_named("episodes:0", data)[0].words
+    assert split_named(data, "episodes:143339")[0].held_out == (Stretch(0),)
+    assert split_named(data, "episodes:143524")[0].held_out == (Stretch(1), Stretch(2))
+    assert "run-143339.csv" in split_named(data, "episodes:0")[0].words
     with pytest.raises(InvalidInput, match=r"run-143339\.csv, run-143524\.csv"):
-        split_named("episodes:run", data)
+        split_named(data, "episodes:run")
 
 
 WRONG = [
@@ -120,7 +120,7 @@ WRONG = [
 @pytest.mark.parametrize(("text", "message"), WRONG, ids=[text for text, _ in WRONG])
 def test_what_makes_no_split_is_refused(text, message):
     with pytest.raises(InvalidInput, match=message):
-        split_named(text, recording())
+        split_named(recording(), text)
 
 
 def test_overlap_is_refused():

@@ -32,7 +32,7 @@ def data():
 
 def comparison(data, **changes) -> Comparison:
     how = {"points": 15, "horizons": (0.1, 0.2), "starts": 2, "restarts": 1, "iterations": 5, **changes}
-    return Comparison(data, data, given_system(), split_named("episodes:1", data), **how)
+    return Comparison(data, data, given_system(), split_named(data, "episodes:1"), **how)
 
 
 @pytest.fixture(autouse=True)
@@ -127,7 +127,7 @@ def test_all_that_failed_still_makes_a_page(data, tmp_path):
 def test_another_configuration_is_refused_and_overwritten_on_demand(data, tmp_path):
     folder = tmp_path / "out"
     validate(comparison(data), folder, models=("analytical",), seeds=1)
-    with pytest.raises(InvalidInput, match=r"points \(15, not 16\), restarts \(1, not 2\).*--out"):
+    with pytest.raises(InvalidInput, match=r"points \(15, not 16\), restarts \(1, not 2\).*`folder`"):
         validate(comparison(data, points=16, restarts=2), folder, models=("analytical",), seeds=1)
     shorter = moving_arm(0.5, 2)
     with pytest.raises(InvalidInput, match=r"another recording_sha256.*, rows_sha256"):

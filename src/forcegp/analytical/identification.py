@@ -17,7 +17,8 @@ from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.regressor import body_pseudo_inertias
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.data.dataset_arguments import dataset_first, require_rows
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 
 Inertias = Literal["consistent", "free"]
@@ -28,9 +29,10 @@ REWEIGHTINGS = 2
 """Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
 
 
+@dataset_first
 def identify_analytical(
-    system: MechanicalSystem,
     dataset: Dataset,
+    system: MechanicalSystem | None = None,
     *,
     friction: Sequence[str] = ("viscous", "coulomb"),
     rotors: Literal["armature", "rotor"] | None = "armature",
@@ -45,8 +47,9 @@ def identify_analytical(
 
     Parameters
     ----------
-    system: start and prior: the robot, friction it lists, and forces that are given. In no contact.
     dataset: q, v, u and a, filtered alike (`forcegp.data.Preparation`); rows need not be in order of time.
+    system: start and prior: the robot, friction it lists, and forces that are given. In no contact. None takes that of
+        the dataset.
     friction: out of "viscous", "coulomb" or "stribeck" or "load" (c + mu |u|), and "offset". Velocity scales are
         estimated, too.
     rotors: "armature": one inertia per joint. "rotor": those of the system's RotorInertia. None: as listed.
@@ -64,10 +67,9 @@ def identify_analytical(
 
     Raises InvalidInput for options that make no sense and for a system in contact.
     """
-    if dataset.joint_names != system.robot.joint_names:
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the robot {', '.join(system.robot.joint_names)}."
-        )
+    given = dataset.system if system is None else system
+    system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
+    require_rows("dataset", dataset, system.robot.joint_names, "the robot")
     for name, given, allowed in (
         ("inertias", inertias, ("consistent", "free")),
         ("likelihood", likelihood, ("torque", "acceleration")),

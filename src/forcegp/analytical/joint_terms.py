@@ -134,7 +134,7 @@ LAWS: dict[str, Law] = {
     ),
     "load": Law(
         LoadJointFriction,
-        (COULOMB, Field("load", "1", (0, 0, 0.1)), VELOCITY_SCALE),
+        (COULOMB, Field("load", "1", (0, 0, 0.1), highest=9.0), VELOCITY_SCALE),
         _load,
         lambda p: LoadJointFriction(*(torch.tensor(p[name]) for name in ("load", "coulomb", "velocity_scale"))),
         lambda force: _numbers(force, coulomb="coulomb", load="coefficients", velocity_scale="velocity_scale"),

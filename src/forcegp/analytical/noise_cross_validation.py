@@ -15,6 +15,7 @@ import torch
 from forcegp.analytical.identification import identify_analytical
 from forcegp.analytical.noise_levels import NoiseLevels
 from forcegp.data import Dataset
+from forcegp.data.dataset_arguments import dataset_first
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem
 
@@ -22,7 +23,8 @@ STRETCHES = 4
 """Stretches of time that logs of fewer than three episodes are cut into."""
 
 
-def held_out_noise(system: MechanicalSystem, dataset: Dataset, **how: Any) -> NoiseLevels:
+@dataset_first
+def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> NoiseLevels:
     """Noise of accelerations and forces about systems identified without the rows in question.
 
     `how` are the options of `identify_analytical`; inertias must be consistent. Rows are left out by episodes, where
@@ -35,7 +37,7 @@ def held_out_noise(system: MechanicalSystem, dataset: Dataset, **how: Any) -> No
     for left_out in _stretches(dataset):
         kept = np.ones(len(dataset), dtype=bool)
         kept[left_out] = False
-        found = identify_analytical(system, dataset.rows(kept), **how).system
+        found = identify_analytical(dataset.rows(kept), system, **how).system
         rows = dataset.rows(left_out)
         q, v, u = (torch.tensor(x, device=found.robot.device) for x in (rows.q, rows.v, rows.u))
         dynamics = found.dynamics(q, v, u)

@@ -8,6 +8,12 @@ With the standard parameters pi of the bodies, the joint terms t(x; v, a) and th
 where M_0 is the inertia of what is listed and not estimated. Differentiating M a^ = Q - bias - t,
 
     dr/dpi = M^-1 Y(q, v, a^),    dr/dx = M^-1 dt/dx (v, a^).
+
+Friction g(x; v) |u| under load makes u the solution of u = z + g |u|, with z all other terms:
+
+    u = z / (1 - g s),    s = sign z = sign u for |g| < 1,    du/dx = (dz/dx + u s dg/dx) / (1 - g s).
+
+The measured |u| in its place would explain the measured torque by itself: g tends to 1, whatever the robot is.
 """
 
 from __future__ import annotations
@@ -20,7 +26,7 @@ from jaxtyping import Float
 
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.mechanics import KnownForce, MechanicalSystem, RigidBodyBias, State
+from forcegp.mechanics import KnownForce, LoadJointFriction, MechanicalSystem, RigidBodyBias, State
 
 
 class RecordedRows:
@@ -38,7 +44,8 @@ class RecordedRows:
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
         state = State.of(robot, at_q, at_v, at_u)
         self.kinematics, self.terms, self.v = state.kinematics, terms, np.array(v)
-        self.load = abs(np.array(u))
+        self.u = np.array(u)
+        self.load = abs(self.u)
         given = kept_forces(system, terms)
         self.force = np.zeros_like(self.v)
         self.inertia = np.zeros((robot.nv, robot.nv))
@@ -57,9 +64,23 @@ class RecordedRows:
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray | None = None
     ) -> np.ndarray:
         """The force Q (rows, nv) under which the model accelerates by a."""
-        Y = self.regressor(a) if regressor is None else regressor
-        torque, _ = self.terms.torque(x, self.v, a, self.load)
-        return np.einsum("nibp,bp->ni", Y, parameters) + a @ (self.inertia + self._armature) + torque
+        return self._needed(parameters, x, a, self.regressor(a) if regressor is None else regressor)[0]
+
+    def _needed(
+        self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`needed_torque`, its derivatives in z (rows, nv), the torque without load, and in x (rows, nv, k)."""
+        torque, in_x = self.terms.torque(x, self.v, a, np.zeros_like(self.load))
+        rigid = np.einsum("nibp,bp->ni", regressor, parameters) + a @ (self.inertia + self._armature)
+        if LoadJointFriction not in self.terms.kinds:
+            return rigid + torque, np.ones_like(self.v), in_x
+        loaded, loaded_in_x = self.terms.torque(x, self.v, a, np.ones_like(self.load))
+        others = self.force - self.u
+        z, g = rigid + torque - others, loaded - torque
+        sign = np.sign(z)
+        left = 1.0 - g * sign
+        u = z / left
+        return u + others, 1.0 / left, (in_x + (u * sign)[..., None] * (loaded_in_x - in_x)) / left[..., None]
 
     def acceleration(self, parameters: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """a^ (rows, nv) and the mass matrices (rows, nv, nv). Raises NumericalError where one is singular."""
@@ -78,8 +99,8 @@ class RecordedRows:
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual (rows, nv) and its derivatives in the parameters (rows, nv, bodies, 10) and in x (rows, nv, k)."""
-        _, in_x = self.terms.torque(x, self.v, a, self.load)
-        return self.needed_torque(parameters, x, a, regressor) - self.force, regressor, in_x
+        needed, in_z, in_x = self._needed(parameters, x, a, regressor)
+        return needed - self.force, in_z[..., None, None] * regressor, in_x
 
     def in_acceleration(
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset
-from forcegp.mechanics import MechanicalSystem
+from forcegp.data.dataset_arguments import dataset_first
+from forcegp.mechanics import LoadJointFriction, MechanicalSystem
 
 
+@dataset_first
 def motion_residuals(
-    system: MechanicalSystem, dataset: Dataset
+    dataset: Dataset, system: MechanicalSystem
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    Under contacts the force residual holds the contact forces as well.
+    Under contacts the force residual holds the contact forces as well. Under friction that grows with |u| it is what
+    the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u| shrinks
+    the residual of any model.
     """
     q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=system.robot.device) for x in ("q", "v", "u", "a"))
     dynamics = system.dynamics(q, v, u)
     force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]
+    for friction in system.known_forces:
+        if isinstance(friction, LoadJointFriction):
+            idle, loaded = (friction.force(replace(dynamics.state, u=u)) for u in (0.0 * u, torch.ones_like(u)))
+            without_load = u + (loaded - idle) * u.abs() - force  # z = u - g |u| - force
+            force = u - without_load / (1.0 + (loaded - idle) * without_load.sign())
     return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
 
 

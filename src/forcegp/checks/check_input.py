@@ -20,7 +20,7 @@ from forcegp.checks.successive_rows import (
     smoothed,
     white_noise,
 )
-from forcegp.data import Dataset, Preparation, Prepared, resample, uniform_step
+from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
@@ -173,12 +173,10 @@ class CheckInput:
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:
     """The report of a preparation with a filter that this dataset went through; empty without one."""
-    report = dataset.metadata.get("preparation")
-    while isinstance(report, Mapping):
-        if report.get("cutoff") is not None:
-            return report
-        report = report.get("earlier")
-    return {}
+    report = preparation_report(dataset.metadata)
+    while report and report.get("cutoff") is None:
+        report = preparation_report({"preparation": report.get("earlier")})
+    return report
 
 
 def _first(even: Dataset) -> np.ndarray:

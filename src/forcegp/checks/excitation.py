@@ -51,7 +51,7 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
                 subject="excitation",
                 seen=f"{listed(still)} moved less than 0.02 rad (2 mm): {'its' if len(still) == 1 else 'their'} "
                 "friction and inertia do not show.",
-                remedy="Move every joint that is to be learned, or lock it in the robot (--lock JOINT=RAD).",
+                remedy="Move every joint that is to be learned, or lock it in the robot (`locked`).",
                 joints=tuple(still),
                 numbers={"joints": motions},
             )
@@ -94,7 +94,7 @@ def _held(inputs: CheckInput, still: list[str]) -> Iterator[Finding]:
             f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
             f"moves {spans[:, joint].max():.2g}.",
             remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
-            "(--lock).",
+            "(`locked`).",
             joints=(name,),
             numbers={"stretches": held.tolist(), "range": float(spans[first, joint])},
         )

@@ -269,7 +269,7 @@ def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
             subject="gravity",
             seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
             f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",
-            remedy=f"Give --gravity={text.replace(' ', '')}.",
+            remedy=f"Give `gravity`={text.replace(' ', '')}.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
         cost = 1.5 if index == len(directions) - 1 else 1.0  # a base along its axes is the likelier one

@@ -58,9 +58,10 @@ def noise_findings(inputs: CheckInput) -> list[Finding]:
         return []
     report = inputs.price
     cutoff = report.get("cutoff")
-    if cutoff is None or "acceleration_noise" not in report:
+    measured = report.get("acceleration_noise", {})
+    if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
         return [Finding(severity="ok", subject="noise", seen="the positions show no noise worth a filter.")]
-    before, after = (numbers_of(report["acceleration_noise"][when]) for when in ("before", "after"))
+    before, after = (numbers_of(measured[when]) for when in ("before", "after"))
     spread = np.std(inputs.prepared.dataset.a, axis=0)
     why = "where the spectrum shows the end of the motion" if inputs.automatic else "as asked for"
     if report is not inputs.prepared.report:

@@ -21,7 +21,8 @@ from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation
-from forcegp.errors import InvalidInput
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import require_type
 from forcegp.mechanics import MechanicalSystem
 
 BEFORE_A_FIT = frozenset(
@@ -104,8 +105,11 @@ def check(
 
     Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
     """
+    require_type("dataset", dataset, Dataset)
     system = dataset.system if system is None else system
-    _require_same_joints(dataset, system)
+    if system is not None:
+        robot = require_type("system", system, MechanicalSystem).robot
+        require_rows("dataset", dataset, robot.joint_names, robot.name)
     inputs = CheckInput.of(dataset, system, preparation or Preparation(cutoff="auto"))
     findings, comparison = _findings(inputs, system)
     if inputs.robot is not None:
@@ -122,7 +126,8 @@ def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tup
     short logs are taken, of which less can be checked. Raises InvalidInput for a robot with other joints.
     """
     system = dataset.system if system is None else system
-    _require_same_joints(dataset, system)
+    if system is not None:
+        require_rows("dataset", dataset, system.robot.joint_names, system.robot.name)
     findings, _ = _findings(CheckInput.quick(dataset, system), system)
     said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
     if dataset.nv > 1:  # friction of one joint can look like a delay
@@ -153,14 +158,6 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
             compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
         findings += [*corrections, *compared]
     return findings, comparison
-
-
-def _require_same_joints(dataset: Dataset, system: MechanicalSystem | None) -> None:
-    if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
-        raise InvalidInput(
-            f"{system.robot.name} has joints {', '.join(system.robot.joint_names)}; the dataset has "
-            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
-        )
 
 
 def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:

@@ -192,5 +192,5 @@ def not_compared(inputs: CheckInput) -> Finding:
         severity="look",
         subject="torque",
         seen="not compared with inverse dynamics: no robot was given.",
-        remedy="Add --robot ARM.urdf.",
+        remedy="Give the robot: `system`.",
     )

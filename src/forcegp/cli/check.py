@@ -66,10 +66,10 @@ class Check(CutoffOptions, RobotOptions):
             report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
-            with plots_folder(terminal, self.plots, KIND, {"data": str(self.data)}) as folder:
+            with plots_folder(terminal, self.plots, KIND, {"data": str(self.data)}, overwrite=self.overwrite) as folder:
                 forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
                 write_json(folder / "check.json", content)
-        terminal.show(*_shown(self.data, report))
+        terminal.show(*_shown(terminal, self.data, report))
         wrong = [finding for finding in report.findings if finding.severity == "wrong"]
         if self.strict and wrong:
             what = ", ".join(dict.fromkeys(finding.subject for finding in wrong))
@@ -79,7 +79,7 @@ class Check(CutoffOptions, RobotOptions):
         return content
 
 
-def _shown(data: Path, report: forcegp.CheckReport) -> list[Any]:
+def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
     """One paragraph per finding, worst first, and the numbers of every joint."""
     content = report.to_dict()
     counts = content["counts"]
@@ -92,7 +92,7 @@ def _shown(data: Path, report: forcegp.CheckReport) -> list[Any]:
         text.append(finding.seen, style="not bold")
         findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
         if finding.remedy:
-            findings.add_row("", Text(f"→ {finding.remedy}", style="dim"))
+            findings.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
     return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
 

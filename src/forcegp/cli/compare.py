@@ -16,12 +16,12 @@ import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
 import forcegp.priors
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.fit_options import POINTS
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import resolved_noise
-from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
@@ -146,12 +146,10 @@ class Compare(LearningOptions):
         content: Mapping[str, Any],
         folders: Mapping[str, str],
     ) -> None:
-        with atomic_folder(out) as folder:
-            folder.mkdir()
+        with output_folder(out, KIND, self._given(), overwrite=self.overwrite) as folder:
             for name, posterior in comparison.posteriors.items():
                 forcegp.save_posterior(posterior, folder / folders[name])
             write_json(folder / "comparison.json", {**content, "models": dict(folders)})
-            write_config(folder, KIND, self._given())
 
     def _report(self, comparison: forcegp.PriorComparison, folders: Mapping[str, str]) -> list[Any]:
         header = ["prior", "latents,\nparam.", "NLL", "row\nout", "stretch\nout", "below\nthe best"]
@@ -169,9 +167,7 @@ class Compare(LearningOptions):
                 f"Next: forcegp fit {self.data} --prior {_quoted(preferred)} --points {comparison.points} --out run"
             )
         table = columns(title, header, rows, long_names=True)
-        unfinished = ", ".join(score.name for score in comparison.scores if not score.converged)
-        warning = [Text(f"Not converged: {unfinished}; give more --iterations.")] if unfinished else []
-        return [table, Text(comparison.verdict), *warning, Text(following)]
+        return [table, Text(comparison.verdict), Text(following)]
 
     def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best

@@ -16,11 +16,11 @@ import forcegp
 import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.evaluate import draw, evaluate_with_progress
 from forcegp.cli.fit import fit_summary, fit_with_progress
-from forcegp.cli.output_folders import holds_only_own_files, require_free_folder, write_config
+from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.simulate import simulate_with_progress
 from forcegp.cli.tables import NONE, NORMAL_FORCES, columns, multiplier_scores, nats, number, percent
 from forcegp.cli.terminal import Terminal
@@ -53,7 +53,7 @@ class Demo(Command):
     """
 
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("demo")
-    """The folder to write. That of an earlier demo is replaced."""
+    """The folder to write. That of an earlier demo is replaced, unless files were added to it."""
     seed: Annotated[int, arg(metavar="K")] = SEED
     """The training trajectory has seed K, the test trajectory K + 1."""
     points: Annotated[int, arg(metavar="N")] = 100
@@ -64,8 +64,6 @@ class Demo(Command):
     """Most iterations of each fit."""
     jobs: Annotated[int, arg(metavar="J")] = 1
     """Processes for the starts of each fit."""
-    overwrite: bool = False
-    """Replace an earlier demo's folder even if it holds other files, too."""
     json: Json = False
     debug: Debug = False
 
@@ -73,11 +71,11 @@ class Demo(Command):
         """All four steps."""
         if self.points < 2:
             raise InvalidInput(f"--points is {self.points}; at least 2 are needed.")
-        replaceable = self.overwrite or holds_only_own_files(self.out, KIND)
-        require_free_folder(self.out, kind=KIND, overwrite=replaceable)
+        require_free_folder(self.out, kind=KIND, overwrite=True)
+        machine = {"system": platform.platform(), "cores": os.cpu_count(), "python": platform.python_version()}
+        options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
         start = time.monotonic()
-        with atomic_folder(self.out) as folder:
-            folder.mkdir()
+        with output_folder(self.out, KIND, {"options": options, "machine": machine}, overwrite=True) as folder:
             train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
             models, evaluations, fit_seconds = {}, {}, {}
             for name, (place, mean) in MODELS.items():
@@ -85,11 +83,10 @@ class Demo(Command):
                 evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
             pictures = _draw_all(terminal, folder, models, test)
             terminal.note(f"drew {', '.join(pictures)}")
-            results = self._results(models, evaluations, fit_seconds, time.monotonic() - start)
+            wall_seconds = time.monotonic() - start
+            results = self._results(models, evaluations, fit_seconds, wall_seconds) | {"machine": machine}
             write_json(folder / "results.json", results)
-            options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
-            write_config(folder, KIND, {"options": options, "machine": results["machine"]})
-        self._show(terminal, evaluations, results["wall_seconds"])
+        self._show(terminal, evaluations, wall_seconds)
         return results
 
     def _seeds(self) -> dict[str, int]:
@@ -146,7 +143,6 @@ class Demo(Command):
                 }
                 for name in models
             },
-            "machine": {"system": platform.platform(), "cores": os.cpu_count(), "python": platform.python_version()},
             "wall_seconds": wall_seconds,
         }
 

@@ -86,12 +86,13 @@ class Evaluate(Command):
             "model": posterior.description,
             "points": len(posterior.training),
             **evaluation.to_dict(),
+            "warnings": [terminal.worded(warning) for warning in evaluation.warnings],
             "forces": forces.to_dict(),
             "normal_force_rests_on_prior": rests_on_prior,
         }
         if self.plots is not None:
             options = {name: scores[name] for name in ("run", "data", "every", "system", "contact")}
-            with plots_folder(terminal, self.plots, KIND, {"options": options}) as folder:
+            with plots_folder(terminal, self.plots, KIND, {"options": options}, overwrite=self.overwrite) as folder:
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import forcegp
+import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
 import forcegp.robots
-from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit_options import ModelOptions
 from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
@@ -65,10 +65,11 @@ class Fit(ModelOptions):
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
         posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
-        with atomic_folder(self.out) as folder:
-            command._write(folder, posterior, KIND)
+        command._write(posterior, KIND)
         if rows_note is not None:
             terminal.note(rows_note)
+        for doubt in forcegp.evaluation.unfinished_search(posterior):
+            terminal.warn(doubt)
         terminal.show(*_report(self.out, summary))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 

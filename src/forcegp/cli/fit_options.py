@@ -12,7 +12,7 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 import forcegp.models
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.output_folders import write_config
+from forcegp.cli.output_folders import output_folder
 
 ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
 
@@ -33,14 +33,13 @@ class FitOptions(LearningOptions):
     out: Annotated[Path, arg(metavar="RUN")] = field()
     """The folder to write."""
 
-    def _write(
-        self, folder: Path, posterior: forcegp.models.Posterior, kind: str, more: Mapping[str, str] | None = None
-    ) -> None:
+    def _write(self, posterior: forcegp.models.Posterior, kind: str, more: Mapping[str, str] | None = None) -> None:
         """The model, `more` files by name with their text, and how it was made."""
-        forcegp.save_posterior(posterior, folder)
-        for name, text in (more or {}).items():
-            (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
-        write_config(folder, kind, {**self._given(), "resolved": dict(posterior.settings)})
+        content = {**self._given(), "resolved": dict(posterior.settings)}
+        with output_folder(self.out, kind, content, overwrite=self.overwrite) as folder:
+            forcegp.save_posterior(posterior, folder)
+            for name, text in (more or {}).items():
+                (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
 
 
 @dataclass(frozen=True, kw_only=True)

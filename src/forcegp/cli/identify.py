@@ -14,7 +14,6 @@ from rich.text import Text
 import forcegp
 import forcegp.inference
 import forcegp.models
-from forcegp.atomic_files import atomic_folder
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit import fit_summary, fit_with_progress
 from forcegp.cli.identify_options import IdentifyOptions
@@ -92,10 +91,9 @@ class Identify(IdentifyOptions):
             found = replace(posterior.identification, progress=report)
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
-        with atomic_folder(self.out) as folder:
-            identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
-            urdf = posterior.system.robot.to_urdf()
-            self._write(folder, posterior, KIND, {"identification.json": identification, "identified.urdf": urdf})
+        identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        urdf = posterior.system.robot.to_urdf()
+        self._write(posterior, KIND, {"identification.json": identification, "identified.urdf": urdf})
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:

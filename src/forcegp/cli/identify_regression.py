@@ -10,10 +10,10 @@ from rich.text import Text
 
 import forcegp
 import forcegp.analytical
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.identify_options import IdentifyOptions
-from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.robot_options import SYSTEM_FILE
 from forcegp.cli.tables import columns
 from forcegp.cli.terminal import Terminal
@@ -35,8 +35,8 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     system = command._system(dataset)
     with terminal.progress("identifying", may_end_early=True) as report:
         found = forcegp.identify_analytical(
-            system,
             dataset,
+            system,
             friction=friction,
             rotors=None if command.rotors == "none" else cast(Any, command.rotors),
             inertias=cast(Any, INERTIAS[command.model]),
@@ -50,20 +50,18 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal, kind: s
     content = {"model": command.model, **found.to_dict(), "cpu_seconds": time.process_time() - begin}
     for name, rows in (("training", dataset), ("test", test)):
         if rows is not None:
-            before = forcegp.analytical.residual_scores(*forcegp.analytical.motion_residuals(system, rows), rows)
+            before = forcegp.analytical.residual_scores(*forcegp.analytical.motion_residuals(rows, system), rows)
             content[name] = {"before": before, "after": found.scores(rows)}
     try:
         identified, why_not = found.system, None
     except NonPhysicalInertia as error:
         identified, why_not = None, str(error)
     content["robot"] = "no" if identified is None else "yes"
-    with atomic_folder(command.out) as folder:
-        folder.mkdir()
+    with output_folder(command.out, kind, command._given(), overwrite=command.overwrite) as folder:
         write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
             (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))
-        write_config(folder, kind, command._given())
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*_report(command, found, content, identified))

@@ -14,12 +14,12 @@ import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, URDF, Debug, Json
+from forcegp.cli.command import LOG, MAPPING, URDF, Debug, Json
 from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import InvalidInput
+from forcegp.errors import ForceGPError, InvalidInput
 
 COPIES = 10
 """Times the size of its file that a dataset is taken to need while it is prepared: numbers hardly shrink in it."""
@@ -53,7 +53,7 @@ class Import(PreparationOptions, RobotOptions):
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     mapping: Annotated[
-        Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: beside)")
+        Path | None, MAPPING, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: beside)")
     ] = None
     """What the columns mean; flags replace its entries. Default: log.yaml or forcegp.yaml beside the log."""
     write_mapping: Annotated[
@@ -124,21 +124,21 @@ class Import(PreparationOptions, RobotOptions):
         """Read, check and write."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        require_free_file(self.out, overwrite=self.overwrite)
+        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
         if self.write_mapping is not None:
-            require_free_file(self.write_mapping, overwrite=self.overwrite)
+            require_free_file(self.write_mapping, overwrite=self.overwrite, own=_is_mapping, what="a mapping")
         mapping = self._mapping(terminal)
         same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
         options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
         system, preparation = self._system(), self._preparation()
-        with atomic_file(self.out) as temporary, terminal.progress("importing") as report:
+        with atomic_file(self.out, overwrite=self.overwrite) as temporary, terminal.progress("importing") as report:
             done = forcegp.import_recordings(
                 self.logs, temporary, mapping, system=system, options=options, report=report
             )
             if not preparation.changes_nothing:
                 done |= _prepared(temporary, preparation, done["rows"])
-        if self.write_mapping is not None:
-            write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
+            if self.write_mapping is not None:  # a mapping that fails leaves no dataset behind
+                write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
         _report(terminal, self.out, done)
         return {"out": str(self.out), **done}
 
@@ -159,6 +159,8 @@ class Import(PreparationOptions, RobotOptions):
                 raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); give --mapping.")
             path = next(iter(found), None)
             if path is not None:
+                if self.write_mapping is not None and path.resolve() == self.write_mapping.resolve():
+                    raise InvalidInput(f"{path} is read by this command; give --write-mapping another name.")
                 terminal.note(f"the columns are mapped by {path}")
         stored = forcegp.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
         return stored.changed_by(self._flags())
@@ -196,6 +198,14 @@ def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[s
     prepared = preparation.apply(forcegp.Dataset.load(path))
     prepared.dataset.save(path)
     return {"rows": len(prepared.dataset), "preparation": prepared.report}
+
+
+def _is_mapping(path: Path) -> bool:
+    try:
+        forcegp.recordings.read_mapping(path)
+    except ForceGPError:
+        return False
+    return True
 
 
 def _list(paths: set[Path | None]) -> str:

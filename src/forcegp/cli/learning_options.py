@@ -33,7 +33,8 @@ class LearningOptions(BackendOptions, RobotOptions):
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
     """The folder to write."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
-    """Noise of the measured acceleration: learned, as the dataset states it, or a standard deviation in rad/s²."""
+    """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
+    where it does not)."""
     force_noise: Annotated[
         float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
     ] = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -15,10 +16,17 @@ from typing import NoReturn
 from forcegp import __version__
 from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.command import Command
+from forcegp.cli.option_names import with_option_names
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import ForceGPError
+from forcegp.errors import ForceGPError, NotEnoughMemory
 
 OK, INTERNAL_ERROR, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+
+
+_FULL, _ELSEWHERE = "; free some space, or write elsewhere.", "; write to a folder where you may."
+_REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL)
+_REMEDIES |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), _ELSEWHERE)
+"""What to do about an OSError, by its number."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,9 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
-        with Terminal(json=command.json) as terminal, warnings.catch_warnings():
+        with Terminal(json=command.json, options=command.options) as terminal, warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
-            command.check_inputs()
+            command.check_paths()
+            _require_address_space()
             terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -47,8 +56,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (ForceGPError, OSError) as error:
-        return _fail(str(error), USER_ERROR, debug)
+    except ForceGPError as error:
+        return _fail(with_option_names(str(error), command.options if command else ()), USER_ERROR, debug)
+    except OSError as error:
+        return _fail(f"{error}{_REMEDIES.get(error.errno or 0, '')}", USER_ERROR, debug)
     except MemoryError as error:
         return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
     except Exception as error:  # the last resort: one line also for a defect of ours, with its own exit code
@@ -59,6 +70,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
     return OK
+
+
+def _require_address_space() -> None:
+    """Refuse a limit (`ulimit -v`) in which the libraries do not fit.
+
+    OpenBLAS, while it is loaded, asks for its buffers again and again and for ever. Raises NotEnoughMemory.
+    """
+    if sys.platform == "win32" or "torch" in sys.modules:
+        return
+    import mmap
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    given = os.environ.get("OPENBLAS_NUM_THREADS") or os.environ.get("OMP_NUM_THREADS") or ""
+    threads = min(int(given) if given.isdecimal() else 64, os.cpu_count() or 1)
+    needed = (820 + 80 * threads) << 20
+    if limit != resource.RLIM_INFINITY:
+        try:
+            mmap.mmap(-1, needed).close()
+        except OSError:
+            raise NotEnoughMemory(
+                f"the address space is limited to {limit >> 20} MiB (ulimit -v), and {needed >> 20} MiB more are "
+                "needed to begin with; raise the limit."
+            ) from None
 
 
 def _fail(message: str, code: int, debug: bool) -> int:

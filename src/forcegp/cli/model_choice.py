@@ -36,9 +36,6 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
 
 Options = TypeVar("Options", bound=ModelOptions)
 
-START_NOISE = 0.1
-"""Where learning the noise starts if the dataset does not state it, in rad/s^2 or m/s^2."""
-
 
 def resolved(command: Options) -> Options:
     """The command with the defaults of its model. Raises InvalidInput for options that mean nothing to it."""
@@ -147,12 +144,8 @@ def resolved_noise(given: str, dataset: forcegp.Dataset, force: float | None = N
     Raises InvalidInput for anything else.
     """
     if given == "learned":
-        return forcegp.Noise(START_NOISE if dataset.noise_std is None else None, force, learn=True)
+        return forcegp.Noise(None, force, learn=True)
     if given == "dataset":
-        if dataset.noise_std is None:
-            raise InvalidInput(
-                "the dataset does not state its noise; add --noise learned, or --noise SIGMA if it is known."
-            )
         return None if force is None else forcegp.Noise(None, force)
     try:
         sigma = float(given)

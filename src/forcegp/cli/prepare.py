@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.data
 import forcegp.evaluation
+from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import DATASET, Debug, Json
 from forcegp.cli.output_folders import plots_folder, require_free_file, require_free_folder
 from forcegp.cli.preparation_options import PreparationOptions
@@ -50,7 +51,7 @@ class Prepare(PreparationOptions, RobotOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, save, draw if asked to, and show."""
-        require_free_file(self.out, overwrite=self.overwrite)
+        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
         if self.plots is not None:
             require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
 
@@ -62,12 +63,13 @@ class Prepare(PreparationOptions, RobotOptions):
             dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
         with terminal.progress("preparing"):
             prepared = preparation.apply(dataset)
-        prepared.dataset.save(self.out)
-        if self.plots is not None:
-            content = {"data": str(self.data), "preparation": prepared.report}
-            with plots_folder(terminal, self.plots, KIND, content) as folder:
-                figure = forcegp.evaluation.preparation_figure(dataset, prepared.preparation)
-                forcegp.evaluation.save_figure(figure, folder / "spectra.png")
+        with atomic_file(self.out, overwrite=self.overwrite) as temporary:
+            prepared.dataset.save(temporary)
+            if self.plots is not None:  # plots that fail leave no dataset behind
+                content = {"data": str(self.data), "preparation": prepared.report}
+                with plots_folder(terminal, self.plots, KIND, content, overwrite=self.overwrite) as folder:
+                    figure = forcegp.evaluation.preparation_figure(dataset, prepared.preparation)
+                    forcegp.evaluation.save_figure(figure, folder / "spectra.png")
         terminal.show(*_report(self.out, dataset, prepared))
         return {"out": str(self.out), "data": str(self.data), **prepared.report}
 

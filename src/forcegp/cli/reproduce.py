@@ -33,6 +33,7 @@ class Reproduce(BackendOptions):
     """
 
     interrupted: ClassVar[str] = "finished jobs are kept, and the same command goes on from there"
+    replaces: ClassVar[bool] = False
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""

@@ -13,6 +13,7 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 from forcegp.cli.command import IDENTIFIED, URDF, Command
 from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.file_digests import require_unchanged
 
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""
@@ -127,6 +128,8 @@ class RobotOptions(Command):
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
 
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
+        if path != self.identified:
+            require_unchanged(self.identified, "identify again")
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:

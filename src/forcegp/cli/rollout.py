@@ -13,9 +13,9 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
-from forcegp.atomic_files import atomic_folder, write_json
+from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
-from forcegp.cli.output_folders import require_free_folder, write_config
+from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import NONE, columns, facts, number, percent
 from forcegp.cli.terminal import Terminal
@@ -96,8 +96,9 @@ class Rollout(Command):
         cpu_seconds = time.process_time() - begun
         errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.system)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
-        with atomic_folder(self.out) as folder:
-            folder.mkdir()
+        options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
+        content = {"options": {name: summary[name] for name in options}}
+        with output_folder(self.out, KIND, content, overwrite=self.overwrite) as folder:
             self._write(folder, rollout, recorded, errors, dataset, summary)
         terminal.note(f"figure: {self.out / 'rollout.png'}")
         terminal.show(*_report(summary))
@@ -153,14 +154,14 @@ class Rollout(Command):
         dataset: forcegp.Dataset,
         summary: Mapping[str, Any],
     ) -> None:
-        import h5py  # here, so that --help does not wait for it
+        from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
 
         write_json(folder / "rollout.json", summary)
         arrays = {"time": rollout.time, "q": rollout.q, "v": rollout.v, "a": rollout.a}
         arrays |= {"constraint": rollout.constraint, "diverged_at": rollout.diverged_at}
         if rollout.samples is not None:
             arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
-        with h5py.File(folder / "rollout.h5", "w") as file:
+        with NewFile(folder / "rollout.h5") as file:
             for name, values in arrays.items():
                 file[name] = values.cpu().numpy()
             for name in ("q", "v", "u"):
@@ -172,8 +173,6 @@ class Rollout(Command):
         forcegp.evaluation.save_figure(
             forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png"
         )
-        options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
-        write_config(folder, KIND, {"options": {name: summary[name] for name in options}})
 
 
 def parse_baumgarte(given: str) -> forcegp.Baumgarte | None:

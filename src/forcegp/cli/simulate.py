@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.data
 import forcegp.simulation
+from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.terminal import Terminal
@@ -64,10 +66,11 @@ class Simulate(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Simulate and save."""
-        require_free_file(self.out, overwrite=self.overwrite)
+        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
         start = time.monotonic()
         dataset = simulate_with_progress(terminal, self.scenario, **self._config())
-        dataset.save(self.out)
+        with atomic_file(self.out, overwrite=self.overwrite) as temporary:
+            dataset.save(temporary)
         seconds = time.monotonic() - start
         terminal.show(
             f"{self.out}: {len(dataset)} rows ({self.episodes} x {self.seconds:g} s), seed {self.seed}, "

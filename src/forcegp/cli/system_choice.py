@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import forcegp
+import forcegp.evaluation
 import forcegp.models
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
@@ -25,8 +25,7 @@ def carried_over(
         return posterior
     if dataset.system is None:
         raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-    if "learned" not in posterior.settings:
-        return posterior.with_system(dataset.system)
-    terminal.note("--system data: contacts of the data; the robot stays the identified one")
-    there = dataset.system
-    return posterior.with_system(replace(posterior.system, contacts=there.contacts, baumgarte=there.baumgarte))
+    system = forcegp.evaluation.moved_system(posterior, dataset.system)
+    if system is not dataset.system:
+        terminal.note("--system data: contacts of the data; the robot stays the identified one")
+    return posterior.with_system(system)

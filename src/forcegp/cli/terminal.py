@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
@@ -17,6 +17,8 @@ from rich.console import Console, RenderableType
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from forcegp.cli.option_names import with_option_names
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
@@ -42,10 +44,12 @@ class Terminal:
 
     With `json`, the process's stdout is pointed at stderr until the result is printed, so that nothing a library prints
     (not even from C) can stand before or after the one JSON object; it is put back at the end of the context.
+    `options` are the command's, by which notes and warnings of the library name arguments.
     """
 
-    def __init__(self, *, json: bool) -> None:
+    def __init__(self, *, json: bool, options: Collection[str] = ()) -> None:
         self.json = json
+        self.options = options
         self._stdout: int | None = None
 
     # rich is imported when something is shown, so that --help and errors come at once
@@ -97,11 +101,15 @@ class Terminal:
 
     def note(self, text: str) -> None:
         """Report on stderr what was done."""
-        self.err.print(text, style="dim", markup=False)
+        self.err.print(self.worded(text), style="dim", markup=False)
 
     def warn(self, text: str) -> None:
         """Print a warning on stderr."""
-        self.err.print(f"warning: {' '.join(text.split())}", style="yellow", markup=False)
+        self.err.print(f"warning: {' '.join(self.worded(text).split())}", style="yellow", markup=False)
+
+    def worded(self, text: str) -> str:
+        """A sentence of the library in terms of this command's options."""
+        return with_option_names(text, self.options)
 
     @contextmanager
     def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[ProgressCallback]:

@@ -42,6 +42,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     """
 
     interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
+    replaces: ClassVar[bool] = False
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset (HDF5), raw or prepared."""
@@ -131,7 +132,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             rows,
             recording,
             system,
-            forcegp.split_named(self.split, rows, self.guard),
+            forcegp.split_named(rows, self.split, self.guard),
             horizons=horizons,
             friction=friction_laws(self.friction),
             **{name: getattr(self, name) for name in SAME},

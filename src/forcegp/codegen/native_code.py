@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shlex
 import shutil
@@ -29,7 +30,13 @@ class Language:
 
     def compiler(self, purpose: str, instead: str) -> list[str]:
         """The command of the compiler, with the options that the environment variable gives."""
-        chosen = shlex.split(os.environ.get(self.variable, ""))
+        try:
+            chosen = shlex.split(os.environ.get(self.variable, ""))
+        except ValueError as error:
+            raise CompilerError(
+                f"the environment variable {self.variable} is {os.environ[self.variable]!r}, which is no command "
+                f"({error}); correct it, or {instead}, whose results are the same."
+            ) from None
         for command in [chosen] if chosen else [[command] for command in self.commands]:
             if shutil.which(command[0]):
                 return command
@@ -60,23 +67,44 @@ CPP = Language(
 
 
 def compile_library(
-    language: Language, source: str, options: Iterable[str], library: Path, *, purpose: str, instead: str
-) -> None:
-    """Compile a source text to the shared library ``library``.
+    language: Language,
+    source: str,
+    options: Iterable[str],
+    library: Path,
+    function: str,
+    *,
+    purpose: str,
+    elsewhere: str,
+    instead: str,
+) -> ctypes.CDLL:
+    """Compile a source text to the shared library ``library``, and load it, which shows that it has ``function``.
 
-    ``purpose`` and ``instead`` name in errors what needs the compiler and what to do without one. Raises
-    :class:`~forcegp.errors.CompilerError` where there is no compiler or it fails, OSError where files cannot be
-    written.
+    ``purpose``, ``elsewhere`` and ``instead`` name in errors what needs the compiler, how to choose another folder, and
+    what to do without a compiler. Raises :class:`~forcegp.errors.CompilerError` where there is no compiler, where it
+    fails, and where nothing may be run from the folder.
     """
     compiler = language.compiler(purpose, instead)
     command = [*compiler, *options, "-x", language.option, "-", "-o", str(library)]
-    done = subprocess.run(command, input=source, capture_output=True, text=True, errors="replace", check=False)
-    if done.returncode != 0:
-        why = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    try:
+        done = subprocess.run(command, input=source, capture_output=True, text=True, errors="replace", check=False)
+        why = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1] if done.returncode else None
+    except OSError as error:  # not a program
+        why = str(error)
+    if why is not None:
         raise CompilerError(
             f"the {language.name} compiler failed: {shlex.join(compiler)}: {why}; name another (GCC or Clang) by the "
             f"environment variable {language.variable}, or {instead}, whose results are the same."
         )
+    try:
+        loaded = ctypes.CDLL(str(library))
+        getattr(loaded, function)
+    except (OSError, AttributeError) as error:
+        raise CompilerError(
+            f"what the {language.name} compiler wrote cannot be loaded ({shlex.join(compiler)}: {error}): its linker "
+            f"is broken, or no program may be run from {library.parent}; choose another folder ({elsewhere}), name "
+            f"another compiler by {language.variable}, or {instead}, whose results are the same."
+        ) from None
+    return loaded
 
 
 def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:

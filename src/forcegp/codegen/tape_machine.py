@@ -283,7 +283,7 @@ def cpp_source() -> str:
 
 
 def _library() -> ctypes.CDLL:
-    library = cpp_library(cpp_source())
+    library = cpp_library(cpp_source(), "values")
     pointer, number = ctypes.c_void_p, ctypes.c_long
     for function, arrays in ((library.values, 2), (library.jacobian, 3)):
         function.restype = None

@@ -10,7 +10,8 @@ from .filtering import (
     as zero_phase_low_pass,
 )
 from .frozen_dict import FrozenDict as FrozenDict
-from .preparation import Preparation as Preparation, Prepared as Prepared
+from .hdf5 import is_dataset as is_dataset
+from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
 from .spectrum import (
     MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,
 )

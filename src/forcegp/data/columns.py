@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from forcegp.errors import DatasetError
+from forcegp.robots.real_numbers import real_array
 
 
 def finite_columns(
@@ -17,7 +18,7 @@ def finite_columns(
     `columns` None asks for a vector, names for one column each, and an empty sequence for any number of columns.
     Raises DatasetError naming the first row and column that are not finite, or the shape that was expected.
     """
-    values = _numbers(name, given, "fiu").astype(np.float64)  # astype always copies
+    values = real_array(name, given, error=DatasetError).astype(np.float64)  # astype always copies
     expected = f"({what},)" if columns is None else f"({what}, {len(columns) or 'any'})"
     wrong_columns = columns is not None and values.ndim == 2 and columns and values.shape[1] != len(columns)
     if values.ndim != (1 if columns is None else 2) or wrong_columns:
@@ -41,21 +42,10 @@ def finite_columns(
 
 def integer_column(name: str, given: object, rows: int) -> np.ndarray:
     """int64, read-only copy of a vector of integers. Raises DatasetError for anything else."""
-    values = _numbers(name, given, "iu")
+    values = real_array(name, given, "iu", DatasetError)
     if values.shape != (rows,):
         raise DatasetError(f"{name} has shape {values.shape}; expected ({rows},).")
     return _read_only(values.astype(np.int64))
-
-
-def _numbers(name: str, given: object, kinds: str) -> np.ndarray:
-    kind = "real numbers" if "f" in kinds else "integers"
-    try:
-        values = np.asarray(given)
-    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors that require a gradient
-        raise DatasetError(f"{name} is not an array of {kind}: {error}") from error
-    if values.dtype.kind not in kinds:
-        raise DatasetError(f"{name} must be an array of {kind}; given: {values.dtype} of shape {values.shape}.")
-    return values
 
 
 def _read_only(values: np.ndarray) -> np.ndarray:

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, overload
 
 import numpy as np
 from jaxtyping import Float, Int
+from typing_extensions import override
 
 import forcegp.mechanics
 from forcegp.data.columns import finite_columns, integer_column
+from forcegp.data.frames import arrays_of, frame_of
 from forcegp.data.frozen_dict import FrozenDict, frozen_json
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.data.units import units_for, validated_units
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message
+from forcegp.summary import Summary, listed, rounded
 
 TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
 TRUTH_KINDS = ("Q_U.", "force.")
@@ -23,7 +26,7 @@ TRUTH_KINDS = ("Q_U.", "force.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Dataset:
+class Dataset(Summary):
     """Rows `(q, v, u) -> a` of one robot, with everything needed to read them.
 
     Arrays are copied to float64, made read-only and checked; a Dataset that exists is valid. In row k, `a` is the
@@ -99,10 +102,57 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.q)
 
-    def __repr__(self) -> str:
-        robot = f"{self.system.robot.name!r}, contacts: {len(self.system.contacts)}" if self.system else "no system"
-        truth = f", truth: {', '.join(self.truth)}" if self.truth else ""
-        return f"Dataset({len(self)} rows, {self.nv} joints, episodes {list(self.episodes)}, {robot}{truth})"
+    @override
+    def facts(self) -> dict[str, object]:
+        """Rows, joints, episodes, robot, and what else is known."""
+        robot = f"{self.system.robot.name!r}, {len(self.system.contacts)} contacts" if self.system else "none"
+        facts: dict[str, object] = {"rows": len(self), "joints": listed(self.joint_names, most=7)}
+        facts |= {"episodes": listed(self.episodes), "robot": robot}
+        noise = self.noise_level
+        return facts | {"noise std": "not stated" if noise is None else rounded(noise), "truth": listed(self.truth)}
+
+    __iter__: ClassVar[None] = None
+    """Rows are arrays: without this, Python would iterate by `dataset[0]`, `dataset[1]`, ..."""
+
+    @overload
+    def __getitem__(self, index: str) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Dataset: ...
+    def __getitem__(self, index: str | int | slice | Sequence[int] | np.ndarray) -> np.ndarray | Dataset:
+        """`dataset["q"]` is a column, `dataset[10:20]`, `dataset[mask]`, `dataset[[3, 1]]`, `dataset[5]` are `rows`.
+
+        Raises InvalidInput for a column or row that is not there.
+        """
+        if not isinstance(index, str):
+            return self.rows([int(index)] if isinstance(index, int | np.integer) else index)
+        columns = self._columns()
+        if index not in columns:
+            raise InvalidInput(unknown_name_message("column", index, "this Dataset", columns))
+        return columns[index]
+
+    def to_pandas(self) -> Any:
+        """A pandas DataFrame: time, episode, `q.JOINT` ..., `truth.Q_U.JOINT` ....
+
+        Raises MissingExtra without pandas.
+        """
+        truth = {f"truth.{name}": values for name, values in self.truth.items()}
+        return frame_of({**self._columns(), **truth}, self.joint_names)
+
+    @staticmethod
+    def from_pandas(frame: Any, system: forcegp.mechanics.MechanicalSystem | None = None, **more: Any) -> Dataset:
+        """The Dataset of a frame with the columns of `to_pandas`, of which time, q, v, u and a must be there.
+
+        `more` are other fields, for example `units` and `noise_std`. Raises DatasetError for columns that are missing
+        or not valid, MissingExtra without pandas.
+        """
+        given: dict[str, Any] = {**arrays_of(frame), "system": system, **more}
+        return Dataset(**given)
+
+    def _columns(self) -> dict[str, np.ndarray]:
+        names = ("time", "episode", "q", "v", "u", "a", "noise_std")
+        stated = {name: getattr(self, name) for name in names}
+        by_row = {"noise_std": None if self.noise_std is None else np.broadcast_to(self.noise_std, self.q.shape)}
+        return {name: values for name, values in {**stated, **by_row}.items() if values is not None}
 
     def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
         return _rebuild, (self._fields(),)

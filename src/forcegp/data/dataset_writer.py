@@ -23,7 +23,7 @@ import forcegp.mechanics
 from forcegp.atomic_files import atomic_file
 from forcegp.data.columns import finite_columns
 from forcegp.data.frozen_dict import frozen_json
-from forcegp.data.hdf5 import COMPRESSION, describe
+from forcegp.data.hdf5 import COMPRESSION, NewFile, describe
 from forcegp.data.units import validated_units
 from forcegp.errors import DatasetError
 
@@ -61,12 +61,12 @@ class DatasetWriter:
         self._jobs: deque[tuple[h5py.Dataset, int, Future[bytes]]] = deque()
         self._pool: ThreadPoolExecutor
         self._stack = ExitStack()
-        self._file: h5py.File
+        self._file: NewFile
 
     def __enter__(self) -> DatasetWriter:
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_file(self.path))
-            self._file = stack.enter_context(h5py.File(temporary, "x"))
+            self._file = stack.enter_context(NewFile(temporary))
             self._pool = ThreadPoolExecutor(THREADS)
             stack.callback(self._pool.shutdown, cancel_futures=True)
             self._stack = stack.pop_all()
@@ -147,6 +147,7 @@ class DatasetWriter:
         while len(self._jobs) > left:
             stored, row, job = self._jobs.popleft()
             stored.id.write_direct_chunk((row, 0)[: stored.ndim], job.result())
+        self._file.require_written()
 
 
 def _compressed(chunk: np.ndarray) -> bytes:

@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 
 import forcegp.robots
 from forcegp.data.dataset import Dataset
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 
@@ -228,9 +229,5 @@ def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robo
     if robot is None:
         assert system is not None
         robot = system.robot
-    if robot.joint_names != tuple(dataset.joint_names):
-        raise InvalidInput(
-            f"{robot.name} has joints {', '.join(robot.joint_names)}; the dataset has "
-            f"{', '.join(dataset.joint_names)}. Give the robot that was recorded."
-        )
+    require_rows("dataset", dataset, robot.joint_names, robot.name)
     return robot

@@ -6,6 +6,7 @@ Nothing in the file is executed: numbers, texts and JSON only, no pickles, no li
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,8 +33,92 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
 
     Raises InvalidInput if the folder does not exist or `path` is a folder.
     """
-    with atomic_file(path) as temporary, h5py.File(temporary, "x") as file:
+    with atomic_file(path) as temporary, NewFile(temporary) as file:
         _write(fields, file)
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a file is a dataset of this or another version."""
+    try:
+        with h5py.File(path, "r") as file:
+            return file.attrs.get("format") == FORMAT
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):  # whatever h5py meets in a damaged file
+        return False
+
+
+class NewFile(h5py.File):
+    """An empty HDF5 file to write to, whose context raises OSError where the disk is full.
+
+    HDF5 that cannot write cannot close its file either, and crashes the process at its end (2.0.0, segmentation fault).
+    So it writes through `_Sink`, which keeps the error to itself until the file is closed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._sink = _Sink(path, "x+b")
+        super().__init__(self._sink, "w")
+
+    def close(self) -> None:
+        """Write what is left. Raises OSError where something was not written."""
+        super().close()
+        self._sink.close()
+        self.require_written()
+
+    def require_written(self) -> None:
+        """Raise what kept data from being written so far."""
+        error = self._sink.error
+        if error is not None:
+            raise OSError(error.errno, error.strerror, str(self._sink.name))
+
+
+class _Sink(io.FileIO):
+    """A file that takes whatever it is given: what the disk does not take, and all that follows, stays in memory.
+
+    So HDF5 reads what it has written, which it needs in order to close the file.
+    """
+
+    error: OSError | None = None
+
+    def __init__(self, path: Path, mode: str) -> None:
+        super().__init__(path, mode)
+        self._lost: list[tuple[int, bytes]] = []
+
+    def write(self, data: Any, /) -> int:
+        view, begin = memoryview(data).cast("B"), self.tell()
+        done = 0
+        try:
+            while done < len(view) and self.error is None:
+                done += super().write(view[done:])
+        except OSError as error:
+            self.error = error
+        if done < len(view):
+            self._lost.append((begin + done, bytes(view[done:])))
+            self.seek(begin + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any, /) -> int:
+        view, begin = memoryview(buffer).cast("B"), self.tell()
+        count = super().readinto(view)
+        if not self._lost:
+            return count
+        for start, data in self._lost:
+            first, last = max(start, begin), min(start + len(data), begin + len(view))
+            if first < last:
+                view[first - begin : last - begin] = data[first - start : last - start]
+        self.seek(begin + len(view))
+        return len(view)
+
+    def seek(self, place: int, whence: int = 0, /) -> int:
+        if whence == io.SEEK_END and self._lost:
+            end = max(super().seek(0, io.SEEK_END), *(start + len(data) for start, data in self._lost))
+            return super().seek(end + place)
+        return super().seek(place, whence)
+
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
 
 
 def read_fields(path: Path) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 from warnings import warn
@@ -116,6 +116,27 @@ class Preparation:
             metadata["preparation"] = {**report, "earlier": dataset.metadata["preparation"]}
         prepared = replace(prepared, metadata=metadata)
         return Prepared(dataset=prepared, report=metadata["preparation"], preparation=chosen)
+
+
+def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """`metadata["preparation"]` as a `Preparation` leaves it; empty for what others may have put there."""
+    report: Any = metadata.get("preparation")
+    shapes = {
+        "cutoff": lambda value: value is None or (_are_numbers([value]) and 0.0 < value < np.inf),
+        **dict.fromkeys(("every", "trim"), lambda value: value is not None and _are_numbers([value])),
+        "delay": lambda value: None not in value and _are_numbers(value),
+        "why": lambda value: isinstance(value, Mapping),
+        **dict.fromkeys(("power_removed", "acceleration_noise"), lambda value: all(map(_are_numbers, value.values()))),
+    }
+    try:
+        whole = all(fits(report[name]) for name, fits in shapes.items() if name in report)
+        return report if whole and isinstance(report, Mapping) else {}
+    except (TypeError, AttributeError):
+        return {}
+
+
+def _are_numbers(values: Any) -> bool:
+    return isinstance(values, list | tuple) and all(value is None or isinstance(value, int | float) for value in values)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -27,7 +27,9 @@ from typing_extensions import override
 from forcegp.data.dataset import Dataset
 from forcegp.data.farthest_points import farthest_point_sampling
 from forcegp.data.filtering import episodes_in_order, require_no_turns
+from forcegp.data.preparation import preparation_report
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message
+from forcegp.robots.real_numbers import whole_number
 
 EXACT_DEGREE = 5
 """Weights are exact for polynomials of time up to this degree, however uneven the steps."""
@@ -114,11 +116,9 @@ class WindowObservation(ABC):
         """
         rows = _window_rows(dataset, self)
         _warn_of_filtered(dataset)
-        if points is not None and not 2 <= points <= len(rows):
-            raise InvalidInput(
-                f"points={points} is not between 2 and the {len(rows)} windows of {self.seconds:g} s in the dataset; "
-                "give fewer points or shorter windows."
-            )
+        if points is not None:
+            why = f"the windows of {self.seconds:g} s in the dataset; give fewer points or shorter windows"
+            points = whole_number("points", points, 2, len(rows), why)
         if points is not None and points < len(rows):
             rows = rows[farthest_point_sampling(self._mean_states(dataset, rows), points)]
         time = dataset.time[rows]
@@ -281,8 +281,7 @@ def _window_rows(dataset: Dataset, how: WindowObservation) -> Int[np.ndarray, "N
 
 
 def _warn_of_filtered(dataset: Dataset) -> None:
-    preparation = dataset.metadata.get("preparation")
-    cutoff = preparation.get("cutoff") if isinstance(preparation, Mapping) else None
+    cutoff = preparation_report(dataset.metadata).get("cutoff")
     if cutoff is not None:
         warnings.warn(
             f"the dataset was filtered at {cutoff:g} Hz, so the noise of its windows is not what they take it for; "

@@ -1,9 +1,10 @@
+from .doubts import unfinished_search as unfinished_search
 from .evaluation import Evaluation as Evaluation
 from .force_errors import (
     ForceScore as ForceScore, ForceScores as ForceScores, curve_coverage as curve_coverage, force_scores as
     force_scores,
 )
-from .overlap import system_warnings as system_warnings
+from .overlap import moved_system as moved_system, system_warnings as system_warnings
 from .plots.check import check_figure as check_figure
 from .plots.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
 from .plots.likelihood import likelihood_figure as likelihood_figure

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Generic, TypeVar
 
+from typing_extensions import override
+
+from forcegp.summary import Summary, listed
+
 Numbers = tuple[float, ...]
 PER = ("_per_joint", "_per_contact")
 Mean = TypeVar("Mean", float, float | None)
@@ -22,8 +26,8 @@ class _Mean(Generic[Mean]):
         return mean
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Evaluation(Summary):
     """Scores on one Dataset. Every `<score>_per_joint` (or `_per_contact`) has its mean as attribute `<score>`.
 
     Errors are in the units of what is compared: rad/s^2 (m/s^2 for prismatic joints) for accelerations, Nm (N) for
@@ -97,6 +101,16 @@ class Evaluation:
     multiplier_mae = _Mean[float | None]("multiplier_mae_per_contact")
     multiplier_rmse = _Mean[float | None]("multiplier_rmse_per_contact")
     multiplier_coverage_95 = _Mean[float | None]("multiplier_coverage_95_per_contact")
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """The scores that say most; all are in `to_dict()`."""
+        floor = "" if self.noise_floor is None else f", noise floor {self.noise_floor:.3g}"
+        free, warned = self.mae_noise_free, listed(self.warnings, most=1)
+        facts: dict[str, object] = {"rows": self.rows, "joints": len(self.joint_names)}
+        facts |= {"mae": f"{self.mae:.3g}{floor}", "known physics mae": f"{self.known_physics_mae:.3g}"}
+        facts |= {"nlpd": f"{self.nlpd:.3g} nats per row", "coverage 95": f"{self.coverage_95:.3g}"}
+        return facts | ({} if free is None else {"mae noise-free": f"{free:.3g}"}) | {"warnings": warned}
 
     def to_dict(self) -> dict[str, Any]:
         """Every score, and every mean before what it is the mean of, as plain JSON values."""

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Numbers
@@ -129,11 +130,7 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
     where two components of the model claim the same truth, since only their sum is true, and not without an analytical
     mean, where the processes hold the known forces, too. Raises InvalidInput for data of other joints.
     """
-    if tuple(dataset.joint_names) != posterior.joint_names:
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the model was trained on "
-            f"{', '.join(posterior.joint_names)}. Score it on data of the same robot."
-        )
+    require_rows("dataset", dataset, posterior.joint_names, "the model")
     named = true_names(_component_names(posterior), dataset)
     if not named and "lambda" not in dataset.truth:
         return ForceScores(len(dataset))

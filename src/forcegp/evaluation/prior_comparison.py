@@ -25,7 +25,9 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset, time_blocks
-from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import ForceGPError, InvalidInput, require_type
+from forcegp.evaluation.doubts import unfinished_search
 from forcegp.evaluation.scoring import evaluate
 from forcegp.inference import Exact, OptimizerOptions, ProblemSize
 from forcegp.inference.memory import require_memory
@@ -82,6 +84,18 @@ class PriorScore:
         return self.difference >= -STANDARD_ERRORS * self.standard_error
 
 
+COLUMNS: dict[str, Callable[[PriorScore], float | None]] = {
+    "marginal likelihood (NLL)": lambda score: score.nll,
+    "density of single rows left out": lambda score: -score.leave_one_out,
+    "test MAE": lambda score: score.mae,
+    "test NLPD": lambda score: score.nlpd,
+}
+"""Scores by which another candidate may be best, lower is better."""
+
+CLEAR = 0.01
+"""Relative difference below which two scores do not disagree."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PriorComparison:
     """Candidates in the order given, their scores, and the fitted models by name."""
@@ -110,7 +124,31 @@ class PriorComparison:
 
     @property
     def verdict(self) -> str:
-        """Which prior the data support, as one sentence."""
+        """Which prior the data support, in one sentence, and in another which columns of the table disagree."""
+        others = [
+            (what, best)
+            for what, key in COLUMNS.items()
+            if (best := self._best_by(key)) is not None and best is not self.preferred
+        ]
+        if not others:
+            return self._supported
+        named = "; ".join(f"{best.name} has the best {what}" for what, best in others)
+        return (
+            f"{self._supported} Other columns disagree: {named}. The choice rests on left-out stretches, which "
+            "are what a model has not seen; if errors of the acceleration are what counts, take the best test MAE."
+        )
+
+    def _best_by(self, key: Callable[[PriorScore], float | None]) -> PriorScore | None:
+        """The candidate with the least value, if it is less than that of the preferred one by a hundredth of it."""
+        known = [(value, score) for score in self.scores if (value := key(score)) is not None]
+        mine = key(self.preferred)
+        if mine is None or not known:
+            return None
+        value, best = min(known, key=lambda entry: entry[0])
+        return best if value < mine - CLEAR * abs(mine) else None
+
+    @property
+    def _supported(self) -> str:
         names = [score.name for score in self.supported]
         preferred, stretches = self.preferred, f"left-out stretches of {self.block_seconds:.3g} s"
         if len(names) == 1:
@@ -181,17 +219,16 @@ def compare_priors(
     FitError: no start of the search for a candidate could be evaluated.
     NotEnoughMemory: the exact covariances of the rows do not fit; give fewer points.
     """
+    require_type("dataset", dataset, Dataset)
+    require_type("priors", priors, Mapping, " from names to priors")
     workers = backend_for(backend, jobs)
     known = dataset.system if system is None else system
     if known is None:
         raise InvalidInput("the dataset does not carry its robot; give system=MechanicalSystem(robot, contacts)")
     if len(priors) < 2:
         raise InvalidInput(f"there is nothing to compare {', '.join(priors) or 'with'}; give two priors or more")
-    if test is not None and tuple(test.joint_names) != tuple(dataset.joint_names):
-        raise InvalidInput(
-            f"the test data have joints {', '.join(test.joint_names)}, the training data "
-            f"{', '.join(dataset.joint_names)}; give another recording of the same robot"
-        )
+    if test is not None:
+        require_rows("test", test, dataset.joint_names, "the training data")
     rows = training_rows(known.robot.joint_names, dataset, points)
     seconds = _block_seconds(rows) if block_seconds is None else block_seconds
     blocks = time_blocks(rows.time, rows.episode, seconds)
@@ -221,7 +258,8 @@ def _compared(
     for name, posterior in posteriors.items():
         difference, error = paired_difference(densities[name], best, sizes)
         evaluation = None if test is None else evaluate(posterior, test)
-        notes += [] if evaluation is None else evaluation.warnings
+        of_it = unfinished_search(posterior) if evaluation is None else evaluation.warnings
+        notes += [(sentence, name) for sentence in of_it]
         scores.append(
             PriorScore(
                 name=name,
@@ -242,8 +280,18 @@ def _compared(
         points=int(sizes.sum()),
         blocks=len(blocks),
         block_seconds=float(seconds),
-        warnings=tuple(dict.fromkeys(notes)),
+        warnings=_told_once(notes, len(posteriors)),
         posteriors=dict(posteriors),
+    )
+
+
+def _told_once(notes: Sequence[tuple[str, str]], candidates: int) -> tuple[str, ...]:
+    """Sentences, with the candidates that they are about where these are not all."""
+    whose: dict[str, list[str]] = {}
+    for sentence, name in notes:
+        whose.setdefault(sentence, []).append(name)
+    return tuple(
+        sentence if len(names) == candidates else f"{', '.join(names)}: {sentence}" for sentence, names in whose.items()
     )
 
 
@@ -280,7 +328,7 @@ def _require_memory(sizes: Sequence[ProblemSize], system: MechanicalSystem) -> N
     kept = sum(8 * (size.rows * size.rank) ** 2 for size in sizes)
     needed = kept + max(Exact().required_bytes(size) for size in sizes)
     what = f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows"
-    require_memory(needed, what, "give fewer points (points=N, --points N), or fewer candidates", system.robot.device)
+    require_memory(needed, what, "give fewer `points`, or fewer candidates", system.robot.device)
 
 
 def _note(progress: Progress, name: str) -> Callable[[int, int, float], None]:

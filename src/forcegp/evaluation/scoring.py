@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset, contact_doubts
-from forcegp.errors import InvalidInput
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import require_type
 from forcegp.evaluation import metrics
+from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.evaluation import Evaluation, Numbers
 from forcegp.evaluation.overlap import overlap_warnings
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows, stated_noise_level
@@ -26,12 +28,14 @@ def evaluate(
 
     Raises InvalidInput if the joints of model and Dataset differ.
     """
-    if tuple(dataset.joint_names) != posterior.joint_names:
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the model was trained on "
-            f"{', '.join(posterior.joint_names)}. Evaluate on data of the same robot."
-        )
+    require_type("posterior", posterior, Posterior, " of a fit, and the dataset after it")
+    require_rows("dataset", dataset, posterior.joint_names, "the model")
     predicted = predict_rows(posterior, dataset, progress)
+    scores = {
+        "known_physics_mae_per_joint": _numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
+        **_against_measurements(predicted, dataset),
+        **_against_truth(predicted, dataset),
+    }
     return Evaluation(
         rows=len(dataset),
         joint_names=posterior.joint_names,
@@ -39,14 +43,13 @@ def evaluate(
         noise_floor_per_joint=None
         if dataset.noise_std is None
         else _numbers(metrics.noise_floor(np.atleast_2d(dataset.noise_std).mean(axis=0))),
-        known_physics_mae_per_joint=_numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
         warnings=(
             *overlap_warnings(posterior, dataset),
             *_noise_warnings(posterior, dataset),
             *(str(doubt) for doubt in contact_doubts(dataset, posterior.system)),
+            *doubts(posterior, dataset, scores),
         ),
-        **_against_measurements(predicted, dataset),
-        **_against_truth(predicted, dataset),
+        **scores,
         **_constraint(predicted),
     )
 

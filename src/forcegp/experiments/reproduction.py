@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from forcegp import __version__
-from forcegp.atomic_files import write_json, write_text
+from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import save_figure
 from forcegp.experiments.experiment import Experiment, Row
@@ -97,6 +97,7 @@ def page_name(experiments: Sequence[Experiment], preset: str) -> str:
 def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        require_writable(folder / "trial")
     except OSError as error:
         raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
 

@@ -118,7 +118,7 @@ class CompiledSums:
         self._held = aligned(table), aligned(own), aligned(weights)
         self.latents, self.valid = len(weights), valid
         self._head = (self.latents, len(table), valid + filled, valid, *(x.data_ptr() for x in self._held))
-        self._sums = cpp_library(SOURCE).sums
+        self._sums = cpp_library(SOURCE, "sums").sums
         self._sums.restype = None
         self._sums.argtypes = [ctypes.c_long] * 5 + [ctypes.c_void_p] * 6
 

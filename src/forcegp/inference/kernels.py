@@ -72,11 +72,14 @@ class LatentKernels(torch.nn.Module):
 
     def at(self, parameters: Mapping[str, Tensor]) -> LatentKernels:
         """A copy that holds `parameters`, without gradients; this one is not changed."""
-        copy = deepcopy(self)
-        for name, value in copy.named_parameters():
+        return deepcopy(self).moved_to(parameters)
+
+    def moved_to(self, parameters: Mapping[str, Tensor]) -> LatentKernels:
+        """These kernels themselves, which from now on hold `parameters`, without gradients: copies take long."""
+        for name, value in self.named_parameters():
             value.requires_grad_(False)
             value.copy_(parameters[name].detach().reshape(value.shape))
-        return copy
+        return self
 
     def _at(self, parameters: Mapping[str, Tensor], what: torch.nn.Module, *arguments: object) -> Any:
         """`what(*arguments)`, a module that holds these kernels under the same names, at `parameters`."""

@@ -166,16 +166,17 @@ class FunctionalPosterior(LatentPosterior):
 
     def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 G_c k_c(Z, z) (Rasmussen & Williams 2006, eq. 2.26)
-        V = torch.stack([self._seen(index, z) for index, z in enumerate(features)], dim=-1).transpose(0, 1)
+        V = torch.stack([self.seen(index, z) for index, z in enumerate(features)], dim=-1).transpose(0, 1)
         prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
         return torch.diag_embed(prior) - V.mT @ V
 
     @override
     def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return self.kernels.dense[index].diagonal(z) - self._seen(index, z).square().sum(0)
+        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
 
-    def _seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "ND n"]:
-        """L^-1 G_c k_c(Z, z)."""
+    @override
+    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        # L^-1 G_c k_c(Z, z)
         cross = self.kernels.dense[index].cross(self.features[index], z)
         return self.factor.solve_lower(self.functionals.through(index, cross))
 

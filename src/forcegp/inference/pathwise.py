@@ -108,8 +108,10 @@ class FunctionSamples:
     beta: Float[Tensor, "S C N"]
 
     @classmethod
-    def draw(cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES) -> FunctionSamples:
-        """Draw functions; the same seed gives the same ones.
+    def draw(
+        cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
+    ) -> FunctionSamples:
+        """Draw functions, `widening` times as far from the mean; the same seed gives the same ones.
 
         Raises InvalidInput if a kernel is not a scaled squared exponential; `draw_functions` takes others, too.
         """
@@ -127,8 +129,8 @@ class FunctionSamples:
                 [_cosines(kernels.training, omega[s], amplitudes[:, s]) for s in range(samples)], dim=1
             )
             at_centers = [values[:, : len(z)] for values, z in zip(prior, latent.features, strict=True)]
-            beta = stacked(latent.function_weights(at_centers, generator)).transpose(0, 1)
-        return cls(kernels, omega, amplitudes, beta)
+            weights = _widened(latent, latent.function_weights(at_centers, generator), widening)
+        return cls(kernels, omega, widening * amplitudes, stacked(weights).transpose(0, 1))
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
         """Every function at points of its own: f_s,c(z_s,i)."""
@@ -149,10 +151,13 @@ class ComposedSamples:
     latent: LatentPosterior
     terms: tuple[tuple[DrawnTerm, ...], ...]
     beta: tuple[Float[Tensor, "S _"], ...]
+    widening: float
 
     @classmethod
-    def draw(cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES) -> ComposedSamples:
-        """Draw functions; the same seed gives the same ones, `frequencies` are those of one function of one term.
+    def draw(
+        cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
+    ) -> ComposedSamples:
+        """As `FunctionSamples.draw`; `frequencies` are those of one function of one term.
 
         Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
         """
@@ -168,7 +173,8 @@ class ComposedSamples:
             prior = [
                 _at_same_points(drawn, z, samples, frequencies) for drawn, z in zip(terms, latent.features, strict=True)
             ]
-            return cls(latent, terms, latent.function_weights(prior, generator))
+            weights = _widened(latent, latent.function_weights(prior, generator), widening)
+            return cls(latent, terms, tuple(weights), widening)
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
         """Every function at points of its own: f_s,c(z_s,i)."""
@@ -179,18 +185,26 @@ class ComposedSamples:
             flat = z.flatten(0, 1)
             cross = kernel.cross(flat, training).unflatten(0, z.shape[:2])
             update = (cross @ self.beta[c][..., None])[..., 0]
-            columns.append(_sum(self.terms[c], flat, slice(None)) + update)
+            columns.append(self.widening * _sum(self.terms[c], flat, slice(None)) + update)
         return torch.stack(columns, dim=-1)
 
 
-def draw_functions(latent: LatentPosterior, samples: int, seed: int) -> FunctionSamples | ComposedSamples:
-    """Functions drawn from the posterior of the latents; the same seed gives the same ones.
+def draw_functions(
+    latent: LatentPosterior, samples: int, seed: int, widening: float = 1.0
+) -> FunctionSamples | ComposedSamples:
+    """Functions drawn from the posterior of the latents, `widening` times as far from its mean.
 
+    The same seed gives the same ones.
     Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
     """
     with torch.no_grad():
         stacked = StackedKernels.of(latent) is not None
-    return (FunctionSamples if stacked else ComposedSamples).draw(latent, samples, seed)
+    return (FunctionSamples if stacked else ComposedSamples).draw(latent, samples, seed, widening=widening)
+
+
+def _widened(latent: LatentPosterior, weights: Sequence[Tensor], widening: float) -> list[Tensor]:
+    """w f + (1 - w) mean at the centres, of functions f whose prior part is multiplied by w as well."""
+    return [widening * drawn + (1.0 - widening) * mean for drawn, mean in zip(weights, latent.weights, strict=True)]
 
 
 def _sum(drawn: Sequence[DrawnTerm], z: Float[Tensor, "n d"], samples: slice) -> Float[Tensor, "S m"]:

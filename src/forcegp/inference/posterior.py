@@ -47,6 +47,22 @@ class LatentPosterior(ABC):
     def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
         """Variance of one latent at points of its own features."""
 
+    def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
+        """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
+
+        Rasmussen & Williams 2006, eq. 2.26. Raises InvalidInput for engines that do not factorise the covariance.
+        """
+        V = torch.cat([self.seen(index, z) for index, z in enumerate(features)], dim=-1)
+        prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
+        return prior - V.mT @ V
+
+    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        """L^-1 Cov(data, f(z)) of one latent, with L L^T the covariance of the (whitened) data.
+
+        Raises InvalidInput for engines that do not factorise it.
+        """
+        raise InvalidInput(f"a {type(self).__name__} does not factorise the covariance of all rows; {self.remedy}.")
+
     @abstractmethod
     def function_weights(
         self, prior: Sequence[Float[Tensor, "S _"]], generator: torch.Generator
@@ -113,10 +129,13 @@ class ExactPosterior(LatentPosterior):
 
     @override
     def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        kernel, C = self.kernels.dense[index], self.system.deflation.C
-        cross = kernel.cross(z, self.features[index])
-        V = (cross.mT[:, None, :] * C[:, :, index, None]).flatten(0, 1)
-        return kernel.diagonal(z) - self.system.factor.solve_lower(V).square().sum(0)
+        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
+
+    @override
+    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        cross = self.kernels.dense[index].cross(z, self.features[index])
+        V = (cross.mT[:, None, :] * self.system.deflation.C[:, :, index, None]).flatten(0, 1)
+        return self.system.factor.solve_lower(V)
 
     @override
     def function_weights(

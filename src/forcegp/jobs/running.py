@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from forcegp.atomic_files import write_json
+from forcegp.atomic_files import require_writable, write_json
 from forcegp.errors import BackendError, FitError, ForceGPError, OutdatedWarning
 from forcegp.jobs.job import Job, digests
 from forcegp.jobs.machine import machine
@@ -42,6 +42,7 @@ def run_jobs(
         store.remove_leftovers()
         missing = {job.name: job for job in jobs if not store.has(job.name, wanted[job.name])}
         if missing:
+            require_writable(store.place("trial"))
             _warn_of_outdated(store, missing)
             _Run(store, jobs, missing, wanted, progress).on(backend or Joblib(1))
     return len(missing)
@@ -84,6 +85,7 @@ class _Run:
         self.failed: dict[str, str] = {}
         self.progress = progress
         self.sent: dict[str, Shared] = {}
+        self.stopped = False
 
     def on(self, backend: Backend) -> None:
         """Compute all."""
@@ -130,7 +132,7 @@ class _Run:
 
     def _ready(self, free: int | float) -> list[Job]:
         """The next jobs whose inputs are finished: those that others wait for longest come first."""
-        ready = [job for job in self.waiting.values() if self.finished.issuperset(job.inputs)]
+        ready = [job for job in self.waiting.values() if not self.stopped and self.finished.issuperset(job.inputs)]
         ready.sort(key=lambda job: -self._work_behind(job.name))
         chosen = ready[: int(min(max(free, 0), len(ready)))]
         for job in chosen:
@@ -153,6 +155,8 @@ class _Run:
             self.finished.add(job.name)
         except ForceGPError as error:
             self.failed[job.name] = str(error)
+        except OSError as error:  # a full disk, say: what others would compute could not be kept either
+            self.failed[job.name], self.stopped = str(error), True
         except Exception as error:  # also a defect in one job must not cost what other jobs have done
             self.failed[job.name] = f"{type(error).__name__}: {error}"
         self.done_cost += job.cost

@@ -48,7 +48,7 @@ class JobStore:
         description = store._description()
         if description is None:
             if folder.exists() and (not folder.is_dir() or not all(map(_is_own_start, folder.iterdir()))):
-                raise InvalidInput(f"{folder} exists and was not written by `{kind}`; choose another --out.")
+                raise InvalidInput(f"{folder} exists and was not written by `{kind}`; choose another `folder`.")
         elif not overwrite:
             store._require_same(description["configuration"], configuration, can_overwrite=overwrite is not None)
             if description["format_version"] == FORMAT_VERSION:
@@ -72,11 +72,11 @@ class JobStore:
         file = next((self.folder / name for name in (DESCRIPTION, *BEFORE) if (self.folder / name).exists()), None)
         if file is None:
             return None
-        stored = read_json(file, f"choose another --out, or delete {self.folder}")
+        stored = read_json(file, f"choose another `folder`, or delete {self.folder}")
         if file.name == BEFORE[0]:
             stored["configuration"] = {"preset": stored.get("preset")}
         if stored.get("kind") != self.kind or not isinstance(stored.get("configuration"), dict):
-            raise InvalidInput(f"{self.folder} was not written by `{self.kind}`; choose another --out.")
+            raise InvalidInput(f"{self.folder} was not written by `{self.kind}`; choose another `folder`.")
         if file.name != DESCRIPTION:
             stored["format_version"] = 1
             stored["configuration"].pop("forcegp", None)
@@ -84,7 +84,7 @@ class JobStore:
             raise FileFormatError(
                 f"{self.folder} holds results of forcegp {stored.get('forcegp_version')} (format "
                 f"{stored.get('format_version')}); this is {__version__} (format {FORMAT_VERSION}). Choose another "
-                "--out."
+                "`folder`."
             )
         return stored
 
@@ -94,8 +94,8 @@ class JobStore:
         if differing:
             given = [f"{name} ({before.get(name)!r}, not {wanted.get(name)!r})" for name in differing]
             named = ", ".join(text if len(text) < 80 else name for name, text in zip(differing, given, strict=True))
-            more = ", or add --overwrite to compute everything anew" if can_overwrite else ""
-            raise InvalidInput(f"{self.folder} holds results with another {named}; choose another --out{more}.")
+            more = ", or add `overwrite=True` to compute everything anew" if can_overwrite else ""
+            raise InvalidInput(f"{self.folder} holds results with another {named}; choose another `folder`{more}.")
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -105,7 +105,7 @@ class JobStore:
             lock.acquire(blocking=False)
         except Timeout:
             raise InvalidInput(
-                f"another `{self.kind}` is at work in {self.folder}; wait for it, or choose another --out."
+                f"another `{self.kind}` is at work in {self.folder}; wait for it, or choose another `folder`."
             ) from None
         try:
             yield

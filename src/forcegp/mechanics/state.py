@@ -33,8 +33,7 @@ class State:
         cls, robot: Robot, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
     ) -> State:
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
-        for name, value in (("q", q), ("v", v), ("u", u)):
-            robot.check_input(name, value)
+        q, v, u = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v), ("u", u)))
         try:
             q, v, u = torch.broadcast_tensors(q, v, u)
         except RuntimeError:

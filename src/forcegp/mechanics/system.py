@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput
+from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.mechanics.contacts import Baumgarte, Contact
 from forcegp.mechanics.gauss_principle import ConstrainedDynamics
 from forcegp.mechanics.known_forces import (
@@ -26,6 +27,7 @@ from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.summary import Summary, listed
 
 FORMAT_VERSION = 1
 STORED_PARTS = {"urdf": str, "gravity": list, "armature": list, "locked": dict, "contacts": list, "known_forces": list}
@@ -33,8 +35,8 @@ CONSISTENCY_TOLERANCE = 1e-6
 """|A a - b| above this fraction of 1 + |b| means that redundant contacts contradict each other."""
 
 
-@dataclass(frozen=True, eq=False)
-class MechanicalSystem:
+@dataclass(frozen=True, eq=False, repr=False)
+class MechanicalSystem(Summary):
     """What is known: the robot, its contacts, the known forces, and Baumgarte's terms if the motion has them.
 
     `known_forces` is the complete list; the default is actuation and rigid-body bias. Joint damping and friction of the
@@ -48,6 +50,7 @@ class MechanicalSystem:
     baumgarte: Baumgarte | None = None
 
     def __post_init__(self) -> None:
+        require_type("robot", self.robot, Robot, ", for example Robot.from_urdf(path)")
         for name, kind in (("contacts", Contact), ("known_forces", KnownForce)):
             given = getattr(self, name)
             values = tuple(given) if isinstance(given, Iterable) else (given,)
@@ -63,6 +66,16 @@ class MechanicalSystem:
                     "constrains nothing; name a frame "
                     "that moves."
                 )
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """Robot, contacts and known forces."""
+        return {
+            "robot": f"{self.robot.name!r}, {self.robot.nv} joints",
+            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.contacts),
+            "known forces": listed(type(force).__name__ for force in self.known_forces),
+            "baumgarte": self.baumgarte or "none",
+        }
 
     def dynamics(
         self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
@@ -142,7 +155,7 @@ class MechanicalSystem:
 
     def with_contacts(self, contacts: Sequence[Contact]) -> MechanicalSystem:
         """The same robot and forces under other contacts."""
-        return replace(self, contacts=tuple(contacts))
+        return replace(self, contacts=contacts)  # type: ignore[arg-type]  # the constructor makes a tuple, or refuses
 
     def force_index(self, name: str) -> int:
         """Position of the one known force that files call `name`, among those whose coefficients can be estimated.

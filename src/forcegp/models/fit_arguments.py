@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,9 +11,21 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
-from forcegp.errors import InvalidInput
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.noise import Noise
+from forcegp.robots.real_numbers import whole_number
+
+MOST_RESTARTS = 10_000
+"""So that a slip such as 10**9 is refused: a start takes from tenths of a second to minutes."""
+
+
+START_SHARE = 0.1
+"""Noise of an acceleration over its spread, from which it is learned; its hyperprior spans a factor of e about that."""
+
+QUIET = 1e-3
+"""Spread of a joint that hardly moves, as a fraction of the largest."""
 
 
 def check_system_and_noise(model: Any) -> None:
@@ -20,19 +33,15 @@ def check_system_and_noise(model: Any) -> None:
 
     Raises InvalidInput for another system.
     """
-    if not isinstance(model.system, MechanicalSystem):
-        given = type(model.system).__name__
-        raise InvalidInput(f"system is a {given}; give a MechanicalSystem, for example system=dataset.system")
+    require_type("system", model.system, MechanicalSystem, ", for example system=dataset.system")
     if model.noise is not None and not isinstance(model.noise, Noise):
         object.__setattr__(model, "noise", Noise(model.noise))
 
 
 def checked_rows(joint_names: Sequence[str], dataset: Dataset) -> Dataset:
     """`dataset`, if it has these joints and at least 2 rows. Raises InvalidInput otherwise."""
-    if tuple(dataset.joint_names) != tuple(joint_names):
-        raise InvalidInput(
-            f"the dataset has joints {', '.join(dataset.joint_names)}; the robot has {', '.join(joint_names)}"
-        )
+    remedy = "; the system belongs to the model, as in StructuredGP(system)"
+    require_rows("dataset", dataset, joint_names, "the robot", remedy)
     if len(dataset) < 2:
         raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
     return dataset
@@ -46,8 +55,7 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
     checked_rows(joint_names, dataset)
     if points is None:
         return dataset
-    if not 2 <= points <= len(dataset):
-        raise InvalidInput(f"points={points} is not between 2 and the {len(dataset)} rows of the dataset")
+    points = whole_number("points", points, 2, len(dataset), "the rows of the dataset")
     return dataset if points == len(dataset) else farthest_rows(dataset, points)
 
 
@@ -78,26 +86,40 @@ def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:
 
 
 def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
-    """The noise given, else the level that the training rows state. Raises InvalidInput where neither is known."""
+    """The noise given, else the level that the training rows state, else one that is learned, with a warning.
+
+    It is then learned from `START_SHARE` of the spread of every joint's acceleration; with `Noise(None, learn=True)`
+    nothing is warned of.
+    """
     if noise is not None and noise.acceleration is not None:
         return noise
     level = rows.noise_level
-    if level is None:
-        raise InvalidInput(
-            "the dataset does not state its noise level; pass noise=Noise(0.1) if it is known in rad/s^2, or "
-            "noise=Noise(0.1, learn=True) "
-            "to learn it from there"
-        )
     noise = noise or Noise()
-    return replace(noise, acceleration=tuple(float(std) for std in level), from_data=not noise.learn)
+    if level is not None:
+        return replace(noise, acceleration=tuple(float(std) for std in level), from_data=not noise.learn)
+    if not noise.learn:
+        warnings.warn(
+            "the dataset does not state the noise of its accelerations, so it is learned with the other parameters; "
+            "give `noise` if it is known",
+            DataWarning,
+            stacklevel=2,
+        )
+    return replace(noise, acceleration=_start_of_noise(rows), learn=True)
+
+
+def _start_of_noise(rows: Dataset | Windows) -> tuple[float, ...]:
+    """Where the search for the noise of every joint begins, in units of its acceleration."""
+    spread = (rows.observed if isinstance(rows, Windows) else rows.a).std(axis=0)
+    largest = float(spread.max())
+    if not largest > 0.0:
+        raise InvalidInput("the acceleration of every joint is constant, so its noise cannot be learned; give `noise`")
+    return tuple(float(START_SHARE * max(std, QUIET * largest)) for std in spread)
 
 
 def check_search_numbers(restarts: int, seed: int) -> None:
     """Raises InvalidInput for numbers that are out of range."""
-    if restarts < 1:
-        raise InvalidInput(f"restarts={restarts} must be at least 1")
-    if seed < 0:
-        raise InvalidInput(f"seed={seed} must be 0 or larger")
+    whole_number("restarts", restarts, 1, MOST_RESTARTS, "the most that one search runs")
+    whole_number("seed", seed, 0)
 
 
 def first_start(

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput, UnknownRow
+from forcegp.summary import Summary, listed
 
 
-@dataclass(frozen=True, eq=False)
-class Gaussian:
+@dataclass(frozen=True, eq=False, repr=False)
+class Gaussian(Summary):
     """A normal distribution per state; `covariance` is None where only the mean was asked for."""
 
     mean: Float[Tensor, "*batch k"]
@@ -21,7 +26,7 @@ class Gaussian:
     def variance(self) -> Float[Tensor, "*batch k"]:
         """Diagonal of the covariance (..., k)."""
         if self.covariance is None:
-            raise ValueError("only the mean was predicted; call predict(..., covariance=True)")
+            raise InvalidInput("only the mean was predicted; call predict(..., covariance=True)")
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0)
 
     @property
@@ -29,8 +34,36 @@ class Gaussian:
         """Standard deviation of each entry (..., k)."""
         return self.variance.sqrt()
 
+    def __getitem__(self, index: Any) -> Self:
+        """The same for some of the states: `prediction[i]`, `prediction[:10]`, `prediction[mask]`.
 
-@dataclass(frozen=True, eq=False)
+        `index` is for the batch dimensions. Raises UnknownRow for states that are not there.
+        """
+        batch = self.mean.shape[:-1]
+        try:
+            rows = torch.arange(batch.numel(), device=self.mean.device).reshape(batch)[index]
+        except (IndexError, TypeError) as error:
+            raise UnknownRow(f"no states {index!r} in a batch of shape {tuple(batch)}: {error}") from None
+
+        def chosen(part: Any) -> Any:
+            if isinstance(part, Tensor):
+                return part.flatten(0, len(batch) - 1)[rows] if batch else part[None][rows]
+            return part[index] if isinstance(part, Gaussian) else part
+
+        return type(self)(**{item.name: chosen(getattr(self, item.name)) for item in fields(self)})
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """Shape, and the largest mean and standard deviation."""
+        facts: dict[str, object] = {"batch": tuple(self.mean.shape[:-1]), "entries": self.mean.shape[-1]}
+        if self.mean.numel() and not self.mean.is_meta:
+            facts["largest mean"] = f"{float(self.mean.detach().abs().amax()):.3g}"
+            if self.covariance is not None:
+                facts["largest std"] = f"{float(self.std.detach().amax()):.3g}"
+        return facts | ({"covariance": "only the mean was predicted"} if self.covariance is None else {})
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Gaussian):
     """The acceleration (`mean` in rad/s^2 or m/s^2, `covariance`), without measurement noise, and the forces behind it.
 
@@ -47,6 +80,12 @@ class Prediction(Gaussian):
     contact_force: Gaussian | None
     unknown_force: Gaussian | None
     noise_covariance: Float[Tensor, "*batch nv nv"]
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """Of the acceleration, and which forces there are."""
+        forces = [name for name in ("multiplier", "contact_force", "unknown_force") if getattr(self, name) is not None]
+        return {**super().facts(), "forces": listed(forces)}
 
     @classmethod
     def of_accelerations(

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,6 +22,7 @@ from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
+from forcegp.robots.real_numbers import real_tensor, require_finite
 
 INSTEAD_OF_TRANSFORMS = (
     "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
@@ -66,6 +66,7 @@ class Predictor:
     tape: TapedTerms | EagerTerms
     kind: str
     compressed: CompressedCovariance | None
+    widening: float
     prepare_seconds: float
 
     @property
@@ -118,9 +119,9 @@ class Predictor:
         if not terms.W.shape[-1]:
             return terms.W.new_zeros(len(terms.W), 0, 0)
         if self.compressed is None:
-            return self.latent.covariance(terms.features)
+            return self.widening**2 * self.latent.covariance(terms.features)
         P = self.prepared.ordered(self.compressed.roots(cross))
-        return torch.diag_embed(self.prepared.diagonal(terms.inputs)) - P @ P.mT
+        return self.widening**2 * (torch.diag_embed(self.prepared.diagonal(terms.inputs)) - P @ P.mT)
 
     def _linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         terms, slopes = self.tape.with_jacobians(x)
@@ -132,10 +133,7 @@ class Predictor:
 
     def _rows(self, q: Any, v: Any, u: Any) -> tuple[Tensor, bool]:
         """One row [q, v, u] per state, and whether it was a single state."""
-        states = [
-            x.to(torch.float64) if isinstance(x, Tensor) else torch.tensor(np.array(x, np.float64), device=self.device)
-            for x in (q, v, u)
-        ]
+        states = [real_tensor(name, x, self.device) for name, x in zip("qvu", (q, v, u), strict=True)]
         shape = states[0].shape
         if shape[-1:] != (self.nv,) or len(shape) > 2 or any(x.shape != shape for x in states):
             shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", states, strict=True))
@@ -147,8 +145,7 @@ class Predictor:
         x = torch.cat(states, dim=-1)
         if isinstance(self.tape, TapedTerms):
             require_plain([x], "a compiled predictor", INSTEAD_OF_TRANSFORMS)
-        if not math.isfinite(float(x.detach().sum())):
-            raise InvalidInput("q, v or u has values that are not finite; a predictor needs finite states.")
+        require_finite("q, v or u", x)
         return (x[None], True) if len(shape) == 1 else (x, False)
 
     def _blocks(self, x: Tensor) -> Sequence[Tensor]:

@@ -13,17 +13,22 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
-from forcegp.mechanics import Baumgarte, ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.prediction import Prediction, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
+from forcegp.models.structured.components import Components, Curve
 from forcegp.models.training_data import TrainingData
+from forcegp.robots import Robot
+from forcegp.robots.real_numbers import real_tensor, require_finite
+from forcegp.summary import Summary, rounded
 
 ROWS_PER_BLOCK = 4096
 """States that are predicted at once; bounds the memory of long recordings."""
@@ -33,7 +38,7 @@ AnyPosterior = TypeVar("AnyPosterior", bound="Posterior")  # beartype cannot che
 Array = Tensor | np.ndarray | Sequence[Any]
 
 
-class Posterior(ABC):
+class Posterior(Summary, ABC):
     """What a fitted model has learned, as a frozen value.
 
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
@@ -82,6 +87,18 @@ class Posterior(ABC):
     ) -> Prediction:
         """`predict` for one block of checked states."""
 
+    @override
+    def facts(self) -> dict[str, object]:
+        """Model, robot, training rows, and how the search ended."""
+        rows, result = self.training, self.result
+        return {
+            "model": self.description,
+            "robot": f"{self.system.robot.name!r}, {self.system.robot.nv} joints, {len(self.system.contacts)} contacts",
+            "learned from": f"{len(rows)} {'rows' if rows.weights is None else 'windows'}",
+            "noise std": rounded(self.noise_std.tolist()),
+            "search": f"{'converged' if result.converged else 'not converged'}, {result.status}",
+        }
+
     @property
     def joint_names(self) -> tuple[str, ...]:
         """The joints in the order of every last dimension."""
@@ -120,7 +137,8 @@ class Posterior(ABC):
         States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
         taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
         in q, v and u where these are tensors that require gradients.
-        Raises InvalidInput for wrong shapes or values that are not finite.
+        Raises InvalidInput for wrong shapes or values that are not finite, and inside `torch.func.vmap`, whose batch
+        the leading dimensions are; NumericalError where the result is not finite.
         """
         states, batch = self.checked_states(q, v, u)
         q, v, u = states
@@ -129,7 +147,17 @@ class Posterior(ABC):
             for start in range(0, max(len(q), 1), ROWS_PER_BLOCK)
             for block in [slice(start, start + ROWS_PER_BLOCK)]
         ]
-        return join_predictions(blocks, batch)
+        predicted = join_predictions(blocks, batch)
+        _require_finite_prediction(predicted)
+        return predicted
+
+    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
+        """Every force by itself, at states as for `predict`. Raises InvalidInput for models that predict no forces."""
+        raise InvalidInput(f"a {self.description} predicts no forces, so it has no components; use a StructuredGP.")
+
+    def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
+        """One process of the prior over its features. Raises InvalidInput for models without a prior on forces."""
+        raise InvalidInput(f"a {self.description} has no latent forces, so it has no curves; use a StructuredGP.")
 
     def predictor(
         self,
@@ -180,7 +208,7 @@ class Posterior(ABC):
         if baumgarte is not None:
             raise InvalidInput(
                 f"baumgarte was given, but a {type(self).__name__} has no constraint, so there is "
-                "nothing to stabilise; give baumgarte=None, and integrator='projected' to stay on the surface."
+                "nothing to stabilise; give baumgarte=None, and `integrator='projected'` to stay on the surface."
             )
 
         def mean() -> AccelerationFunction:
@@ -188,7 +216,7 @@ class Posterior(ABC):
 
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             raise InvalidInput(
-                f"no functions can be drawn from a {type(self).__name__}; give samples=0, or use a StructuredGP."
+                f"no functions can be drawn from a {type(self).__name__}; give `samples=0`, or use a StructuredGP."
             )
 
         return AccelerationModel(self.system, None, mean, sampled)
@@ -281,6 +309,14 @@ class Posterior(ABC):
             "another; fit it to data from there, or use a structured model, which learns forces."
         )
 
+    def with_contacts(self, contacts: Sequence[Contact]) -> Posterior:
+        """The same knowledge under other contacts. Raises InvalidInput as `with_system`."""
+        return self.with_system(self.system.with_contacts(contacts))
+
+    def with_robot(self, robot: Robot) -> Posterior:
+        """The same knowledge on another robot with the same joints. Raises InvalidInput as `with_system`."""
+        return self.with_system(self.system.with_robot(robot))
+
     def to(self: AnyPosterior, device: torch.device | str) -> AnyPosterior:
         """The same knowledge on another device, for instance "cuda": conditioned there on the same rows.
 
@@ -352,24 +388,29 @@ class Model(ABC):
         """Names and shapes of the parameters that a posterior on these points needs."""
 
 
+def _require_finite_prediction(predicted: Prediction) -> None:
+    """Raise NumericalError for a state so large, or a system so singular, that the numbers were lost on the way."""
+    variance = predicted.mean if predicted.covariance is None else predicted.variance
+    lost = ~torch.isfinite(predicted.mean.detach() + variance.detach()).reshape(-1, predicted.mean.shape[-1]).all(-1)
+    if bool(lost.any()):
+        raise NumericalError(
+            f"the prediction of row {int(lost.nonzero()[0])} is not finite: q, v or u is too large for float64 there, "
+            "the mass matrix is singular, or a surface has no normal; check q, v and u of that row, and the system by "
+            "MechanicalSystem.check_states."
+        )
+
+
 def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
 
 
 def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
-    if isinstance(values, Tensor):
-        tensor = values.to(torch.float64)
-    else:
-        try:
-            tensor = torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
-        except (TypeError, ValueError) as error:
-            raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None
+    tensor = real_tensor(name, values, device)
     if tensor.dim() == 0 or tensor.shape[-1] != nv:
         raise InvalidInput(
             f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {nv}, one value per joint."
         )
-    if not bool(torch.isfinite(tensor).all()):
-        raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
+    require_finite(name, tensor)
     return tensor
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -15,6 +14,7 @@ from forcegp.errors import InvalidInput
 from forcegp.integration import ConstraintManifold, Feedback, Trajectory, integrate, integrator_named
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.search import blas_threads
+from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
 
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
@@ -113,10 +113,7 @@ def roll_out(
     progress: Callable[[int, int], None] | None = None,
 ) -> Rollout:
     """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 0:
-        raise InvalidInput(f"samples is {samples!r}; give the number of sampled motions, 0 for none.")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InvalidInput(f"seed is {seed!r}; give an integer of at least 0.")
+    samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model.system)
     q, v, forces, batch = _checked_start(model, q0, v0, u)
     runs = _Runs(model, integrator, dt)
@@ -214,14 +211,16 @@ def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunc
 def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
     """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions."""
     robot = model.system.robot
-    given = {name: _numbers(name, values, robot.device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
+    given = {
+        name: real_tensor(name, values, robot.device).detach().to(robot.device)
+        for name, values in (("q0", q0), ("v0", v0), ("u", u))
+    }
     for name, values in given.items():
         least = 2 if name == "u" else 1
         if values.dim() < least or values.shape[-1] != robot.nv:
             wanted = f"(..., T, {robot.nv})" if name == "u" else f"(..., {robot.nv})"
             raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
-        if not bool(torch.isfinite(values).all()):
-            raise InvalidInput(f"{name} has values that are not finite; drop or repair them.")
+        require_finite(name, values)
     q, v, forces = given.values()
     steps = forces.shape[-2]
     if not steps:
@@ -236,12 +235,3 @@ def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[
     q, v = (x.expand(*batch, -1).reshape(-1, robot.nv) for x in (q, v))
     forces = forces.expand(*batch, -1, -1).reshape(-1, steps, robot.nv).movedim(1, 0).contiguous()
     return q, v, forces, batch
-
-
-def _numbers(name: str, values: Any, device: torch.device) -> Tensor:
-    if isinstance(values, Tensor):
-        return values.detach().to(device, torch.float64)
-    try:
-        return torch.tensor(np.array(values, dtype=np.float64), device=device)  # a copy: datasets are read-only
-    except (TypeError, ValueError) as error:
-        raise InvalidInput(f"{name} cannot be read as numbers: {error}") from None

@@ -1,7 +1,8 @@
 """Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
 
-A model that was carried to another system (`with_system`) has `target.urdf`, too, the robot there. The folder holds the
-training points and parameters; loading runs the same conditioning as fitting, so predictions are the same.
+`SHA256SUMS` holds the digest of each: a flipped bit would hardly ever be noticed otherwise. A model that was carried to
+another system (`with_system`) has `target.urdf`, too, the robot there. The folder holds the training points and
+parameters; loading runs the same conditioning as fitting, so predictions are the same.
 """
 
 from __future__ import annotations
@@ -20,14 +21,17 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder
 from forcegp.data import units_for
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
+from forcegp.file_digests import SUMS, added_files, require_unchanged, write_digests
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.stored_models import KINDS, kind_of
 from forcegp.models.training_data import TrainingData
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
+WITH_DIGESTS = 7
+"""The first format whose files have digests."""
 FEATURES = {
     "target": "it was carried to another system, for which it predicts",
     "reference": "its rows are standardised by others than those that it is conditioned on",
@@ -51,15 +55,23 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
 
     Raises
     ------
-    FileFormatError: `path` exists and `overwrite` is false, or is not a model folder.
+    FileFormatError: `path` is there, is not an empty folder, and `overwrite` is false, or is not a model folder, or is
+        one to which files were added.
     ContactError: a surface of the system holds code.
     """
+    require_type("posterior", posterior, Posterior)
     path = Path(path)
-    if path.exists():
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         if not overwrite:
             raise FileFormatError(f"{path} exists already; choose another name or pass overwrite=True")
         if not _is_model_folder(path):
             raise FileFormatError(f"{path} exists and is not a folder written by forcegp, so it is not overwritten")
+        others = added_files(path, ("model.json", "tensors.safetensors", ROBOT, TARGET))
+        if others:
+            raise FileFormatError(
+                f"{path} holds files that forcegp did not write there ({', '.join(others[:3])}), so it is not "
+                "overwritten; move them away or choose another name"
+            )
     kind = kind_of(posterior.model)
     system = posterior.model.system.to_dict()
     target = None if posterior.target is None else posterior.target.to_dict()
@@ -105,6 +117,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         for name, urdf in robots.items():
             (folder / name).write_bytes(urdf.encode("utf-8"))  # as text, line ends would change
         (folder / "model.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_digests(folder)
 
 
 def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
@@ -119,6 +132,9 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     path = Path(path)
     document = _document(path)
     declared = _declared(path / "model.json", document)
+    # whatever the version says: a flipped bit could make it one of those that had no digests
+    if not require_unchanged(path, "fit the model again") and document["format_version"] >= WITH_DIGESTS:
+        raise FileFormatError(f"{path} is incomplete: it has no {SUMS}; fit the model again")
     try:
         urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
         moved_to = None
@@ -154,6 +170,8 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             float(result["cpu_seconds"]),
         )
         names = document["joint_names"]
+        if not all(isinstance(name, str) for name in names) or not isinstance(settings.get("data", {}), dict):
+            raise ValueError("joint_names or the data of its settings are of another type")
     except (KeyError, TypeError, ValueError, RuntimeError, ForceGPError) as error:
         raise FileFormatError(f"{path / 'model.json'} is incomplete or damaged: {error}") from None
     if document.get("units") != _plain(units_for(system.robot)):

@@ -94,6 +94,10 @@ class ForcePrior(ABC):
             return SumPrior((self, other))
         return SumPrior((*self.summands(), *other.summands()))
 
+    def __radd__(self, other: object) -> ForcePrior:
+        """`sum([a, b])` begins with 0. Raises InvalidInput for anything else that is no prior, as `SumPrior`."""
+        return self if isinstance(other, int) and other == 0 else SumPrior((other, self))  # type: ignore[arg-type]  # refused there
+
 
 # Here because `ForcePrior.__add__` makes sums. Columns of B, features and kernels stand side by side, so one fit learns
 # all terms, and `posterior.components` finds each by its slice of the latents.

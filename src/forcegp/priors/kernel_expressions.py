@@ -23,6 +23,17 @@ from forcegp.priors.kernel_parameters import LOG_VARIANCE_SPREAD, float64, regis
 KernelFactory = Callable[[int, Tensor | float], Kernel]
 """Called with the number of features and the start variance of the function; returns a fresh float64 kernel."""
 
+ELSEWHERE = {
+    **dict.fromkeys(("rbf", "se", "gaussian", "exponentiated-quadratic"), "squared-exponential"),
+    **dict.fromkeys(("matern", "matern52", "matern-52"), "matern-5/2"),
+    **dict.fromkeys(("matern32", "matern-32"), "matern-3/2"),
+    **dict.fromkeys(("matern12", "exponential", "ornstein-uhlenbeck"), "matern-1/2"),
+    **dict.fromkeys(("rq", "rational"), "rational-quadratic"),
+    **dict.fromkeys(("dot-product", "linear-kernel"), "linear"),
+    "bias": "constant",
+}
+"""What GPyTorch, scikit-learn and GPy call the kernels of the registry."""
+
 _TOKEN = re.compile(r"[()+*]|[^()+*\s]+")
 
 
@@ -69,7 +80,7 @@ class KernelExpression:
             raise self._wrong(f"{name!r} stands where a name is expected")
         if name not in self.factories:
             where = "the registry" if name == self.expression.strip() else repr(self.expression)
-            raise InvalidInput(unknown_name_message("kernel", name, where, self.factories))
+            raise InvalidInput(unknown_name_message("kernel", name, where, self.factories, synonyms=ELSEWHERE))
         return self.factories[name]
 
     def _accept(self, token: str) -> bool:

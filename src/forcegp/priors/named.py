@@ -55,7 +55,10 @@ NAMED_PRIORS: dict[str, NamedPrior] = {
     "joint-accelerations": NamedPrior("accelerations without the contacts, on (q, v, u)", JointAccelerations),
     "none": NamedPrior("no unknown force at all", NoForces),
 }
-"""The names that `named_prior` and `--prior` take. Add your own: NAMED_PRIORS["mine"] = NamedPrior(..., MyPrior)."""
+"""The names that `named_prior` and `forcegp fit --prior` take.
+
+Add your own: NAMED_PRIORS["mine"] = NamedPrior(..., MyPrior).
+"""
 
 
 def named_prior(expression: str, system: MechanicalSystem | None = None) -> ForcePrior:

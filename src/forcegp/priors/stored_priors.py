@@ -45,6 +45,14 @@ def prior_to_dict(prior: ForcePrior) -> dict[str, Any]:
     return {"type": name, **prior.to_dict()}
 
 
+def described_prior(prior: ForcePrior) -> dict[str, Any]:
+    """`prior_to_dict`, or the name alone of a prior that is not in `PRIORS`: only storing a model needs more."""
+    try:
+        return prior_to_dict(prior)
+    except InvalidInput:
+        return {"type": type(prior).__name__}
+
+
 def prior_from_dict(stored: object) -> ForcePrior:
     """The prior that `prior_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
     if isinstance(stored, Mapping) and stored.get("type") == SUM:

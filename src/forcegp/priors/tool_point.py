@@ -71,7 +71,7 @@ def require_contact(prior: str, contact: int, system: MechanicalSystem) -> None:
         numbers = ", ".join(map(str, range(len(system.contacts))))
         have = f"only contact {numbers}" if system.contacts else "no contact"
         raise InvalidInput(
-            f"{prior} acts at contact {contact}, but the system has {have}; give the contact (--contact), or use a "
+            f"{prior} acts at contact {contact}, but the system has {have}; give the contact (`contacts`), or use a "
             "prior that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."
         )
 

@@ -47,7 +47,7 @@ def guessed_time(source: Source, used: Sequence[str]) -> str | None:
         return by_format
     named = [column for column in source.columns() if column.lower() in WORDS["time"]]
     if len(named) > 1:
-        raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; choose with --time.")
+        raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; choose with `time`.")
     return named[0] if named else None
 
 

@@ -62,7 +62,7 @@ def _choices(pattern: str, inside: str, joints: Sequence[str]) -> list[str]:
         return [f"{number:0{padded}d}" for number in range(first, last + step, step)]
     if inside == JOINTS:
         if not joints:
-            raise InvalidInput(f"{pattern!r} asks for the names of the joints, which are not known; add --joints.")
+            raise InvalidInput(f"{pattern!r} asks for the names of the joints, which are not known; add `joints`.")
         return list(joints)
     choices = [choice.strip() for choice in inside.split(",")]
     if len(choices) > 1 and all(choices):

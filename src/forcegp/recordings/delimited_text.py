@@ -80,7 +80,7 @@ class DelimitedText(Source):
             named = self._fields(comments[-1]) if comments else []
             if len(named) != len(fields):
                 raise FileFormatError(
-                    f"{self.path} begins with numbers, not with names of columns; add --headerless {len(fields)}, "
+                    f"{self.path} begins with numbers, not with names of columns; add `headerless` {len(fields)}, "
                     "or how many numbers make a row where every line holds one."
                 )
             self._columns, self._first = named, fields
@@ -94,10 +94,10 @@ class DelimitedText(Source):
 
     def _without_header(self, fields: list[str], width: int) -> None:
         if not all(_NUMBER.fullmatch(field) for field in fields):
-            raise FileFormatError(f"{self.path} begins with {fields[0]!r}, which is no number; leave --headerless out.")
+            raise FileFormatError(f"{self.path} begins with {fields[0]!r}, which is no number; leave `headerless` out.")
         if len(fields) not in (1, width):
             raise FileFormatError(
-                f"{self.path} has {len(fields)} numbers on its first line; --headerless is {width}. "
+                f"{self.path} has {len(fields)} numbers on its first line; `headerless` is {width}. "
                 "Either so many stand on every line, or one."
             )
         self._columns = [f"c{index + 1}" for index in range(width)]
@@ -107,7 +107,8 @@ class DelimitedText(Source):
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:
             return line.split()
-        row = next(csv.reader([line], delimiter=self._delimiter), [])
+        with reading(self.path, "text with a delimiter", csv.Error):  # a field of more than 131,072 letters, say
+            row = next(csv.reader([line], delimiter=self._delimiter), [])
         return [field.strip() for field in row]
 
     @override
@@ -166,7 +167,7 @@ class DelimitedText(Source):
             yield {name: np.ascontiguousarray(table[:, self._columns.index(name)]) for name in names}
         if rest.size:
             raise FileFormatError(
-                f"{self.path} has {count} numbers, which is no multiple of {width}; another --headerless may be right, "
+                f"{self.path} has {count} numbers, which is no multiple of {width}; another `headerless` may be right, "
                 "or the file is truncated."
             )
 
@@ -199,7 +200,7 @@ def _remedy(value: str) -> str:
     if re.fullmatch(r"[+-]?\d+,\d+", value):
         return "Write decimal points instead of commas."
     if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", value):
-        return "Write the time as a number of seconds, or give --step."
+        return "Write the time as a number of seconds, or give `step`."
     return "Repair or remove that row."
 
 
@@ -225,5 +226,5 @@ def _detected_delimiter(lines: Sequence[str], path: Path) -> str:
     if all(len(line.split()) == len(lines[0].split()) for line in lines) and len(lines[0].split()) > 1:
         return BLANKS
     if any(letter in lines[0] for letter in ";|") or len(lines[0].split()) > 1:
-        raise FileFormatError(f"{path}: its delimiter cannot be detected; add --delimiter.")
+        raise FileFormatError(f"{path}: its delimiter cannot be detected; add `delimiter`.")
     return ","

@@ -48,9 +48,9 @@ def open_source(
     """
     kind = _kind(path)
     if kind not in TEXT and (headerless or delimiter):
-        raise InvalidInput(f"--headerless and --delimiter mean nothing to {path}; they are for text files.")
+        raise InvalidInput(f"`headerless` and `delimiter` mean nothing to {path}; they are for text files.")
     if kind not in ARRAYS and within is not None:
-        raise InvalidInput(f"--episodes means nothing to {path}; it is for {', '.join(ARRAYS)} files.")
+        raise InvalidInput(f"`episodes` means nothing to {path}; it is for {', '.join(ARRAYS)} files.")
     if kind in TEXT:
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:

@@ -66,7 +66,7 @@ class ImportOptions:
             if value is not None and not 0.0 < value < float("inf"):
                 raise InvalidInput(f"{name} is {value}; it must be positive and finite.")
         if self.rate is not None and self.resample == "no":
-            raise InvalidInput("a rate asks for resampling; leave out --rate or --resample no.")
+            raise InvalidInput("a rate asks for resampling; leave out `rate` or `resample` no.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
         if self.most_rows < 1:
@@ -139,7 +139,7 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
 
     if mapping.side_by_side:
         if mapping.episodes is not None:
-            raise InvalidInput("files side by side are one recording; leave --episodes out.")
+            raise InvalidInput("files side by side are one recording; leave `episodes` out.")
         together = SideBySide([opened(index) for index in range(len(paths))])
         return [(str(together.path), together)]
     found: list[tuple[str, Source]] = []
@@ -176,7 +176,7 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
     if options.rate is not None:
         if options.rate < 0.9 / median:
             warnings.warn(
-                f"--rate {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
+                f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
                 "of that appears as slow motion. Filter first: forcegp prepare --cutoff --every.",
                 DataWarning,
                 stacklevel=3,
@@ -204,7 +204,7 @@ def _without_jumps(episodes: list[EpisodeRows]) -> list[EpisodeRows]:
                 raise DatasetError(
                     f"{recording.label}: q of joint {item.joint!r} jumps by more than half a turn at "
                     f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
-                    "is in degrees. Add --unwrap, or --unit q=deg."
+                    "is in degrees. Add `unwrap`, or `unit` q=deg."
                 )
     return episodes
 

@@ -43,7 +43,7 @@ def read_mapping(path: Path) -> ColumnMapping:
     Raises FileFormatError naming the file and the key.
     """
     if not path.is_file():
-        raise FileFormatError(f"{path} is not a file; give --mapping a YAML file.")
+        raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
     with reading(path, "YAML", yaml.YAMLError, RecursionError):
         if path.stat().st_size > LARGEST:
             raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
@@ -119,7 +119,7 @@ _EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "scale": "u=0.001", "off
 
 
 def factors_of(flag: str, text: str) -> Any:
-    """The value of --sign, --scale or --offset as a YAML file would have it."""
+    """The value of `sign`, `scale` or `offset` as a YAML file would have it."""
     if "=" not in text:
         return [_number(flag, part) for part in text.split(",")]
     return {name: [_number(flag, part) for part in parts] for name, parts in by_quantity(flag, text).items()}

@@ -40,13 +40,13 @@ def require_plausible_positions(
         degrees = item.unit.name == "rad" and max(-low, high) > TURNS
         where = f"{recording.label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
         if beyond:
-            hint = "Is it in degrees? Then add --unit q=deg." if degrees else "Are unit, sign, offset and URDF right?"
+            hint = "Is it in degrees? Then add `unit` q=deg." if degrees else "Are unit, sign, offset and URDF right?"
             raise DatasetError(
-                f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF. {hint} --beyond-limits accepts it."
+                f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF. {hint} `beyond_limits` accepts it."
             )
         if degrees and not stated and not np.isfinite(upper - lower):
             raise DatasetError(
-                f"{where}, more than two turns. Give --unit q=deg if it is in degrees, --unit q=rad if not."
+                f"{where}, more than two turns. Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
             )
 
 
@@ -59,7 +59,7 @@ def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot:
         if item.signal == "u" and 0.0 < limit < np.inf and most > STRONGER * limit:
             warnings.warn(
                 f"{recording.label}: u of joint {item.joint!r} reaches {most:.4g} {item.unit.si}; the URDF allows "
-                f"{limit:.4g}. Is it in another unit (--unit u=mNm), or on the motor's side of a gear (--scale)?",
+                f"{limit:.4g}. Is it in another unit (`unit` u=mNm), or on the motor's side of a gear (`scale`)?",
                 DataWarning,
                 stacklevel=2,
             )

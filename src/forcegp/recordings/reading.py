@@ -68,7 +68,7 @@ def read_recording(
     for columns in source.chunks(plan.columns, ROWS_AT_A_TIME) if plan.columns else ():
         count = len(next(iter(columns.values())))
         if rows + count > most_rows:
-            raise FileFormatError(f"{label} has more than {most_rows} rows; allow more with --max-rows.")
+            raise FileFormatError(f"{label} has more than {most_rows} rows; allow more with `most_rows`.")
         times.append(clock.seconds(columns, rows, count))
         table = np.empty((count, len(plan.signals)))
         for index, item in enumerate(plan.signals):

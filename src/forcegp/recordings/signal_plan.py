@@ -97,13 +97,13 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Ro
             )
     if not joints:
         example = ",".join(f"joint{index + 1}" for index in range(len(found["q"])))
-        raise InvalidInput(f"the joints have no names; add --joints, for example {example}, or --robot.")
+        raise InvalidInput(f"the joints have no names; add `joints`, for example {example}, or `system`.")
     if mapping.time is None and mapping.step is None:
         used = [name for expressions in found.values() for item in expressions for name in item.weights]
         name = guessed_time(source, used)
         if name is None:
             raise InvalidInput(
-                "no column for the time; name it with --time, or --step for the time between rows. "
+                "no column for the time; name it with `time`, or `step` for the time between rows. "
                 f"{source.path} has {_some(source.columns())}"
             )
         guessed.append(f"time = {name}")
@@ -111,7 +111,7 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Ro
     else:
         time = parse_expression(mapping.time, source.columns(), str(source.path)) if mapping.time is not None else None
     if time is not None and not time.weights:
-        raise InvalidInput(f"time is the constant {mapping.time!r}; give a column, or --step for the time of a row.")
+        raise InvalidInput(f"time is the constant {mapping.time!r}; give a column, or `step` for the time of a row.")
     order = range(len(joints)) if robot is None else [joints.index(name) for name in robot.joint_names]
     types = {} if robot is None else {joint.name: joint.type for joint in robot.joints}
     signals, units = _joint_signals(mapping, found, joints, order, types)
@@ -132,7 +132,7 @@ def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple
     if mapping.joints and sorted(mapping.joints) != sorted(own):
         raise InvalidInput(
             f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
-            "Give the columns of exactly these, or another --robot."
+            "Give the columns of exactly these, or another `system`."
         )
     return mapping.joints or own
 

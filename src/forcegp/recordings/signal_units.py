@@ -54,7 +54,7 @@ UNITS: dict[str, dict[str, LogUnit]] = {
     "a": _units("rad/s^2", rad_per_ssquared=1, deg_per_ssquared=_DEGREE)
     | _units("m/s^2", m_per_ssquared=1, mm_per_ssquared=_MILLI),
 }
-"""By quantity and name: what `--unit` accepts."""
+"""By quantity and name: what `ColumnMapping.unit` accepts."""
 
 
 def log_unit(quantity: str, name: str) -> LogUnit:

@@ -91,7 +91,7 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
     if not stretches:
         raise DatasetError(
             f"{recording.label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
-            "a longer --gap may be right."
+            "a longer `gap` may be right."
         )
     gaps = tuple(between[same & ~inside].tolist())
     worst = float(np.abs(between[inside] / step - 1.0).max())
@@ -109,7 +109,7 @@ def _typical_step(recording: RawRecording) -> float:
         raise DatasetError(
             f"{recording.label}: time runs backwards by {-steps[row - 1]:.6g} s at {recording.source.place(row)} "
             f"({recording.time[row]:.6g} s from the start), {backwards.size} times in all. Sort the log, map another "
-            "column as the time, or name the column that numbers its episodes (--episode)."
+            "column as the time, or name the column that numbers its episodes (`episode`)."
         )
     positive = steps[steps > 0]
     if len(recording.time) < FEWEST_ROWS:
@@ -126,7 +126,7 @@ def _between(recording: RawRecording, start: float | None, end: float | None) ->
     since = recording.time - np.repeat(recording.time[begins], counts)
     inside = (since >= (-np.inf if start is None else start)) & (since <= (np.inf if end is None else end))
     if not inside.any():
-        raise DatasetError(f"{recording.label}: no row lies between --start and --end; it has {since.max():.6g} s.")
+        raise DatasetError(f"{recording.label}: no row lies between `start` and `end`; it has {since.max():.6g} s.")
     return inside
 
 
@@ -139,9 +139,9 @@ def _require_rate(recording: RawRecording, step: float) -> None:
     if rate < SLOWEST:
         fitting = [unit for unit, factor in factors.items() if 10.0 <= rate * factor <= 2e4]
         if fitting:
-            hint = f"Is the time in {' or '.join(fitting)}? Then add --unit time={fitting[0]}."
+            hint = f"Is the time in {' or '.join(fitting)}? Then add `unit` time={fitting[0]}."
     else:
-        hint = "Is the time in s rather than in a smaller unit? Then add --unit time=s."
+        hint = "Is the time in s rather than in a smaller unit? Then add `unit` time=s."
     raise DatasetError(
         f"{recording.label}: the median step is {step:.6g} s, {rate:.3g} rows per second, no rate of a robot's log. "
         f"{hint}"

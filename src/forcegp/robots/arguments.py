@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.robots.real_numbers import real_array, real_tensor
 
 Vector = Sequence[float | int] | np.ndarray | Tensor
 Inertials = Mapping[str, Tensor]
@@ -17,21 +18,20 @@ JointValues = Float[Tensor, "*#batch nv"]
 """One value per joint, float64 (..., nv); the batch dimensions of several arguments broadcast."""
 
 
-def check_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> None:
-    """:class:`~forcegp.errors.InvalidInput` unless ``value`` is a float64 tensor (..., size) on ``device``."""
+def checked_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> Tensor:
+    """The tensor in float64; :class:`~forcegp.errors.InvalidInput` unless it is real (..., size) on ``device``."""
     if not isinstance(value, Tensor):
         raise InvalidInput(
             f"{name} is a {type(value).__name__}; give a tensor: torch.as_tensor({name}, dtype=torch.float64)."
         )
     if value.dim() == 0 or value.shape[-1] != size:
         raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
-    if value.dtype != torch.float64:
-        raise InvalidInput(f"{name} is {value.dtype}; the dynamics needs float64, pass {name}.double().")
     if value.device != device:
         raise InvalidInput(
             f"{name} is on {value.device} but the robot on {device}; use robot.to({str(value.device)!r}) "
             f"or {name}.to({str(device)!r})."
         )
+    return real_tensor(name, value, device)
 
 
 def check_mapping(inertials: object) -> None:
@@ -59,8 +59,9 @@ def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
 def finite_vector(name: str, values: Vector, size: int) -> np.ndarray:
     """``size`` finite numbers as an array."""
     try:
-        array = np.array([float(value) for value in values])
-    except (TypeError, ValueError):
+        plain = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
+        array = real_array(name, plain).astype(np.float64)
+    except InvalidInput:  # text, of which every letter could be a digit
         raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.") from None
     if array.shape != (size,) or not np.isfinite(array).all():
         raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
@@ -71,8 +72,7 @@ def checked_point(point: Vector, device: torch.device) -> Tensor:
     """A point (..., 3) in m as a float64 tensor on ``device``; :class:`~forcegp.errors.InvalidInput` for others."""
     if not isinstance(point, Tensor):
         point = torch.as_tensor(finite_vector("point", point, 3), device=device)
-    check_tensor("point", point, 3, "x, y, z in m", device)
-    return point
+    return checked_tensor("point", point, 3, "x, y, z in m", device)
 
 
 def armature_values(

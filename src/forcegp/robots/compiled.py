@@ -119,8 +119,7 @@ class CompiledRobot:
         return found
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
-        for name, value in arguments.items():
-            self.robot.check_input(name, value)
+        arguments = {name: self.robot.checked_input(name, value) for name, value in arguments.items()}
         shapes = {name: value.shape[:-1] for name, value in arguments.items()}
         tensors = list(arguments.values())
         if inertials:

@@ -169,8 +169,16 @@ def compile_c(source: str, options: tuple[str, ...], path: Path) -> None:
     """Compile a source text to the library ``path``, whole or not at all."""
     try:
         with atomic_file(path) as library:  # whoever else compiles the same meanwhile
-            options = (*OPTIONS, *options)
-            compile_library(C, source, options, library, purpose="compiled dynamics", instead="use the robot itself")
+            compile_library(
+                C,
+                source,
+                (*OPTIONS, *options),
+                library,
+                "evaluate",  # tried before it is kept
+                purpose="compiled dynamics",
+                elsewhere="robot.compile(folder=...)",
+                instead="use the robot itself",
+            )
             library.chmod(0o700)
     except OSError as error:
         raise CompilerError(

@@ -74,7 +74,7 @@ class Kinematics:
         self, a: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
-        self.robot.check_input("a", a)
+        a = self.robot.checked_input("a", a)
         at, inertias = self._expand(self._broadcast("a", a.shape[:-1]))._with_inertias(inertials)
         _, v = at._moving("inverse_dynamics")
         tree, a = self.robot.tree, _columns(a, at.batch_shape)
@@ -86,7 +86,7 @@ class Kinematics:
         self, tau: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
-        self.robot.check_input("tau", tau)
+        tau = self.robot.checked_input("tau", tau)
         at, inertias = self._expand(self._broadcast("tau", tau.shape[:-1]))._with_inertias(inertials)
         net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
         return at._rows(algorithms.solve_mass_matrix(at._mass_matrix(inertias), net))
@@ -99,7 +99,7 @@ class Kinematics:
         Body i is what joint i moves as one: its child link and all that is fixed to it. Parameters are about the
         origin and in the axes of the child link, in the order of :func:`forcegp.robots.inertia.standard_basis`.
         """
-        self.robot.check_input("a", a)
+        a = self.robot.checked_input("a", a)
         at = self._expand(self._broadcast("a", a.shape[:-1]))
         _, v = at._moving("torque_regressor")
         tree = self.robot.tree

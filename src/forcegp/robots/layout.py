@@ -179,7 +179,7 @@ def check_inertias(description: RobotDescription, layout: Layout, armature: np.n
             raise NonPhysicalInertia(
                 f"{description.source}: no physical body has the inertia of link {name!r}: {objection}. Correct its "
                 "<inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>), or "
-                "take the nearest inertia that a body can have: inertias='nearest', --inertias nearest."
+                "take the nearest inertia that a body can have: `inertias='nearest'`."
             )
         mass[placement.body] += inertial.mass
         local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)

@@ -107,7 +107,7 @@ class Robot(RobotStructure):
         text = self.urdf_text
         for name, parameters in inertials.items():
             self.layout.require_moving(name, self.name)
-            self.check_parameters(name, parameters)
+            parameters = self.checked_parameters(name, parameters)
             if parameters.dim() != 1:
                 raise InvalidInput(
                     f"inertials[{name!r}] has shape {tuple(parameters.shape)}; a robot holds one set, give shape (10,)."
@@ -148,10 +148,10 @@ class Robot(RobotStructure):
 
     def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:
         """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""
-        self.check_input("q", q)
+        q = self.checked_input("q", q)
         if v is None:
             return Kinematics.of(self, q, None)
-        self.check_input("v", v)
+        v = self.checked_input("v", v)
         if q.shape != v.shape:
             batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1]})
             q, v = q.expand(*batch, -1), v.expand(*batch, -1)

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
-from forcegp.robots.arguments import Inertials, check_mapping, check_tensor
+from forcegp.robots.arguments import Inertials, check_mapping, checked_tensor
 from forcegp.robots.layout import WORLD, Layout
 from forcegp.robots.parts import Joint, Link
 from forcegp.robots.tree import Tree, merged_inertias
 from forcegp.robots.urdf import RobotDescription
+from forcegp.summary import Summary, listed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RobotStructure:
+class RobotStructure(Summary):
     """The constants of a :class:`~forcegp.robots.Robot`, for code that its algorithms are made of."""
 
     description: RobotDescription
@@ -107,9 +109,11 @@ class RobotStructure:
             self.layout.require_moving(name, self.name)
         return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
 
-    def __repr__(self) -> str:
-        kinds = ", ".join(f"{joint.name} ({joint.type})" for joint in self.layout.joints)
-        return f"Robot({self.name!r}, nv={self.nv}, links={len(self.layout.links)}, joints=[{kinds}])"
+    @override
+    def facts(self) -> dict[str, object]:
+        """Name, sizes and joints."""
+        kinds = listed((f"{joint.name} ({joint.type})" for joint in self.layout.joints), most=7)
+        return {"name": repr(self.name), "nv": self.nv, "links": len(self.layout.links), "joints": kinds}
 
     # ------------------------------------------------------------------ checks of inputs
 
@@ -121,18 +125,18 @@ class RobotStructure:
         body, offset = found
         return body, offset.clone()
 
-    def check_input(self, name: str, value: object) -> None:
-        """:class:`~forcegp.errors.InvalidInput` unless ``value`` is float64 (..., nv) on the robot's device."""
-        check_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
+    def checked_input(self, name: str, value: object) -> Tensor:
+        """``value`` in float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv) on the robot's device."""
+        return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
         check_mapping(inertials)
-        for name, parameters in inertials.items():
+        for name in inertials:
             self.layout.require_moving(name, self.name)
-            self.check_parameters(name, parameters)
-        return merged_inertias(self.tree, self.layout, inertials)
+        checked = {name: self.checked_parameters(name, parameters) for name, parameters in inertials.items()}
+        return merged_inertias(self.tree, self.layout, checked)
 
-    def check_parameters(self, link: str, parameters: object) -> None:
-        """:class:`~forcegp.errors.InvalidInput` unless these can be log-Cholesky parameters of ``link``."""
-        check_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)
+    def checked_parameters(self, link: str, parameters: object) -> Tensor:
+        """In float64; :class:`~forcegp.errors.InvalidInput` unless they can be log-Cholesky parameters of ``link``."""
+        return checked_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

@@ -26,7 +26,7 @@ def read_text(path: str | Path) -> str:
     encoding = declared_encoding(data)
     try:
         return data.decode(encoding)
-    except (UnicodeDecodeError, LookupError):
+    except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
         raise UnreadableRobotFile(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'

@@ -21,7 +21,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, named_prior
-from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, learned_noise
+from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS
 
 Kind = Literal["given", "identified", "yardstick", "black box", "force prior"]
 """Parametric physics as given or identified, or identified from more rows than others see and therefore in no verdict,
@@ -64,7 +64,7 @@ class Training:
         """Of models with physics."""
         if self.levels is None:
             measured = self.measured_torque and self.force_noise is not None
-            return learned_noise(self.rows, self.force_noise, measured)
+            return Noise(None, self.force_noise, learn=True, measured_torque=measured)
         acceleration, force = (
             tuple(float(std) for std in stds) for stds in (self.levels.acceleration, self.levels.force)
         )
@@ -126,7 +126,7 @@ def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
 
 
 def _fit_independent(training: Training) -> Posterior:
-    model = IndependentGP(training.given, noise=learned_noise(training.rows))
+    model = IndependentGP(training.given, noise=Noise(None, learn=True))
     return model.fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
 
 

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models import Noise
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions
 from forcegp.validation.identified_systems import (
     DEFAULT_IDENTIFICATION,
     FRICTION,
     IDENTIFICATIONS,
-    learned_noise,
 )
 from forcegp.validation.splits import Split
 from forcegp.validation.training_subsets import training_subset
@@ -61,25 +62,23 @@ class Comparison:
     friction: tuple[str, ...] = FRICTION
 
     def __post_init__(self) -> None:
+        require_type("system", self.system, MechanicalSystem)
         names = tuple(self.system.robot.joint_names)
         for what, dataset in (("rows", self.rows), ("recording", self.recording)):
-            if tuple(dataset.joint_names) != names:
-                raise InvalidInput(
-                    f"the {what} have joints {', '.join(dataset.joint_names)}; the robot {', '.join(names)}"
-                )
+            require_rows(what, dataset, names, "the robot")
         for name in ("restarts", "iterations"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
-        learned_noise(self.rows, self.force_noise)
+        Noise(None, self.force_noise)
         integrator_named(self.integrator, self.system)
         if self.identification not in IDENTIFICATIONS:
             given, allowed = self.identification, ", ".join(IDENTIFICATIONS)
             raise InvalidInput(f"no identification is called {given!r}; there are {allowed}.")
         if self.measured_torque and self.force_noise is None and IDENTIFICATIONS[self.identification].noise is None:
             raise InvalidInput(
-                "measured_torque needs a noise of the forces; give force_noise (--force-noise SIGMA), or an "
-                "identification of all training rows, which finds it (--identification acceleration-all or torque-all)."
+                "measured_torque needs a noise of the forces; give `force_noise`, or an `identification` of "
+                "all training rows, which finds it: acceleration-all or torque-all."
             )
         if len({split.name for split in self.splits}) < len(self.splits) or not self.splits:
             raise InvalidInput("give one split or more, each of its own name.")

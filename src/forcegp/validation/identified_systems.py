@@ -7,29 +7,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from forcegp.analytical import NoiseLevels, held_out_noise, identify_analytical
 from forcegp.data import Dataset
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models import Noise
-
-START_NOISE = 0.1
-"""Where a learned noise begins, as a part of the standard deviation of the measured acceleration of each joint."""
-
-
-def learned_noise(rows: Dataset, force: float | None = None, measured_torque: bool = False) -> Noise:
-    """The noise that every model of a comparison learns, from the same start; `force`, `measured_torque` as in `Noise`.
-
-    It begins at what the dataset states, else at a tenth of the scatter of each joint's acceleration among `rows`.
-    """
-    if rows.noise_std is not None:
-        return Noise(None, force, learn=True, measured_torque=measured_torque)
-    scatter = rows.a.std(axis=0)
-    largest = float(scatter.max())
-    start = START_NOISE * np.where(scatter > 0.0, scatter, largest if largest > 0.0 else 1.0)
-    level = tuple(float(value) for value in start)
-    return Noise(level, force, learn=True, measured_torque=measured_torque)
 
 
 @dataclass(frozen=True)
@@ -52,11 +32,11 @@ class Identification:
 
 
 def _identified(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> MechanicalSystem:
-    return identify_analytical(system, rows, friction=friction, **how).system
+    return identify_analytical(rows, system, friction=friction, **how).system
 
 
 def _noise(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> NoiseLevels:
-    return held_out_noise(system, rows, friction=friction, **how)
+    return held_out_noise(rows, system, friction=friction, **how)
 
 
 def _consistent(likelihood: str, rows: str, all_rows: bool) -> Identification:

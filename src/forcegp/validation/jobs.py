@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
-from forcegp.errors import FileFormatError, ForceGPError
+from forcegp.errors import DataWarning, FileFormatError, ForceGPError
 from forcegp.jobs import Job, JobStore
 from forcegp.mechanics import MechanicalSystem
 from forcegp.parallel import Shared
@@ -162,7 +163,9 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
     posterior = work.fit(training)
     seconds = before + time.process_time() - start
     mass, whose = reference_mass(store, comparison, spec["mass_matrix"], test)
-    scores = acceleration_scores(posterior, test, mass)
+    scores, doubted = acceleration_scores(posterior, test, mass)
+    for sentence in doubted:
+        warnings.warn(sentence, DataWarning, stacklevel=1)  # the page shows what was warned of in a job
     motions = comparison.motions(comparison.splits[spec["split"]])
     scores["motions"] = motion_scores(posterior, motions, comparison.integrator)
     return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": len(rows), "test_rows": len(test), **scores}
@@ -190,6 +193,6 @@ def reference_mass(
     found = kept(store, name)
     if found["result"] is None:
         whose = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
-        return mass_matrices(comparison.system, test), whose
+        return mass_matrices(test, comparison.system), whose
     system = MechanicalSystem.from_dict(found["result"]["system"])
-    return mass_matrices(system, test), f"the system identified with seed 0 by {found['result']['how']}"
+    return mass_matrices(test, system), f"the system identified with seed 0 by {found['result']['how']}"

@@ -15,6 +15,9 @@ ALT_TEXTS = {
     "motions": "Errors of predicted motions against their length",
 }
 
+WORTH_PREDICTING = 0.7
+"""Force-space error of the best model over that of no acceleration, above which the score says nothing."""
+
 
 def page(document: Mapping[str, Any]) -> str:
     """Markdown: what was done, the conclusions, tables with the best marked, and what failed."""
@@ -76,7 +79,8 @@ def _done(document: Mapping[str, Any]) -> list[str]:
     whose = "; ".join(document["mass_matrix"]) or "none, since no model finished"
     lines.append(
         f"* Force-space error: M (predicted − measured acceleration) with one M for all models: of {whose}. Where M is "
-        "small, a small force is a large acceleration, so an error of acceleration alone can mislead."
+        "small, a small force is a large acceleration, so an error of acceleration alone can mislead. It is no error "
+        "of a torque: a model that shrinks accelerations scores well where they are small."
     )
     return ["\n".join(lines)]
 
@@ -180,12 +184,37 @@ def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
     parts = []
     for score, title, digits in tables:
         parts.append(f"{title}:\n\n{_joint_table(models, document, score, digits)}")
+        if score == "force_rms_per_joint":
+            parts += _at_rest(models, document)
     for level in (95, 50):
         score = f"coverage_{level}_per_joint"
         rows = [[_named(name, model), *(_percent(value) for value in model[score])] for name, model in models.items()]
         table = markdown_table(["model", *document["joint_names"]], rows)
         parts.append(f"Held-out rows inside the {level} % interval:\n\n{table}")
     return parts
+
+
+def _at_rest(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:
+    """What predicting no acceleration would score, and the joints where the best model is hardly better than that."""
+    rest = next((m["force_rms_at_rest_per_joint"] for m in models.values() if "force_rms_at_rest_per_joint" in m), None)
+    if rest is None:
+        return []
+    best = [_least(model["force_rms_per_joint"][joint] for model in models.values()) for joint in range(len(rest))]
+    empty = [
+        name
+        for name, least, value in zip(document["joint_names"], best, rest, strict=True)
+        if least is not None and least > WORTH_PREDICTING * value["median"]
+    ]
+    levels = ", ".join(
+        f"{name} {value['median']:.3g}" for name, value in zip(document["joint_names"], rest, strict=True)
+    )
+    sentence = f"Predicting no acceleration at all has {levels}."
+    if empty:
+        sentence += (
+            f" At {', '.join(empty)} the best model is hardly better than that: there this score says nothing about a "
+            "model, least of all how well it predicts torques."
+        )
+    return [sentence]
 
 
 def _joint_table(models: Mapping[str, Any], document: Mapping[str, Any], score: str, digits: int) -> str:

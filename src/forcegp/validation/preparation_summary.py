@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from forcegp.data import preparation_report
+
 
 def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
     """`metadata["preparation"]` of a Dataset (`data.Preparation`) as sentences, the last step first."""
-    report = metadata.get("preparation")
-    if not isinstance(report, Mapping):
+    report = preparation_report(metadata)
+    if not report:
         return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
     lines = [f"Preparation: {_step(report)}"]
     removed = report.get("power_removed")
@@ -21,7 +23,7 @@ def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
     for quantity, reason in dict(report.get("why") or {}).items():
         lines.append(f"Chosen automatically, {quantity}: {_reason(reason)}")
     earlier = report.get("earlier")
-    return lines + (preparation_lines({"preparation": earlier}) if isinstance(earlier, Mapping) else [])
+    return lines + (preparation_lines({"preparation": earlier}) if preparation_report({"preparation": earlier}) else [])
 
 
 def _step(report: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ import forcegp.evaluation
 import forcegp.validation
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.jobs.machine import machine
 from forcegp.parallel import Backend, backend_for
@@ -73,6 +73,7 @@ def validate(
     ------
     InvalidInput: an argument is out of range, the folder holds something else, or another process is at work there.
     """
+    require_type("comparison", comparison, Comparison)
     workers = backend_for(backend, jobs)
     if not workers.shares_files:
         raise InvalidInput(f"the backend {workers.name} does not share files; choose serial or joblib.")

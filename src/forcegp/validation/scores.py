@@ -12,6 +12,7 @@ from jaxtyping import Float
 from forcegp.checks.findings import plain
 from forcegp.data import Dataset, time_blocks
 from forcegp.evaluation import metrics
+from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
@@ -25,7 +26,7 @@ STRETCHES = 20
 ROWS_PER_BLOCK = 4096
 
 
-def mass_matrices(system: MechanicalSystem, dataset: Dataset) -> Float[np.ndarray, "_ nv nv"]:
+def mass_matrices(dataset: Dataset, system: MechanicalSystem) -> Float[np.ndarray, "_ nv nv"]:
     """M of every row [kg m^2, kg m or kg], rotors and armature included."""
     blocks = []
     with torch.no_grad():
@@ -56,8 +57,12 @@ def force_errors(
     return (mass @ (predicted - target)[..., None])[..., 0]
 
 
-def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndarray, "rows nv nv"]) -> dict[str, Any]:
-    """All scores of the held-out rows; `mass` is the same for every model (`mass_matrices`).
+def acceleration_scores(
+    posterior: Posterior, test: Dataset, mass: Float[np.ndarray, "rows nv nv"]
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """All scores of the held-out rows, and what a reader has to know beside them (`evaluation.doubts`).
+
+    `mass` is the same for every model (`mass_matrices`).
 
     Intervals and densities are those of a measurement: with the noise of the model, or of the Dataset where that is
     larger. What is not a number (a constant target) is None.
@@ -66,12 +71,15 @@ def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndar
     a, variance = test.a, predicted.measurement_variance
     forces = force_errors(predicted.mean, a, mass)
     covered = [metrics.interval_coverage(predicted.mean, variance, a, level) for level in LEVELS]
-    return {
+    known = metrics.mean_absolute_error(predicted.known_physics, a)
+    scores = {
         "rmse": plain(metrics.root_mean_square_error(predicted.mean, a)),
         "mae": plain(metrics.mean_absolute_error(predicted.mean, a)),
         "nrmse": plain(normalized_error(predicted.mean, a)),
         "force_rms": plain(np.sqrt(np.square(forces).mean(axis=0))),
         "force_mae": plain(np.abs(forces).mean(axis=0)),
+        # a light joint under a noisy torque is predicted well by not moving at all: a score has to beat this
+        "force_rms_at_rest": plain(np.sqrt(np.square(force_errors(np.zeros_like(a), a, mass)).mean(axis=0))),
         "nlpd": float(predicted.negative_log_density.mean()),
         "nlpd_per_joint": plain(metrics.marginal_negative_log_density(predicted.mean, variance, a)),
         "levels": list(LEVELS),
@@ -79,6 +87,12 @@ def acceleration_scores(posterior: Posterior, test: Dataset, mass: Float[np.ndar
         "stretches": _by_stretch(predicted, test, forces),
         "noise_std": plain(posterior.noise_std.detach().cpu().numpy()),
     }
+    shared = {
+        "mae_per_joint": scores["mae"],
+        "known_physics_mae_per_joint": known,
+        "coverage_95_per_joint": covered[LEVELS.index(0.95)],
+    }
+    return scores, doubts(posterior, test, shared)
 
 
 def _by_stretch(

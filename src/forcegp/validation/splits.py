@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from forcegp.data import Dataset, require_disjoint
+from forcegp.data.dataset_arguments import dataset_first
 from forcegp.errors import InvalidInput
 
 FORMS = "episodes:N,N..., leave-one-out, fraction:F[:SEED] or blocks:N:K,K..."
@@ -187,8 +188,9 @@ def hold_out_blocks(dataset: Dataset, blocks: int, held_out: Sequence[int], guar
     return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
 
 
-def split_named(text: str, dataset: Dataset, guard: float = 0.25) -> tuple[Split, ...]:
-    """The splits of a text as in --split: several for leave-one-out, else one.
+@dataset_first
+def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split, ...]:
+    """The splits of a text, as `forcegp validate --split` takes it: several for leave-one-out, else one.
 
     `auto` is a quarter of the episodes, or with one episode blocks 3 and 5 of five. `guard` [s] is for blocks only.
     Episodes that `forcegp import` made may be named by a part of the name of their log.
@@ -197,7 +199,7 @@ def split_named(text: str, dataset: Dataset, guard: float = 0.25) -> tuple[Split
     kind, _, rest = text.partition(":")
     if text == "auto":
         if len(dataset.episodes) == 1:
-            return split_named(DEFAULT_BLOCKS, dataset, guard)
+            return split_named(dataset, DEFAULT_BLOCKS, guard)
         return (hold_out_fraction(dataset, DEFAULT_FRACTION),)
     if text == "leave-one-out":
         return leave_one_episode_out(dataset)

@@ -51,6 +51,8 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
     for score in ("nrmse", "rmse", "mae", "force_rms", "force_mae"):
         out[score] = median_and_range(over_joints(score, result[score]) for result in results)
         out[f"{score}_per_joint"] = _per_joint(results, lambda result, score=score: result[score])
+    if all("force_rms_at_rest" in result for result in results):
+        out["force_rms_at_rest_per_joint"] = _per_joint(results, lambda result: result["force_rms_at_rest"])
     for score in ("nlpd", "cpu_seconds"):
         out[score] = median_and_range(result[score] for result in results)
     out["nlpd_per_joint"] = _per_joint(results, lambda result: result["nlpd_per_joint"])

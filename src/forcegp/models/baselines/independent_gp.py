@@ -99,7 +99,7 @@ class IndependentGP(Model):
         check_search_numbers(restarts, seed)
         nv, device = self.system.robot.nv, self.system.robot.device
         needed = 8 * len(rows) ** 2 * (nv + 4)  # a factor for every joint, and what the gradients of one of them take
-        require_memory(needed, f"an IndependentGP of N={len(rows)} rows", "give fewer points (--points)", device)
+        require_memory(needed, f"an IndependentGP of N={len(rows)} rows", "give fewer `points`", device)
         training = TrainingData.of(rows, device)
         likelihood = IndependentLikelihood(self.inputs, training)
         kernels = likelihood.kernels()

@@ -118,7 +118,7 @@ class IndependentLikelihood:
         return torch.cat([states[name] for name in self.inputs], dim=-1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IndependentPosterior(Posterior):
     """An `IndependentGP` conditioned on training data; made by `IndependentGP.fit` or `load_posterior`.
 

@@ -79,7 +79,7 @@ class NetworkModel(Model):
         return rows, TrainingData.of(rows, self.system.robot.device)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NetworkPosterior(Posterior):
     """A trained network or ensemble; made by its `fit` or by `load_posterior`.
 

@@ -137,7 +137,7 @@ def curvature_about(
     if found.doubts:
         warnings.warn(
             f"the search has not ended at a minimum ({'; '.join(found.doubts)}), so estimates and standard errors are "
-            "rough: raise `iterations`, lower `tolerance` of the options, or keep the hyperprior",
+            "rough: search longer, by more `iterations` of the options, or keep the `hyperprior`",
             NumericalWarning,
             stacklevel=2,
         )

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult
@@ -17,6 +18,7 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.models.identification.curvature import Curvature, Report, curvature_about
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.models.search import Objective, blas_threads
+from forcegp.summary import Summary, listed
 
 WEAK = 0.3
 """Standard deviation beyond which a direction counts as not identified: 30 % of a mass or of a coefficient, or 0.3 of
@@ -50,8 +52,8 @@ class WeakDirection:
         return f"{terms.removeprefix('+ ')} (standard deviation {self.std:.2g})"
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Summary):
     """Physical parameters before and after a fit, in SI units, centres of mass in link frames.
 
     `history` holds their values at the start and after every iteration of the search that won. Standard errors, their
@@ -73,6 +75,13 @@ class Identification:
         """From the result of a search that kept its iterates; `covariance_rows` is the size of what it factorised."""
         history = tuple(physical.named(point[PHYSICAL]) for point in result.iterates)
         return cls(physical, objective, result.parameters, history, covariance_rows)
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """The first estimates; standard errors, which take time, are not among them."""
+        units, start = self.units, self.start
+        values = [f"{name} {value:.4g} (from {start[name]:.4g}) {units[name]}" for name, value in self.values.items()]
+        return {"iterations": len(self.history), "values": listed(values, most=6)}
 
     @property
     def start(self) -> dict[str, float]:

@@ -65,7 +65,7 @@ def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
         return
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
-    remedy = "find hyper-parameters on fewer rows: learning_points=600 (--learning-points 600), or give fewer points"
+    remedy = "find hyper-parameters on fewer rows: `learning_points=600`, or give fewer points"
     what = f"the likelihood of N={size.rows} rows with its gradients"
     require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
 

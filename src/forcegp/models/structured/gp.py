@@ -34,9 +34,11 @@ from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_prior
 from forcegp.models.structured.search import Search
 from forcegp.models.structured.surface_distance import check_distance, warn_of_contacts
+from forcegp.models.structured.widening import widened
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
-from forcegp.priors import ForcePrior, prior_to_dict
+from forcegp.priors import ForcePrior
+from forcegp.priors.stored_priors import described_prior
 
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
@@ -239,6 +241,7 @@ class StructuredGP(StructuredModel):
             fitted = self._with_refined_loads(self._fit(rows, dataset, search), rows, dataset, search)
         else:
             fitted = self._identify(rows, dataset, search, learn, prior_strength)
+        fitted = widened(fitted, search.hyperprior)
         warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
         described = described_rows(all_rows, dataset)
@@ -262,7 +265,9 @@ class StructuredGP(StructuredModel):
             fitted = model._identify(windows, dataset, search, learn, prior_strength)
         reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
         described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
-        return fitted.with_settings(**described, engine=Exact().to_dict(), engine_reason=reason)
+        return widened(fitted, search.hyperprior).with_settings(
+            **described, engine=Exact().to_dict(), engine_reason=reason
+        )
 
     def _fit_as_before(
         self,
@@ -319,12 +324,12 @@ class StructuredGP(StructuredModel):
     def _fit(self, rows: Dataset | Windows, dataset: Dataset, search: Search) -> StructuredPosterior:
         """One search on these rows or windows of the dataset with the prior as it is, and the exact posterior there."""
         fitted, likelihood = self._checked(rows)
+        described = fitted._settings(rows, dataset)  # before the search: a prior of one's own may fail there
         learned_noise, fixed = fitted.split_noise
         kernels = likelihood.kernels()
         objective = FitObjective(likelihood, kernels, fitted.known_noise, fixed, search.hyperprior)
         result, of_search = search.best(objective, kernels.initial_parameters() | learned_noise)
-        settings = fitted._settings(rows, dataset, of_search)
-        return fitted.condition(likelihood.training, result.parameters | fixed, result, settings)
+        return fitted.condition(likelihood.training, result.parameters | fixed, result, {**described, **of_search})
 
     def _identify(
         self,
@@ -336,6 +341,7 @@ class StructuredGP(StructuredModel):
     ) -> StructuredPosterior:
         """One search for physical parameters and all others on these rows or windows of the dataset."""
         fitted, likelihood = self._checked(rows)
+        described = fitted._settings(rows, dataset)  # before the search: a prior of one's own may fail there
         learned_noise, fixed = fitted.split_noise
         begin = PhysicalStart.of(learn, likelihood, learned_noise | fixed, prior_strength)
         kernels = with_variance_priors(begin.kernels) if search.hyperprior else begin.kernels
@@ -345,7 +351,8 @@ class StructuredGP(StructuredModel):
         result, of_search = search.best(objective, begin.path[-1] | learned_noise, keep_iterates=True)
         # the steps before the search are its first iterations
         result = with_steps_before(result, objective, [point | learned_noise for point in begin.path[:-1]])
-        settings = fitted._settings(rows, dataset, of_search) | {
+        settings = described | {
+            **of_search,
             "learned": learn_to_list(begin.physical),
             "prior_strength": prior_strength,
             "log_variance_spread": LOG_VARIANCE_SPREAD if search.hyperprior else None,
@@ -368,13 +375,12 @@ class StructuredGP(StructuredModel):
         require_memory_to_learn(likelihood)
         return fitted, likelihood
 
-    def _settings(self, rows: Dataset | Windows, dataset: Dataset, of_search: Mapping[str, Any]) -> dict[str, Any]:
-        """The resolved configuration of a fit as plain JSON values."""
+    def _settings(self, rows: Dataset | Windows, dataset: Dataset) -> dict[str, Any]:
+        """The resolved configuration of a fit as plain JSON values, all but its search."""
         return {
             **described_rows(rows, dataset),
-            **of_search,
             "mean": self.mean,
-            "prior": prior_to_dict(self.prior),
+            "prior": described_prior(self.prior),
             "noise": self.known_noise.to_dict(),
         }
 

@@ -27,6 +27,7 @@ from forcegp.inference.linear_functionals import functional_negative_log_likelih
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.identification.physical_parameters import COEFFICIENTS, INERTIALS, coefficients_of, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
+from forcegp.models.structured.prior_values import checked_kernels
 from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
 from forcegp.priors import ForcePrior
 
@@ -133,7 +134,8 @@ class MarginalLikelihood:
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         dimensions = tuple(z.shape[-1] for z in features)
-        return LatentKernels(self.prior.kernels(self.system.robot, dimensions, variances)).to(variances.device)
+        kernels = self.prior.kernels(self.system.robot, dimensions, variances)
+        return LatentKernels(checked_kernels(self.prior, kernels, len(dimensions))).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood, exact and differentiable in every parameter.
@@ -172,8 +174,20 @@ class MarginalLikelihood:
         report: Iteration | None = None,
     ) -> LatentPosterior:
         """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`."""
+        return self.condition_kernels(kernels.at(parameters), parameters, engine, start=start, report=report)
+
+    def condition_kernels(
+        self,
+        kernels: LatentKernels,
+        parameters: Mapping[str, Tensor],
+        engine: Engine | None = None,
+        *,
+        start: Tensor | None = None,
+        report: Iteration | None = None,
+    ) -> LatentPosterior:
+        """`condition` with kernels that hold the parameters already; they are not copied."""
         with torch.no_grad():
             terms = self.terms(parameters)
             if self.training.weights is not None:
-                return FunctionalPosterior.condition(kernels.at(parameters), self.training.weights, terms)
-            return (engine or Exact()).condition(kernels.at(parameters), terms, start=start, report=report)
+                return FunctionalPosterior.condition(kernels, self.training.weights, terms)
+            return (engine or Exact()).condition(kernels, terms, start=start, report=report)

@@ -133,8 +133,10 @@ def _ridge(physical: PhysicalParameters, prior_strength: float) -> Float[Tensor,
             for link, value in inertias.items()
         }
         each = [torch.linalg.solve_triangular(factors[link], half.mT, upper=False) for link, half in halves.items()]
-        return torch.stack(each).flatten() if each else s[:0]
+        return torch.stack(each).flatten()
 
+    if not factors:  # coefficients alone
+        return torch.eye(len(physical.zero), dtype=physical.zero.dtype, device=physical.zero.device)
     J = torch.as_tensor(torch.autograd.functional.jacobian(whitened, physical.zero))
     return torch.eye(J.shape[1], dtype=J.dtype, device=J.device) + prior_strength * J.mT @ J
 

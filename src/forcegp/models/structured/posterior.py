@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_type, unknown_name_message
 from forcegp.inference import (
     Engine,
     InducingPosterior,
@@ -47,9 +47,10 @@ from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots import Robot
+from forcegp.robots.real_numbers import real_tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StructuredPosterior(Posterior):
     """A `StructuredGP` conditioned on training data; made by `StructuredGP.fit` or `load_posterior`.
 
@@ -152,7 +153,17 @@ class StructuredPosterior(Posterior):
             nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
             return Latents(nothing.flatten(-2), nothing if covariance else None)
         mean = self.latent.mean(features).reshape(*batch, latents)
-        return Latents(mean, self.latent.covariance(features).reshape(*batch, latents, latents) if covariance else None)
+        if not covariance:
+            return Latents(mean, None)
+        return Latents(mean, self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents))
+
+    @property
+    def widening(self) -> float:
+        """How many times as wide intervals are as those of `latent`, whose hyper-parameters count as known.
+
+        `structured/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
+        """
+        return float(self.settings.get("widening", 1.0))
 
     @override
     def predictor(
@@ -170,7 +181,7 @@ class StructuredPosterior(Posterior):
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        return prepared_predictor(self.latent, self.training, self._terms_function, **how)
+        return prepared_predictor(self.latent, self.widening, self.training, self._terms_function, **how)
 
     def _terms_function(self, prepared: PreparedKernels, features: bool) -> TermsFunction:
         """The terms of a predictor as a function of the state, differentiable, by the same code as `predict`.
@@ -189,6 +200,7 @@ class StructuredPosterior(Posterior):
 
         return terms
 
+    @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
         """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
 
@@ -200,6 +212,7 @@ class StructuredPosterior(Posterior):
         latents = self._latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
+    @override
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
         """One process of the prior over its features: a friction curve, for example.
 
@@ -231,7 +244,7 @@ class StructuredPosterior(Posterior):
             plain if labels is None else labels[index],
             z,
             mean,
-            variance.clamp_min(0.0).sqrt(),
+            self.widening * variance.clamp_min(0.0).sqrt(),
             visited,
         )
 
@@ -244,6 +257,7 @@ class StructuredPosterior(Posterior):
     def _scales(self) -> tuple[Tensor, ...]:
         return self.likelihood.standardization.scale
 
+    @override
     def with_contacts(self, contacts: Sequence[Contact]) -> StructuredPosterior:
         """The same forces under other contacts, without another fit: another surface, or none at all, `[]`.
 
@@ -252,6 +266,7 @@ class StructuredPosterior(Posterior):
         """
         return self.with_system(self.system.with_contacts(contacts))
 
+    @override
     def with_robot(self, robot: Robot) -> StructuredPosterior:
         """The same forces on another robot with the same joints, for example with another known tool.
 
@@ -266,6 +281,7 @@ class StructuredPosterior(Posterior):
 
         Raises InvalidInput as `with_robot`, and UnknownFrame where a force acts on a frame that the robot lacks.
         """
+        require_type("system", system, MechanicalSystem)
         trained = self.model.system
         if system.robot.joint_names != trained.robot.joint_names:
             raise InvalidInput(
@@ -275,7 +291,7 @@ class StructuredPosterior(Posterior):
         if self.carries_known_forces and not system.robot.tree.equals(trained.robot.tree):
             raise InvalidInput(
                 "the model has no analytical mean, so its processes hold gravity and inertia of the robot that it was "
-                "trained on and cannot move to another; fit with mean='analytical' (--mean analytical)."
+                "trained on and cannot move to another; fit with `mean='analytical'`."
             )
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
@@ -329,7 +345,7 @@ class StructuredPosterior(Posterior):
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             if not len(self.kernels.kernels):  # no unknown force: all functions are the same
                 return mean()
-            return through(draw_functions(self.latent, samples, seed))
+            return through(draw_functions(self.latent, samples, seed, self.widening))
 
         return AccelerationModel(system, baumgarte, mean, sampled)
 
@@ -400,7 +416,7 @@ def _curve_features(latent: str, given: Array | None, visited: Tensor, points: i
             raise InvalidInput(f"a curve of points={points} was asked for; give 1 or more")
         steps = torch.linspace(0.0, 1.0, points, dtype=torch.float64, device=visited.device)
         return visited[0] + steps[:, None] * (visited[1] - visited[0])
-    z = torch.as_tensor(given, dtype=torch.float64, device=visited.device)
+    z = real_tensor(f"features of {latent!r}", given, visited.device)
     z = z[:, None] if z.dim() == 1 and count == 1 else z
     if z.dim() != 2 or z.shape[-1] != count or not bool(torch.isfinite(z).all()):
         raise InvalidInput(f"features of {latent!r} have shape {tuple(z.shape)}; give finite numbers (n, {count})")

@@ -31,6 +31,7 @@ TermsOf = Callable[[PreparedKernels, bool], TermsFunction]
 
 def prepared_predictor(
     latent: LatentPosterior,
+    widening: float,
     training: TrainingData,
     terms_of: TermsOf,
     *,
@@ -66,7 +67,7 @@ def prepared_predictor(
         eager = EagerTerms(terms_of(prepared, True), nv, groups)
         compressed = _compressed(latent, training, prepared, eager, tolerance, largest_rank)
     seconds = time.perf_counter() - begin
-    return Predictor(nv, device, latent, prepared, terms, covariance, compressed, seconds)
+    return Predictor(nv, device, latent, prepared, terms, covariance, compressed, widening, seconds)
 
 
 def _compressed(

@@ -11,6 +11,7 @@ from torch import Tensor
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.prior_values import checked_values
 from forcegp.models.training_data import CONSTANT
 from forcegp.priors import ForcePrior
 
@@ -31,17 +32,17 @@ ROWS_LOOKED_AT = 500
 def check_prior(likelihood: MarginalLikelihood) -> None:
     """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
 
-    Raises InvalidInput if no latent changes the acceleration at any training point, if all of one term do nothing at
-    all, if all features of a latent are constant (a tool or joint that never moves), and if latents of two terms do the
-    same in every row. Warns (DataWarning) of single features that are constant, of latents that move nothing or that
-    the constraint hides while others show, and, with the mean "zero", of known forces that no latent can take over.
+    Raises InvalidInput if the prior gives other shapes or types than it should, if no latent changes the acceleration
+    at any training point, if all of one term do nothing at all, if all features of a latent are constant (a tool or
+    joint that never moves), and if latents of two terms do the same in every row. Warns (DataWarning) of single
+    features that are constant, of latents that move nothing or that the constraint hides while others show, and, with
+    the mean "zero", of known forces that no latent can take over.
     """
+    dynamics = likelihood.dynamics()
+    B, features = checked_values(likelihood.prior, dynamics)
     names = likelihood.prior.latent_names(likelihood.system.robot)
     if not names:
         return
-    dynamics = likelihood.dynamics()
-    B = likelihood.prior.mixing(dynamics)
-    features = likelihood.prior.features(dynamics)
     _check_features(likelihood, names, features)
     effect = dynamics.H @ B
     terms = [number for number, (*_, which) in enumerate(_terms(likelihood)) for _ in range(which.stop - which.start)]
@@ -152,8 +153,8 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
     if share > LEFT_OUT:
         warnings.warn(
             f"with the mean 'zero' the prior carries gravity, actuation and all known forces, but {share:.0%} of the "
-            "acceleration that they cause lies where none of its forces acts; take mean='analytical' (--mean "
-            "analytical), or add a force on every joint, JointForces() (--prior joint)",
+            "acceleration that they cause lies where none of its forces acts; take `mean='analytical'`, or "
+            "add a force on every joint to the `prior`, JointForces()",
             DataWarning,
             stacklevel=5,
         )

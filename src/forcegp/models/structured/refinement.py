@@ -85,7 +85,7 @@ def _checked(posterior: StructuredPosterior) -> StructuredPosterior:
         warnings.warn(
             f"{latent.space.count} inducing points leave out {latent.left_out:.2g} of the noise variance of a row, so "
             "that the posterior is an approximation with wider intervals than the exact one; give more points, or take "
-            "engine='exact' or 'iterative'",
+            "`engine='exact'` or `engine='iterative'`",
             NumericalWarning,
             stacklevel=4,
         )

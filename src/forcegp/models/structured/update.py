@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import DataWarning, InvalidInput
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import DataWarning
 from forcegp.inference import ExactPosterior
 from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
 from forcegp.inference.memory import require_memory
@@ -20,6 +21,7 @@ from forcegp.models.search import blas_threads
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.surface_distance import check_distance
 from forcegp.models.training_data import TrainingData
+from forcegp.robots.real_numbers import whole_number
 
 Keep = Callable[[ExactPosterior, int], Tensor]
 """(posterior, budget) -> numbers of the rows to keep, ascending."""
@@ -72,10 +74,10 @@ def learn_more_rows(
 
 def _check(joints: Sequence[str], rows: Dataset, budget: int | None) -> None:
     """Raises InvalidInput for rows of other joints and a budget below 2."""
-    if tuple(rows.joint_names) != tuple(joints):
-        raise InvalidInput(f"the new rows have joints {', '.join(rows.joint_names)}; the model has {', '.join(joints)}")
-    if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 2):
-        raise InvalidInput(f"budget is {budget!r}; it is the number of rows to keep, 2 or more, or None for all")
+    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
+    require_rows("rows", rows, joints, "the model", example)
+    if budget is not None:
+        whole_number("budget", budget, 2)
 
 
 def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:

@@ -1,0 +1,40 @@
+"""How values show themselves: a few facts as text, and as a table in a notebook."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from html import escape
+
+WIDTH = 100
+"""Longest text that stands on one line."""
+
+
+class Summary:
+    """`repr` and a notebook's table of a class, from `facts`; dataclasses need `repr=False`."""
+
+    @abstractmethod
+    def facts(self) -> Mapping[str, object]:
+        """What the value is, by name: at most nine short entries, and nothing that takes long to compute."""
+
+    def __repr__(self) -> str:
+        entries = [f"{name}: {value}" for name, value in self.facts().items()]
+        line = f"{type(self).__name__}({', '.join(entries)})"
+        return line if len(line) <= WIDTH else f"{type(self).__name__}(\n  " + "\n  ".join(entries) + "\n)"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>" for name, value in self.facts().items()
+        )
+        return f"<table><caption>{escape(type(self).__name__)}</caption>{rows}</table>"
+
+
+def listed(names: Iterable[object], most: int = 4) -> str:
+    """`a, b, c, d and 3 more`; `none` of nothing."""
+    texts = list(map(str, names))
+    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "") or "none"
+
+
+def rounded(values: Iterable[float]) -> str:
+    """Three digits of each: `0.05, 0.051, 0.048`."""
+    return listed((f"{value:.3g}" for value in values), most=7)

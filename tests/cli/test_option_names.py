@@ -1,0 +1,83 @@
+"""Messages name arguments in Python and options on the command line, from one text."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from tests.models.arm import arm_data
+
+from forcegp.cli.arguments import COMMANDS, parse_arguments
+from forcegp.cli.option_names import OTHERWISE, with_option_names
+from forcegp.data import Dataset
+from forcegp.errors import ForceGPError
+from forcegp.models import StructuredGP
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|`?ray [a-z]+|xcode-select|start one with)[^;)`]* --[a-z]")
+ALLOWED = {"parallel/connection.py": "--port and --address of ray"}
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        ("`points=61` must be an integer", "--points 61 must be an integer"),
+        ("`seed=-1` must", "--seed=-1 must"),
+        ("give `mean='analytical'`, or fewer `points`", "give --mean analytical, or fewer --points"),
+        ("use `learning_points=600`", "use --learning-points 600"),
+        ("add `overwrite=True` or another `folder`", "add --overwrite or another --out"),
+        ("another `system` or its `contacts`", "another --robot or its --contact"),
+        ("a `tolerance` that only Python has, `forcegp fit`", "a `tolerance` that only Python has, `forcegp fit`"),
+        ("`unit` q=deg", "`unit` q=deg"),  # of another command
+    ],
+)
+def test_arguments_become_the_options_of_the_command(message, words):
+    assert with_option_names(message, parse_arguments(["fit", "x.h5", "--out", "run"]).options) == words
+
+
+def test_every_other_name_is_an_option_of_some_command():
+    everywhere = {name for kind, _ in COMMANDS.values() for name in kind.__dataclass_fields__}
+    assert set(OTHERWISE.values()) <= everywhere
+
+
+def test_the_same_error_in_both_worlds(forcegp, tmp_path):
+    data = arm_data(20, 0)
+    with pytest.raises(ForceGPError, match=r"^`points=99` must be an integer from 2 to 20"):
+        StructuredGP(data.system).fit(data, points=99)
+    data.save(tmp_path / "arm.h5")
+    for words, message in [
+        ("fit arm.h5 --points 1 --out run", "forcegp: --points 1 must be an integer from 2 to 20, the rows of the"),
+        ("fit arm.h5 --restarts 1000000000 --out run", "forcegp: --restarts 1000000000 must be an integer from 1 to"),
+    ]:
+        done = forcegp(*words.split(), folder=tmp_path)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith(message)
+    assert Dataset.load(tmp_path / "arm.h5")["q"].shape == (20, 3)
+
+
+def flags_without_a_command(path):
+    """Texts of a module with an option that is not part of a whole command, and so means nothing in Python."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    parts = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in nodes:
+        if id(node) in parts:
+            continue
+        if isinstance(node, ast.JoinedStr):
+            text = "".join(part.value if isinstance(part, ast.Constant) else "X" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = node.value
+        else:
+            continue
+        if re.search(r"(?<![-\w])--[a-z]", text) and not OF_A_PROGRAM.search(text):
+            yield text
+
+
+def test_below_the_command_line_no_message_names_a_bare_option():
+    package = REPOSITORY / "src" / "forcegp"
+    found = {
+        (name, text)
+        for path in sorted(package.rglob("*.py"))
+        if (name := path.relative_to(package).as_posix()).partition("/")[0] != "cli" and name not in ALLOWED
+        for text in flags_without_a_command(path)
+    }
+    assert found == set()

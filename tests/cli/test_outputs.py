@@ -1,0 +1,293 @@
+"""Where commands write: never over what is not theirs, never over what they read, and tried before the work."""
+
+import json
+import math
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from tests.cli.one_line import assert_refused
+from tests.models.arm import URDF, arm_data
+
+import forcegp
+from forcegp import Dataset, load_posterior
+from forcegp.atomic_files import atomic_folder
+from forcegp.cli.main import main
+from forcegp.file_digests import write_digests
+
+QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
+IMPORT = "import log.csv --time time --q q_a --u u_a --joints a"
+FILES = {
+    "simulate": "simulate kuka-surface --overwrite --out OUT",
+    "import": f"{IMPORT} --overwrite --out OUT",
+    "mapping": f"{IMPORT} --overwrite --out x.h5 --write-mapping OUT",
+    "prepare": "prepare arm.h5 --every 2 --overwrite --out OUT",
+}
+FOLDERS = {
+    "spectra": "prepare arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
+    "fit": "fit arm.h5 --overwrite --out OUT",
+    "identify": "identify arm.h5 --learn hand:mass --overwrite --out OUT",
+    "regression": "identify arm.h5 --model consistent --overwrite --out OUT",
+    "compare": "compare arm.h5 --prior joint --prior joint-friction --overwrite --out OUT",
+    "evaluate": "evaluate run arm.h5 --overwrite --plots OUT",
+    "rollout": "rollout run arm.h5 --overwrite --out OUT",
+    "check": "check arm.h5 --overwrite --plots OUT",
+    "demo": "demo --out OUT",
+}
+STORES = {
+    "validate": "validate arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
+    "reproduce": "reproduce fig2b --out OUT",
+    "docs": "reproduce fig2b --out runs --docs OUT",
+}
+KINDS = {"spectra": "forcegp prepare", "regression": "forcegp identify"}
+COMMANDS = FILES | FOLDERS | STORES
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A folder with data, a log and what passes for a model as long as nothing reads it; the current one."""
+    monkeypatch.chdir(tmp_path)
+    arm_data(40, seed=0).save("arm.h5")
+    rows = (f"{k / 100},{math.sin(k / 30)},{math.cos(k / 50)}" for k in range(300))
+    Path("log.csv").write_text("time,q_a,u_a\n" + "\n".join(rows) + "\n")
+    Path("arm.urdf").write_text(URDF)
+    Path("run").mkdir()
+    return tmp_path
+
+
+@pytest.fixture
+def no_work(monkeypatch) -> None:
+    """Whoever begins the work fails."""
+
+    def begun(*_, **__):
+        raise AssertionError("the work has begun")
+
+    monkeypatch.setattr("forcegp.jobs.running._Run", begun)
+    monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
+    monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
+    monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)
+    monkeypatch.setattr("forcegp.models.fit_arguments.farthest_rows", begun, raising=False)
+    own = Dataset.load
+    monkeypatch.setattr(Dataset, "load", lambda path: own(path) if "validate" in sys.argv else begun())
+
+
+def filled(name: str, out: object) -> list[str]:
+    return [str(out) if word == "OUT" else word for word in COMMANDS[name].split()]
+
+
+def hidden(folder: Path) -> list[Path]:
+    return [entry for entry in folder.rglob(".*") if entry.name != ".lock"]
+
+
+def refused(words: list[str], capfd) -> str:
+    """The one line of a refused command."""
+    capfd.readouterr()
+    assert main(words) == 2, capfd.readouterr().err
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1, told.err
+    return told.err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_pipes_and_devices_are_never_replaced(folder, no_work, monkeypatch, capfd, name):
+    monkeypatch.setattr(sys, "argv", [name])
+    os.mkfifo("pipe")
+    Path("link").symlink_to("pipe")
+    for out in ("pipe", "link"):
+        refused(filled(name, out), capfd)
+        assert stat.S_ISFIFO(Path("pipe").stat().st_mode)
+        assert Path("link").is_symlink()
+    assert not hidden(folder)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_what_cannot_be_written_is_noticed_before_the_work(folder, no_work, monkeypatch, capfd, name):
+    monkeypatch.setattr(sys, "argv", [name])
+    places = ["arm.urdf/out"] + ["/proc/forcegp-out"] * Path("/proc/self").exists()
+    for out in places:
+        refused(filled(name, out), capfd)
+    assert Path("arm.urdf").read_text() == URDF
+    assert not hidden(folder)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_full_disk_is_noticed_before_the_work(folder, no_work, monkeypatch, capfd, limited_file_size, name):
+    monkeypatch.setattr(sys, "argv", [name])
+    with limited_file_size(2000):
+        told = refused(filled(name, "out"), capfd)
+    assert "File too large" in told
+    assert not hidden(folder)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypatch, capfd, name):
+    monkeypatch.setattr(sys, "argv", [name])
+    Path("out").mkdir()
+    kind = KINDS.get(name, f"forcegp {name}")
+    Path("out/config.json").write_text(json.dumps({"kind": kind, "files": ["config.json"]}))
+    Path("out/notes.txt").write_text("mine")
+    told = refused(filled(name, "out"), capfd)
+    assert f"out holds files that `{kind}` did not write (notes.txt), so it is not overwritten" in told
+    assert Path("out/notes.txt").read_text() == "mine"
+
+
+def test_a_file_that_appears_while_the_model_is_fitted_is_not_deleted(folder, capfd, monkeypatch):
+    assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
+    own = forcegp.StructuredGP.fit
+
+    def fit(*given, **more):
+        Path("out/notes.txt").write_text("mine")
+        return own(*given, **more)
+
+    monkeypatch.setattr(forcegp.StructuredGP, "fit", fit)
+    assert "(notes.txt)" in refused(["fit", "arm.h5", *QUICK.split(), "--out", "out", "--overwrite"], capfd)
+    assert Path("out/notes.txt").read_text() == "mine"
+    load_posterior("out")
+    assert not hidden(folder)
+
+
+@pytest.mark.parametrize("written", ["a file", "a folder"])
+def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, written):
+    def meanwhile(own, make):
+        return lambda *given, **more: (make(), own(*given, **more))[1]
+
+    if written == "a file":
+        change = meanwhile(forcegp.import_recordings, lambda: Path("out").write_text("theirs"))
+        monkeypatch.setattr(forcegp, "import_recordings", change)
+        told = refused([*IMPORT.split(), "--out", "out"], capfd)
+        assert Path("out").read_text() == "theirs"
+    else:
+        change = meanwhile(forcegp.StructuredGP.fit, lambda: (Path("out").mkdir(), Path("out/a").write_text("theirs")))
+        monkeypatch.setattr(forcegp.StructuredGP, "fit", change)
+        told = refused(["fit", "arm.h5", *QUICK.split(), "--out", "out"], capfd)
+        assert Path("out/a").read_text() == "theirs"
+    assert "out exists" in told
+    assert not hidden(folder)
+
+
+OVER_INPUTS = [
+    "import log.csv --time time --q q_a --u u_a --joints a --out log.csv",
+    "import log.csv --time time --q q_a --u u_a --joints a --out ./run/../log.csv",
+    "import log.csv --time time --q q_a --u u_a --joints a --out link.csv",
+    "import log.csv --time time --q q_a --u u_a --joints a --out hard.csv",
+    "import log.csv --mapping log.yaml --out x.h5 --write-mapping log.yaml",
+    "import log.csv --out x.h5 --write-mapping log.yaml",
+    "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
+    "prepare arm.h5 --every 2 --out arm.h5",
+    "fit arm.h5 --robot arm.urdf --out arm.urdf",
+    "fit arm.h5 --identified run --out run",
+    "fit run/inner.h5 --out run",
+    "identify arm.h5 --robot run/inner.urdf --learn hand:mass --out run",
+    "identify arm.h5 --test run/inner.h5 --model consistent --out run",
+    "compare arm.h5 --test run/inner.h5 --prior joint --prior joint-friction --out run",
+    "evaluate run arm.h5 --plots run",
+    "rollout run arm.h5 --out run",
+    "rollout run run/inner.h5 --out run",
+    "check arm.h5 --plots arm.h5",
+    "validate arm.h5 --out arm.h5",
+]
+
+
+@pytest.mark.parametrize("words", OVER_INPUTS)
+def test_no_command_writes_over_what_it_reads(folder, capfd, words):
+    Path("link.csv").symlink_to("log.csv")
+    os.link("log.csv", "hard.csv")
+    Path("log.yaml").write_text("time: time\nq: q_a\nu: u_a\njoints: a  # of the user\n")
+    for name in ("inner.h5", "inner.urdf"):
+        os.link("arm." + name.partition(".")[2], f"run/{name}")
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    overwrite = [] if words.startswith("validate") else ["--overwrite"]
+    told = refused([*words.split(), *overwrite], capfd)
+    assert "this command" in told
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"{IMPORT} --out x.h5 --write-mapping x.h5",
+        f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
+        "prepare arm.h5 --every 2 --out x.h5 --plots x.h5",
+        "prepare arm.h5 --every 2 --out new/x.h5 --plots new",
+        "reproduce fig2b --out x --docs x",
+    ],
+)
+def test_two_outputs_are_two_places(folder, capfd, words):
+    assert_refused(words, "which this command writes, too; choose another name", folder, capfd)
+
+
+@pytest.mark.parametrize("name", ["thesis.txt", "arm.urdf", "log.csv"])
+def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
+    Path("thesis.txt").write_text("years of work")
+    before = Path(name).read_bytes()
+    for words in (FILES["simulate"], FILES["prepare"]):
+        told = refused([name if word == "OUT" else word for word in words.split()], capfd)
+        assert f"{name} is not a dataset of forcegp, so it is not overwritten" in told
+    told = refused([*IMPORT.split(), "--out", "x.h5", "--overwrite", "--write-mapping", "arm.h5"], capfd)
+    assert "arm.h5 is not a mapping, so it is not overwritten" in told
+    assert Path(name).read_bytes() == before
+
+
+def test_links_stay_and_what_they_point_to_is_written(folder):
+    Path("elsewhere").mkdir()
+    for link, target in (("data", "elsewhere/data.h5"), ("model", "elsewhere/model")):
+        Path(link).symlink_to(target)
+    for again in ([], ["--overwrite"]):
+        assert main([*IMPORT.split(), "--out", "data", *again]) == 0
+        assert main(["fit", "arm.h5", *QUICK.split(), "--out", "model", *again]) == 0
+    assert Path("data").is_symlink()
+    assert Path("model").is_symlink()
+    assert sorted(entry.name for entry in Path("elsewhere").iterdir()) == ["data.h5", "model"]
+    assert len(Dataset.load("elsewhere/data.h5")) == 300
+    load_posterior("elsewhere/model")
+    assert not hidden(folder)
+
+
+@pytest.mark.parametrize("name", ["import", "prepare", "fit", "check"])
+def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, limited_file_size, name):
+    arm_data(80, seed=0).save("arm.h5")
+    monkeypatch.setattr("forcegp.atomic_files.TRIAL", 1)  # a file is larger than the trial, whatever its size
+    words = filled(name, "out") + (QUICK.split() if name == "fit" else [])
+    assert main(words) == 0, capfd.readouterr().err
+    old = {file: file.read_bytes() for file in [Path("out"), *Path("out").rglob("*")] if file.is_file()}
+    with limited_file_size(1500):
+        told = refused(words, capfd)
+    assert "free some space" in told
+    assert {file: file.read_bytes() for file in [Path("out"), *Path("out").rglob("*")] if file.is_file()} == old
+    assert not hidden(folder)
+    assert main(words) == 0
+
+
+def test_the_next_run_removes_what_a_killed_one_left(folder):
+    for name in (".out.0123456789ab.tmp", ".data.h5.0123456789ab.tmp"):
+        Path(name).mkdir()
+        (Path(name) / "half").write_text("half")
+    Path("..data.h5.0123456789ab.tmp.ba9876543210.tmp").write_text("half")
+    with atomic_folder("out") as living:
+        assert main([*IMPORT.split(), "--out", "data.h5"]) == 0
+        assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
+        assert hidden(folder) == [living.parent, living.parent / ".lock"] or hidden(folder) == [living.parent]
+        living.mkdir()
+    assert not hidden(folder)
+
+
+def test_a_changed_system_of_an_identification_is_refused(folder, capfd):
+    Path("found").mkdir()
+    system = arm_data(5, seed=0).system.to_json()
+    Path("found/system.json").write_text(system)
+    write_digests(Path("found"))
+    assert main(["fit", "arm.h5", *QUICK.split(), "--identified", "found", "--out", "one"]) == 0
+    Path("found/system.json").write_text(system.replace("0.6", "0.7"))
+    told = refused(["fit", "arm.h5", "--identified", "found", "--out", "two"], capfd)
+    assert "found is damaged: system.json is not as it was written; identify again" in told
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names are UTF-8 there")
+def test_names_that_are_no_text_are_refused(folder, capfd):
+    name = os.fsdecode(b"arm\xff.h5")
+    os.link("arm.h5", name)
+    for words in (["check", name], ["fit", "arm.h5", "--out", name], ["validate", name, "--out", "out"]):
+        assert "is not UTF-8, so it could not be reported; rename it" in refused(words, capfd)

@@ -1,0 +1,147 @@
+"""Numbers that users hand over: what is taken, what is converted, and what would have been read as something else."""
+
+import datetime
+
+import numpy as np
+import pytest
+import torch
+from tests.data.samples import LINK, TWO_JOINTS, columns, dataset
+from tests.models.arm import arm_data
+
+from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
+from forcegp.models import IndependentGP, StructuredGP
+from forcegp.robots import Robot
+from forcegp.robots.real_numbers import whole_number
+
+pytestmark = pytest.mark.usefixtures("unchecked")
+TEXT = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow="revolute")
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(12, 0)
+
+
+@pytest.fixture(scope="module")
+def posterior(data):
+    return StructuredGP(data.system).fit(data, restarts=1)
+
+
+@pytest.fixture(scope="module")
+def state(data):
+    return tuple(np.array(x[0]) for x in (data.q, data.v, data.u))
+
+
+@pytest.mark.parametrize("name", ["q", "v", "u", "a", "noise_std", "truth"])
+def test_masked_entries_of_a_dataset_are_refused(name):
+    masked = np.ma.masked_equal(np.where(np.arange(80).reshape(40, 2) == 7, -9999.0, 1.0), -9999.0)
+    given = {"truth": {"a": masked}} if name == "truth" else {name: masked}
+    with pytest.raises(DatasetError, match=r"has 1 masked values, the first at \(3, 1\); .* drop these rows"):
+        dataset(**given)
+
+
+def test_a_mask_that_hides_nothing_is_no_mask():
+    given = columns()["u"]
+    np.testing.assert_array_equal(dataset(u=np.ma.masked_array(given)).u, given)
+
+
+WRONG = [
+    (np.ma.masked_array([1.0, 2.0, -9999.0], [False, False, True]), "u has 1 masked values"),
+    (np.array(["2026-01-01"] * 3, "datetime64[D]"), "u must be an array of real numbers; given: datetime64"),
+    ([datetime.date(2026, 1, 1)] * 3, "u must be an array of real numbers; given: object"),
+    ([True, False, True], "u must be an array of real numbers; given: bool"),
+    (np.full(3, 1.0 + 2.0j), "u must be an array of real numbers; given: complex128"),
+    (torch.tensor([True, False, True]), "u must be a tensor of real numbers; given: torch.bool"),
+    (torch.full((3,), 1.0 + 2.0j), "u must be a tensor of real numbers; given: torch.complex64"),
+    ("123", "u must be an array of real numbers; given: <U3"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), WRONG)
+def test_predict_rollout_and_predictor_refuse_what_is_no_real_number(posterior, state, given, message):
+    q, v, _ = state
+    predictor = posterior.predictor(compile=False)
+    steps = [given] if isinstance(given, str | list) else given[None]
+    for call in (
+        lambda: posterior.predict(q, v, given),
+        lambda: posterior.components(q, v, given),
+        lambda: posterior.rollout(q, v, steps, 0.01),
+        lambda: predictor(q, v, given),
+    ):
+        with pytest.raises(InvalidInput, match=message):
+            call()
+
+
+def test_a_prediction_that_is_not_finite_is_an_error(posterior, state):
+    q, v, u = state
+    with pytest.raises(NumericalError, match="prediction of row 1 is not finite: q, v or u is too large"):
+        posterior.predict(np.stack([q, q]), np.stack([v, 1e308 * np.ones(3)]), np.stack([u, u]))
+    with pytest.raises(ForceGPError):
+        posterior.predict(q + 1e308, v, u)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16, np.int64])
+def test_numbers_of_any_precision_are_converted_exactly_everywhere(posterior, data, state, kind):
+    given = tuple(x.astype(kind) for x in state)
+    exact = tuple(torch.tensor(x.astype(np.float64)) for x in given)
+    tensors = tuple(torch.tensor(x) for x in given)
+    robot, predictor = data.system.robot, posterior.predictor(compile=False)
+    expected = posterior.predict(*exact, covariance=False).mean
+    for same in (given, tensors):
+        assert torch.equal(posterior.predict(*same, covariance=False).mean, expected)
+        assert torch.equal(predictor.mean(*same), predictor.mean(*exact))
+    assert torch.equal(data.system.dynamics(*tensors).H, data.system.dynamics(*exact).H)
+    assert torch.equal(robot.inverse_dynamics(*tensors), robot.inverse_dynamics(*exact))
+    assert torch.equal(robot.forward_dynamics(*tensors), robot.forward_dynamics(*exact))
+    held = dataset(q=columns()["q"].astype(kind)).q
+    assert held.dtype == np.float64
+    np.testing.assert_array_equal(held, columns()["q"].astype(kind))
+
+
+@pytest.mark.parametrize("given", [{"armature": "10"}, {"gravity": "123"}, {"gravity": [True, False, True]}])
+def test_text_and_truth_values_are_no_vector(given):
+    (name,) = given
+    with pytest.raises(InvalidInput, match=rf"{name} is .*; give \d finite numbers"):
+        Robot.from_urdf_text(TEXT, **given)
+
+
+@pytest.mark.parametrize(
+    ("argument", "given"),
+    [
+        ("points", "10"),
+        ("points", 10.0),
+        ("points", 13),
+        ("points", True),
+        ("restarts", 1.5),
+        ("restarts", np.nan),
+        ("restarts", np.inf),
+        ("restarts", 0),
+        ("restarts", 10**9),
+        ("seed", None),
+        ("seed", np.nan),
+        ("seed", -1),
+        ("seed", 10**30),
+    ],
+)
+@pytest.mark.parametrize("kind", [StructuredGP, IndependentGP])
+def test_numbers_of_a_fit_are_integers_in_their_range(data, kind, argument, given):
+    with pytest.raises(InvalidInput, match=rf"`{argument}=.*` must be an integer"):
+        kind(data.system).fit(data, **{argument: given})
+
+
+def test_integers_of_numpy_are_integers():
+    assert whole_number("points", np.int64(3), 1) == 3
+    with pytest.raises(InvalidInput, match=r"`points=(np\.)?True_?`"):
+        whole_number("points", np.True_, 1)
+
+
+def test_inside_vmap_the_remedy_is_stated(posterior, data):
+    rows = [torch.tensor(np.array(x[:3])) for x in (data.q, data.v, data.u)]
+    predictor = posterior.predictor(compile=False)
+    for call in (
+        lambda q, v, u: posterior.predict(q, v, u).mean,
+        lambda q, v, u: posterior.rollout(q, v, u[None], 0.01).q,
+        lambda q, v, u: predictor.mean(q, v, u),
+    ):
+        with pytest.raises(InvalidInput, match=r"torch.func.vmap.*batch dimensions lead.*\(n, nv\)"):
+            torch.func.vmap(call)(*rows)

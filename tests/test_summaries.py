@@ -1,0 +1,140 @@
+"""What values show of themselves: at most ten lines, at once, and as a table in a notebook."""
+
+from xml.etree import ElementTree
+
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp import Coefficients, IndependentGP, NeuralNetwork, StructuredGP, ViscousJointFriction, evaluate
+from forcegp.errors import ForceGPError
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Actuation, RigidBodyBias
+from forcegp.summary import Summary
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(20, 0)
+
+
+@pytest.fixture(scope="module")
+def shown(data):
+    """One value of every kind, by name."""
+    quick = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
+    posterior = StructuredGP(data.system).fit(data, **quick)
+    friction = arm_system(known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(0.1)))
+    learned = StructuredGP(friction).identify(data, Coefficients("viscous-joint-friction"), **quick)
+    prediction = posterior.predict(data.q, data.v, data.u)
+    return {
+        "Dataset": data,
+        "StructuredPosterior": posterior,
+        "IndependentPosterior": IndependentGP(data.system).fit(data, **quick),
+        "NetworkPosterior": NeuralNetwork(data.system, steps=3).fit(data),
+        "Prediction": prediction,
+        "Gaussian": prediction.unknown_force,
+        "Evaluation": evaluate(posterior, arm_data(10, 1)),
+        "Robot": data.system.robot,
+        "MechanicalSystem": data.system,
+        "Identification": learned.identification,
+    }
+
+
+FACTS = {
+    "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
+    "StructuredPosterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
+    "IndependentPosterior": ["learned from: 20 rows"],
+    "NetworkPosterior": ["learned from: 20 rows"],
+    "Prediction": ["batch: (20,)", "entries: 3", "forces: multiplier, contact_force, unknown_force"],
+    "Gaussian": ["batch: (20,)", "largest std"],
+    "Evaluation": ["rows: 10", "mae: ", "noise floor 0.0399", "coverage 95: ", "warnings: "],
+    "Robot": ["name: 'arm'", "nv: 3", "pan (revolute), lift (revolute), bend (revolute)"],
+    "MechanicalSystem": ["contacts: hand on Plane", "known forces: Actuation, RigidBodyBias", "omega=5.0"],
+    "Identification": ["values: viscous-joint-friction.pan", "(from 0.1)", "iterations: "],
+}
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_texts_are_short_and_hold_what_matters(shown, name):
+    text = repr(shown[name])
+    assert text.startswith(f"{name}(")
+    assert len(text) < 700
+    assert len(text.splitlines()) <= 11
+    for fact in FACTS[name]:
+        assert fact in text
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_notebooks_show_the_same_facts_as_a_table(shown, name):
+    table = ElementTree.fromstring(shown[name]._repr_html_())
+    assert table.findtext("caption") == name
+    cells = {row.findtext("th"): row.findtext("td") for row in table.findall("tr")}
+    assert cells == {key: str(value) for key, value in shown[name].facts().items()}
+
+
+def test_html_of_a_name_is_escaped():
+    odd = type("Odd", (Summary,), {"facts": lambda self: {"x": "<b>"}})
+    assert "<td>&lt;b&gt;</td>" in odd()._repr_html_()
+
+
+def test_a_prediction_of_means_shows_itself(shown, data):
+    prediction = shown["StructuredPosterior"].predict(data.q, data.v, data.u, covariance=False)
+    assert "only the mean was predicted" in repr(prediction)
+    for name in ("std", "variance"):
+        with pytest.raises(ForceGPError, match="call predict"):
+            getattr(prediction, name)
+
+
+@pytest.mark.parametrize(
+    ("index", "rows"),
+    [
+        (3, 3),
+        (-1, 19),
+        (slice(2, 5), slice(2, 5)),
+        ([4, 1], [4, 1]),
+        (torch.arange(20) < 2, slice(2)),
+        (..., slice(20)),
+    ],
+)
+def test_a_prediction_of_some_states(shown, index, rows):
+    whole = shown["Prediction"]
+    part = whole[index]
+    assert type(part) is type(whole)
+    for name in ("mean", "covariance", "noise_covariance", "std"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)[rows])
+    for name in ("multiplier", "contact_force", "unknown_force"):
+        assert torch.equal(getattr(part, name).mean, getattr(whole, name).mean[rows])
+        assert torch.equal(getattr(part, name).std, getattr(whole, name).std[rows])
+
+
+def test_batches_of_several_dimensions_and_single_states(shown, data):
+    posterior = shown["StructuredPosterior"]
+    q, v, u = (x.reshape(4, 5, 3) for x in (data.q, data.v, data.u))
+    whole = posterior.predict(q, v, u)
+    assert torch.equal(whole[1, 2].mean, whole.mean[1, 2])
+    assert torch.equal(whole[:, 2].covariance, whole.covariance[:, 2])
+    assert torch.equal(whole[..., 2].mean, whole.mean[:, 2])  # never an entry of the acceleration
+    single = posterior.predict(data.q[0], data.v[0], data.u[0])
+    assert torch.equal(single[...].mean, single.mean)
+    network = shown["NetworkPosterior"].predict(data.q, data.v, data.u)
+    assert network[2].unknown_force is None
+
+
+def test_states_that_are_not_there(shown):
+    for index in (20, (1, 1), "mean", 1.5):
+        with pytest.raises(ForceGPError, match="no states"):
+            shown["Prediction"][index]
+    assert len(list(shown["Prediction"])) == 20  # a loop ends
+
+
+def test_models_without_forces_state_that_they_have_no_components(shown, data):
+    state = (data.q, data.v, data.u)
+    for name in ("IndependentPosterior", "NetworkPosterior"):
+        for call in (
+            lambda model: model.components(*state),
+            lambda model: model.curve("friction"),
+            lambda model: model.with_contacts([]),
+            lambda model: model.with_robot(data.system.robot),
+        ):
+            with pytest.raises(ForceGPError, match=r"^a .*; (use|fit) "):
+                call(shown[name])
