@@ -13,6 +13,11 @@ from forcegp.errors import ContactWarning
 FIT = ("--points", 12, "--iterations", 2, "--restarts", 1, "--prior", "joint-friction", "--overwrite", "--out", "run")
 
 
+def looked(stderr: str) -> list[str]:
+    """The warnings of the look; two iterations of a search do not converge, which is another one."""
+    return [line for line in stderr.splitlines() if line.startswith("warning: ") and "did not converge" not in line]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("looks")
@@ -29,22 +34,22 @@ def test_a_clean_log_is_fitted_without_a_word(forcegp, folder):
     for name in ("clean.h5", "line.h5"):
         done = forcegp("fit", name, *FIT, folder=folder)
         assert done.returncode == 0, done.stderr
-        assert "warning" not in done.stderr
+        assert not looked(done.stderr)
 
 
 def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
     done = forcegp("fit", "sign.h5", *FIT, folder=folder)
     assert done.returncode == 0, done.stderr
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning: ")]
+    (line,) = looked(done.stderr)
     assert line.startswith("warning: torque sign: the torque of joint2 has the opposite sign")
     assert "forcegp check sign.h5" in line
-    assert "warning" not in forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr
+    assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)
 
 
 def test_a_missing_contact_is_said_once_by_fit_and_by_evaluate(forcegp, folder):
     done = forcegp("fit", "line.h5", *FIT, "--contact", "none", folder=folder)
     assert done.returncode == 0, done.stderr
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning: ")]
+    (line,) = looked(done.stderr)
     assert "no contact is stated, but link 'link2' stays on a plane" in line
     scored = forcegp("evaluate", "run", "line.h5", "--every", 10, folder=folder)
     assert scored.returncode == 0, scored.stderr
