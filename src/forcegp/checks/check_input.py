@@ -16,6 +16,7 @@ from forcegp.checks.successive_rows import (
     drop_outs,
     few_stretches,
     mended_rows,
+    move_on,
     running_width,
     smoothed,
     white_noise,
@@ -139,6 +140,8 @@ class CheckInput:
     def quick(cls, dataset: Dataset, system: MechanicalSystem | None) -> CheckInput:
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
         system = dataset.system if system is None else system
+        if dataset.time_ordered and not move_on(dataset):
+            dataset = replace(dataset, time_ordered=False)
         dropped, mended = {}, dataset
         even, prepared = dataset, None
         wraps = jumps = np.zeros(dataset.q.shape, dtype=bool)

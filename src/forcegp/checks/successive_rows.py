@@ -18,6 +18,9 @@ LEAST_JUMP = 0.02
 
 FEWEST_DROPS = 2
 
+LEAP = 0.3
+"""Median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)."""
+
 FEW_JOINTS = 3
 """Of more joints, half as many rows."""
 
@@ -36,6 +39,16 @@ SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15
 def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
     """Whether the next row belongs to the same episode and follows; False for the last row."""
     return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
+
+
+def move_on(dataset: Dataset) -> bool:
+    """Whether rows that follow each other belong to one motion; a sample of rows or of random states leaps about."""
+    steps = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]]
+    spread = dataset.q.std(axis=0)
+    moving = spread > 0.0
+    if not len(steps) or not moving.any():
+        return bool(len(steps))
+    return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
 def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:

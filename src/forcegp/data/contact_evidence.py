@@ -97,7 +97,7 @@ def _stated(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[C
         moves = speed > 2.0 * LEAST_SPEED
         along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= NEAR)
         what = f"contact {index} (frame {contact.frame!r}): "
-        remedy = "Check its point, its surface and their units (m), or leave the contact out (--contact none)."
+        remedy = "Check its point, its surface and their units (m), or leave the contact out (`contacts=none`)."
         share = float(along[moves].mean()) if moves.any() else 1.0
         far = float(np.median(np.abs(distance[along]))) if along.any() else float(np.median(np.abs(distance)))
         if share < HARDLY_ANY:
@@ -163,7 +163,7 @@ def _forces(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[C
             ContactDoubt(
                 kind="no force",
                 seen="the accelerations show no force of the stated contact: they fit as well without it.",
-                remedy="If nothing was touched, leave the contact out (--contact none).",
+                remedy="If nothing was touched, leave the contact out (`contacts=none`).",
                 numbers={"gain": necessary},
             )
         )
@@ -187,7 +187,7 @@ def _missing(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[
             kind="missing",
             seen=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations "
             "need a force along its normal.",
-            remedy="State the contact (--contact FRAME@x,y,z:SURFACE), or leave out the rows in contact.",
+            remedy="State it (`contacts`), or leave out the rows in contact.",
             numbers={"frame": contact.frame, "gain": gain},
         )
     ]
