@@ -22,7 +22,12 @@ def test_the_python_example_runs(repository: Path, tmp_path: Path):
     assert acceleration == "torch.Size([1200, 7]) torch.Size([1200, 7, 7])"
     assert forces == "torch.Size([1200, 1]) torch.Size([1200, 7])"
     assert float(error.split()[3]) < 0.2
-    assert {path.name for path in (tmp_path / "model").iterdir()} == {"model.json", "tensors.safetensors", "robot.urdf"}
+    assert {path.name for path in (tmp_path / "model").iterdir()} == {
+        "model.json",
+        "tensors.safetensors",
+        "robot.urdf",
+        "SHA256SUMS",
+    }
 
 
 def test_the_pictures_and_pages_that_it_names_exist(repository: Path):

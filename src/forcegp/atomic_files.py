@@ -52,7 +52,7 @@ def atomic_file(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
                 os.link(temporary, target)  # unlike a rename, never over what another process has written meanwhile
                 return
             except FileExistsError:
-                raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.") from None
+                raise InvalidInput(f"{path} exists already; choose another name, or add `overwrite=True`.") from None
             except OSError:  # a file system without hard links
                 pass
         os.replace(temporary, target)

@@ -17,7 +17,7 @@ from forcegp.atomic_files import atomic_folder
 from forcegp.cli.main import main
 from forcegp.file_digests import write_digests
 
-QUICK = "--points 8 --iterations 2 --restarts 1"
+QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
 IMPORT = "import log.csv --time time --q q_a --u u_a --joints a"
 FILES = {
     "simulate": "simulate kuka-surface --overwrite --out OUT",
@@ -37,7 +37,7 @@ FOLDERS = {
     "demo": "demo --out OUT",
 }
 STORES = {
-    "validate": "validate arm.h5 --overwrite --out OUT",
+    "validate": "validate arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
     "reproduce": "reproduce fig2b --out OUT",
     "docs": "reproduce fig2b --out runs --docs OUT",
 }

@@ -1,5 +1,7 @@
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -10,8 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from tests.data.samples import assert_equal, complete, dataset, system
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, preparation_report
 from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.validation.preparation_summary import preparation_lines
 
 
 @pytest.fixture
@@ -262,3 +265,61 @@ def test_every_stored_name_is_in_the_docs(repository, file):
         names = [*opened.attrs]
         opened.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
     assert all(f"`{name}`" in text for name in [*names, "system"]), names
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+from tests.data.samples import complete
+out, whole = Path(sys.argv[1]), int(sys.argv[2])
+for limit in [*range(1, whole, whole // 40), whole]:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    try:
+        complete().save(out)
+    except OSError as error:
+        assert "File too large" in str(error), error
+        assert limit < whole, limit
+        assert not list(out.parent.iterdir())
+    else:
+        assert limit == whole, limit
+"""
+
+
+def test_a_disk_that_fills_up_at_any_byte_is_an_error_of_the_system(file, tmp_path, repository):
+    """In a process of its own: HDF5 crashed here."""
+    out = tmp_path / "full" / "log.h5"
+    out.parent.mkdir()
+    command = [sys.executable, "-c", FULL, out, str(file.stat().st_size)]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_equal(Dataset.load(out), complete())
+
+
+PREPARED = {"cutoff": 20.0, "order": 2, "every": 1, "trim": 0.1, "delay": [0.0, 0.0], "why": {}}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cutoff": "x"},
+        {"cutoff": -1.0},
+        {"cutoff": float("nan")},
+        {"cutoff": [20.0]},
+        {"delay": 5},
+        {"delay": ["x"]},
+        {"delay": [None]},
+        {"every": None},
+        {"every": "2"},
+        {"trim": {}},
+        {"why": "because"},
+        {"power_removed": [1.0]},
+        {"power_removed": {"a": "x"}},
+        {"acceleration_noise": {"before": "x", "after": [1.0]}},
+    ],
+)
+def test_metadata_that_others_wrote_are_no_preparation(change):
+    assert preparation_report({"preparation": PREPARED}) == PREPARED
+    assert preparation_report({"preparation": PREPARED | change}) == {}
+    assert preparation_lines({"preparation": PREPARED | change})[0].startswith("Preparation: none stated")
+    for other in ("x", 5, None, ["cutoff"]):
+        assert preparation_report({"preparation": other}) == {}

@@ -61,6 +61,18 @@ def test_a_defect_in_one_job_does_not_cost_the_others(results, task, cause):
     assert not results.place("bad").exists()
 
 
+def test_on_a_full_disk_nothing_more_is_begun(results):
+    with pytest.raises(FitError, match=r"full failed, 2 .* left out \(.*No space left on device\); 0 of 3 jobs"):
+        run_jobs(results, [Job("full", f"{TOY}:fill_the_disk", {}), square(2), square(3)], Serial())
+    assert run_jobs(results, [square(2), square(3)], Serial()) == 2
+
+
+def test_a_disk_that_is_full_is_noticed_before_the_first_job(results, limited_file_size):
+    with limited_file_size(1000), pytest.raises(OSError, match="File too large"):
+        run_jobs(results, [square(2)], Serial())
+    assert not list(results.folder.rglob(".*.tmp"))
+
+
 @pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
 def test_a_process_that_always_dies_is_reported_and_what_was_done_is_kept(results):

@@ -1,5 +1,6 @@
 """Tasks that take no time, for tests of the machinery."""
 
+import errno
 import os
 import time
 import warnings
@@ -26,6 +27,10 @@ def fail(results, spec, folder):
 
 def break_down(results, spec, folder):
     return {"value": 1 / 0}
+
+
+def fill_the_disk(results, spec, folder):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def not_a_number(results, spec, folder):

@@ -139,7 +139,7 @@ class ModelConformance:
         errors = fitted.predict(test.q, test.v, test.u).mean.numpy() - test.a
         np.testing.assert_allclose(evaluation.mae_per_joint, np.abs(errors).mean(0), rtol=1e-9)
         assert np.isfinite(evaluation.nlpd)
-        assert evaluation.warnings == ()
+        assert not any("of the data" in warning or "training rows" in warning for warning in evaluation.warnings)
         speaks = fitted.predict(test.q[:1], test.v[:1], test.u[:1]).unknown_force is not None
         assert fitted.predicts_forces == speaks
         with pytest.warns(DeprecationWarning, match="predicts_forces"):

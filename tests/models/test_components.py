@@ -260,7 +260,7 @@ def test_what_cannot_move_is_refused(posterior, train):
         posterior.with_system(arm_system(contacts=0).with_robot(handless))
     once = OptimizerOptions(iterations=1)
     zero = StructuredGP(train.system, mean="zero").fit(train, restarts=1, options=once)
-    with pytest.raises(InvalidInput, match=r"no analytical mean, .* fit with mean='analytical'"):
+    with pytest.raises(InvalidInput, match=r"no analytical mean, .* fit with `mean='analytical'`"):
         zero.with_robot(heavier)
     assert zero.with_contacts([]).predict(train.q, train.v, train.u).multiplier.mean.shape == (16, 0)
 

@@ -154,7 +154,7 @@ def test_schur_complement_of_a_known_quadratic_form():
 
     # away from the optimum: Newton's method would go to 0, by p in units of the covariance
     away = {name: torch.as_tensor(generator.standard_normal(tuple(value.shape))) for name, value in point.items()}
-    with pytest.warns(NumericalWarning, match=r"move the estimates by .* raise `iterations`"):
+    with pytest.warns(NumericalWarning, match=r"move the estimates by .* more `iterations`"):
         moved = curvature_about("p", objective, away)
     assert moved.decrement == pytest.approx(float(away["p"] @ expected @ away["p"]) ** 0.5, rel=1e-7)
     size = 0.09 / moved.decrement

@@ -208,8 +208,6 @@ def test_what_makes_no_sense_is_refused(train):
         IndependentGP(train.system, noise=Noise(0.1, 0.2))
     with pytest.raises(InvalidInput, match="give one or more of 'q', 'v', 'u'"):
         IndependentGP(train.system, inputs=("q", "a"))
-    with pytest.raises(InvalidInput, match=r"Noise\(0.1, learn=True\)"):
-        IndependentGP(train.system).fit(dataclasses.replace(train, noise_std=None))
     with pytest.raises(InvalidInput, match="all accelerations are zero"):
         IndependentGP(train.system).fit(dataclasses.replace(train, a=np.zeros_like(train.a), truth={}))
     huge = dataclasses.replace(train, a=np.full_like(train.a, 1e200), truth={})

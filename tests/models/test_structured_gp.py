@@ -220,12 +220,6 @@ def test_a_dataset_of_another_robot_is_refused(train):
         StructuredGP(train.system.with_robot(renamed)).fit(train)
 
 
-def test_an_unknown_noise_level_asks_for_one(train):
-    fields = {name: getattr(train, name) for name in ("q", "v", "u", "a", "time", "joint_names", "units", "system")}
-    with pytest.raises(InvalidInput, match=r"Noise\(0.1, learn=True\)"):
-        StructuredGP(train.system).fit(Dataset(**fields))
-
-
 def test_wrong_mean_and_contradictory_contacts_are_refused(train):
     with pytest.raises(InvalidInput, match="'analytical', 'zero'"):
         StructuredGP(train.system, mean="none")

@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from tests.models.arm import arm_data, arm_system
 
 from forcegp.errors import ContactError, DataWarning, FileFormatError, InvalidInput, NotEnoughMemory
+from forcegp.file_digests import write_digests
 from forcegp.inference import OptimizerOptions, likelihood
 from forcegp.inference import memory as memory_module
 from forcegp.mechanics import Contact, Plane
@@ -234,6 +235,7 @@ def test_only_updated_models_declare_rows_of_reference(tmp_path):
         assert json.loads((tmp_path / name / "model.json").read_text())["features"] == features
     assert not any(key.startswith("reference.") for key in load_file(tmp_path / "old" / "tensors.safetensors"))
     (tmp_path / "old" / "model.json").write_bytes((tmp_path / "new" / "model.json").read_bytes())
+    write_digests(tmp_path / "old")
     with pytest.raises(FileFormatError, match=r"reference\.q"):
         load_posterior(tmp_path / "old")
 

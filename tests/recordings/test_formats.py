@@ -276,6 +276,12 @@ def test_a_header_may_be_long(tmp_path):
     np.testing.assert_array_equal(piece["a_long_name_of_column_2999"], [2999, 3000, 3001])
 
 
+def test_a_name_of_a_column_that_is_too_long_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_text(f"time,{'n' * 200_000}\n0,1\n")
+    with pytest.raises(FileFormatError, match=r"log\.csv cannot be read as text .*field limit"):
+        open_source(tmp_path / "log.csv")
+
+
 def test_options_of_other_formats_are_refused(tmp_path):
     with pytest.raises(InvalidInput, match="mean nothing to"):
         open_source(write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)

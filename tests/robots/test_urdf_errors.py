@@ -230,6 +230,15 @@ def test_files_that_cannot_be_read(tmp_path):
         Robot.from_urdf(tmp_path / "arm.urdf")
 
 
+@pytest.mark.parametrize("encoding", ["punycode", "undefined", "hex", "idna", "no-such", "utf-16-be"])
+def test_encodings_that_fail_in_their_own_way_are_named(encoding, tmp_path):
+    (tmp_path / "arm.urdf").write_bytes(
+        f'<?xml version="1.0" encoding="{encoding}"?>'.encode() + b"<robot name='\xff'/>"
+    )
+    with pytest.raises(errors.RobotModelError, match=r"arm\.urdf"):
+        Robot.from_urdf(tmp_path / "arm.urdf")
+
+
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
 def test_declared_encodings_are_read_and_written(encoding, tmp_path):
     path, copy = tmp_path / "arm.urdf", tmp_path / "copy.urdf"

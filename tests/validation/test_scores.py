@@ -135,3 +135,12 @@ def test_the_page_names_joints_where_the_score_says_nothing(best, said):
     (sentence,) = _at_rest({"one": model}, {"joint_names": ["elbow", "wrist"]})
     assert sentence.startswith("Predicting no acceleration at all has elbow 5, wrist 0.1.")
     assert ("At wrist the best model is hardly better" in sentence) is said
+
+
+def test_what_a_reader_has_to_know_comes_with_the_scores(test_rows):
+    system = given_system()
+    sure = StructuredGP(system, NoForces(), "analytical", 1e-3).fit(test_rows, points=5)
+    scores, doubted = acceleration_scores(sure, test_rows, mass_matrices(test_rows, system))
+    inside = np.mean(scores["coverage"][LEVELS.index(0.95)])
+    assert inside < 0.9
+    assert any(f"the 95 % intervals hold {inside:.0%} of the measurements" in sentence for sentence in doubted)

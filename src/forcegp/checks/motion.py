@@ -48,11 +48,12 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
     even = inputs.even
     if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
+    pieces = [even.select_episodes([number]) for number in even.episodes]
     found = []
     for name, source, what, derivative in (("v", "q", "velocity", "dq/dt"), ("a", "v", "acceleration", "dv/dt")):
         if name == "a" and any(finding.severity != "ok" for finding in found):
             break  # of wrong velocities nothing better can come
-        fits = [_compared(even, name, source, joint) for joint in range(even.nv)]
+        fits = [_compared(pieces, name, source, joint) for joint in range(even.nv)]
         findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
         found += _merged([item for item in findings if item is not None], even.nv)
         if not found and name == "v":
@@ -70,11 +71,10 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
     return found
 
 
-def _compared(data: Dataset, name: str, source: str, joint: int) -> tuple[float, float, float] | None:
+def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tuple[float, float, float] | None:
     """Factor, delay [s] and unexplained share of `name` against the derivative of `source`; None without motion."""
     left, right = [], []
-    for number in data.episodes:
-        rows = data.select_episodes([number])
+    for rows in pieces:
         inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
         if inner.sum() < 3:
             continue
@@ -86,7 +86,11 @@ def _compared(data: Dataset, name: str, source: str, joint: int) -> tuple[float,
         return None
     values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
     power = np.square(values).sum(axis=1)
-    least = ROUNDING * max(float(np.square(getattr(data, name)).mean()), float(np.square(slopes).mean())) * len(slopes)
+    least = (
+        ROUNDING
+        * max(max(float(np.square(getattr(rows, name)).mean()) for rows in pieces), float(np.square(slopes).mean()))
+        * len(slopes)
+    )
     if not np.square(slopes).sum() > least or not power.min() > least:
         return None  # a joint that stands still
     factor = values @ slopes / np.square(slopes).sum()

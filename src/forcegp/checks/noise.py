@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from forcegp.checks.check_input import CheckInput, white_noise
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, plain
+from forcegp.checks.successive_rows import white_noise
 
 MUCH = 0.2
 """Noise relative to the spread of the signal from which a filter is worth its name."""

@@ -264,11 +264,11 @@ def _gravity(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation
         along = (size or STANDARD_GRAVITY) * axis
         pulled = tau if size else inverse_dynamics(with_gravity(robot, along), rows)
         text = ",".join(f"{value + 0.0:.3g}" for value in along)
-        stated = "" if size else f", but the robot states none (--gravity={text})"
+        stated = "" if size else f", but the robot states none (`gravity={text}`)"
         yield Variation(
             subject="gravity",
             seen=lambda x, text=text, stated=stated: (
-                "the torques show no gravity, although the robot states one (--gravity=0,0,0)"
+                "the torques show no gravity, although the robot states one (`gravity=0,0,0`)"
                 if abs(x) < NO_GRAVITY
                 else f"the torques fit {x:.3g} times gravity along ({text}) m/s²{stated}"
             ),

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import GAP, CheckInput, consecutive
+from forcegp.checks.check_input import GAP, CheckInput
 from forcegp.checks.findings import Finding
+from forcegp.checks.successive_rows import consecutive
 from forcegp.data.filtering import JITTER
 
 LOST = 1.8

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput, consecutive
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, listed
+from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
@@ -85,9 +86,10 @@ def _dropped(inputs: CheckInput) -> Iterator[Finding]:
 
 def _constant(inputs: CheckInput) -> Iterator[Finding]:
     log = inputs.log
+    rests = still(log, "v") & still(log, "q")
     for name, quantity in QUANTITY.items():
         values = getattr(log, name)
-        dead = [joint for joint in range(log.nv) if still(log, name)[joint]]
+        dead = np.flatnonzero(still(log, name)).tolist()
         if not dead:
             continue
         names = tuple(inputs.names[joint] for joint in dead)
@@ -103,7 +105,6 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
             else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         )
         passive = name == "u" and not values[:, dead].any()
-        rests = still(log, "v") & still(log, "q")
         yield Finding(
             severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
             subject="constant channel",

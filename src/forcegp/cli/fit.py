@@ -56,7 +56,7 @@ class Fit(ModelOptions):
         start = time.monotonic()
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
-        self._check(terminal, dataset, system)
+        self._check(terminal, dataset, system, self.learn_from == "accelerations")
         rows_note = None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)

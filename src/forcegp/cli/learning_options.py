@@ -72,10 +72,19 @@ class LearningOptions(BackendOptions, RobotOptions):
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
 
-    def _check(self, terminal: Terminal, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> None:
-        """One line on what would spoil the model; contacts are not warned of again by the fit."""
+    def _check(
+        self, terminal: Terminal, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, accelerations: bool = True
+    ) -> None:
+        """One line on what would spoil the model; contacts are not warned of again by the fit.
+
+        Without `accelerations` nobody has measured `a`: nothing is compared with it.
+        """
         if self.checks:
-            line = findings_in_one_line(forcegp.checks.quick_check(dataset, system), self.data)
+            # without a system it compares no torques
+            looked_at = (dataset, system) if accelerations else (replace(dataset, system=None), None)
+            found = forcegp.checks.quick_check(*looked_at)
+            used = [each for each in found if accelerations or each.subject not in ("acceleration", "noise_std")]
+            line = findings_in_one_line(used, self.data)
             if line is not None:
                 terminal.warn(line)
         warnings.simplefilter("ignore", ContactWarning)

@@ -21,7 +21,7 @@ from forcegp.data.filtering import (
     uniform_step,
 )
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
-from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
+from forcegp.errors import DataWarning, DatasetError, InvalidInput, usable_arguments
 
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""
@@ -130,8 +130,8 @@ def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
         **dict.fromkeys(("power_removed", "acceleration_noise"), lambda value: all(map(_are_numbers, value.values()))),
     }
     try:
-        fine = all(fits(report[name]) for name, fits in shapes.items() if name in report)
-        return report if fine and isinstance(report, Mapping) else {}
+        whole = all(fits(report[name]) for name, fits in shapes.items() if name in report)
+        return report if whole and isinstance(report, Mapping) else {}
     except (TypeError, AttributeError):
         return {}
 

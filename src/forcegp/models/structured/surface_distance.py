@@ -41,6 +41,8 @@ def check_distance(system: MechanicalSystem, training: TrainingData) -> None:
 
 def warn_of_contacts(system: MechanicalSystem, dataset: Dataset) -> None:
     """Warn where rows contradict the contacts, which a model would learn away as a force (`contact_doubts`)."""
+    if ("ignore", None, ContactWarning, None, 0) in warnings.filters:
+        return  # whoever wants none, as the command line after its own look, need not pay for it
     for doubt in contact_doubts(dataset, system):
         if doubt.numbers.get("distance", 0.0) > FAR_FROM_SURFACE:
             continue  # check_distance refuses the rows or warns

@@ -1,0 +1,88 @@
+"""`forcegp fit` looks at its data: one line of what would spoil the model, none for a clean log, and none if asked."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.checks.corruptions import at, clean, moved, on_a_line, two_links, without_contacts
+from tests.checks.logs import column
+
+import forcegp as package
+from forcegp.errors import ContactWarning
+
+FIT = ("--points", 12, "--iterations", 2, "--restarts", 1, "--prior", "joint-friction", "--overwrite", "--out", "run")
+
+
+def looked(stderr: str) -> list[str]:
+    """The warnings of the look; two iterations of a search do not converge, which is another one."""
+    return [line for line in stderr.splitlines() if line.startswith("warning: ") and "did not converge" not in line]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("looks")
+    data = clean(two_links(), 0, seconds=5.0)
+    data.save(place / "clean.h5")
+    column(at(data, "q", [1.0, 1.0]), "u", 1, np.negative).save(place / "sign.h5")
+    line = on_a_line(0, seconds=5.0)
+    line.save(place / "line.h5")
+    moved(line, (0.005, 0.0, 0.0)).save(place / "aside.h5")
+    return place
+
+
+def test_a_clean_log_is_fitted_without_a_word(forcegp, folder):
+    for name in ("clean.h5", "line.h5"):
+        done = forcegp("fit", name, *FIT, folder=folder)
+        assert done.returncode == 0, done.stderr
+        assert not looked(done.stderr)
+
+
+def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
+    done = forcegp("fit", "sign.h5", *FIT, folder=folder)
+    assert done.returncode == 0, done.stderr
+    (line,) = looked(done.stderr)
+    assert line.startswith("warning: torque sign: the torque of joint2 has the opposite sign")
+    assert "forcegp check sign.h5" in line
+    assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)
+
+
+def test_a_missing_contact_is_said_once_by_fit_and_by_evaluate(forcegp, folder):
+    done = forcegp("fit", "line.h5", *FIT, "--contact", "none", folder=folder)
+    assert done.returncode == 0, done.stderr
+    (line,) = looked(done.stderr)
+    assert "no contact is stated, but link 'link2' stays on a plane" in line
+    scored = forcegp("evaluate", "run", "line.h5", "--every", 10, folder=folder)
+    assert scored.returncode == 0, scored.stderr
+    assert "no contact is stated" in scored.stderr
+
+
+def test_compare_looks_too(forcegp, folder):
+    done = forcegp(
+        *("compare", "sign.h5", "--prior", "joint", "--prior", "joint-friction", "--points", 12, "--iterations", 2),
+        *("--restarts", 1),
+        folder=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "warning: torque sign" in done.stderr
+
+
+def test_in_python_a_fit_warns_of_contacts_that_the_rows_contradict(folder):
+    data = package.Dataset.load(folder / "line.h5")
+    wrong = without_contacts(data)
+    assert wrong.system is not None
+    model = package.StructuredGP(wrong.system, package.JointFriction())
+    few = package.inference.OptimizerOptions(iterations=1)
+    with pytest.warns(ContactWarning, match="no contact is stated"):
+        model.fit(replace(wrong, metadata={}), points=12, restarts=1, options=few)
+
+
+@pytest.mark.parametrize("columns", ["40", "80"])
+def test_the_table_of_check_is_never_cut(forcegp, folder, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    done = forcegp("check", "clean.h5", folder=folder)
+    (header,) = [line for line in done.stdout.splitlines() if "times M" in line]
+    rows = [line for line in done.stdout.splitlines() if line.startswith(" joint")][-2:]
+    assert len(header.split()) >= 5
+    for row in rows:
+        assert row.split()[2] == "%"
+        assert len(row.split()) == 8
