@@ -21,7 +21,7 @@ from forcegp.data.filtering import (
     uniform_step,
 )
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
-from forcegp.errors import DataWarning, DatasetError, InvalidInput, usable_arguments
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""
