@@ -44,9 +44,8 @@ def real_tensor(name: str, given: Any, device: torch.device) -> Tensor:
     """
     if not isinstance(given, Tensor):
         return torch.tensor(real_array(name, given).astype(np.float64), device=device)
-    dense = given.layout == torch.strided and given.is_meta <= (device.type == "meta")
-    if not dense or given.dtype == torch.bool or given.is_complex():
-        raise InvalidInput(f"{name} must be a tensor of real numbers; given: {given.dtype} on {given.device}.")
+    if given.layout != torch.strided or given.dtype == torch.bool or given.is_complex():
+        raise InvalidInput(f"{name} must be a tensor of real numbers; given: {given.dtype}, {given.layout}.")
     return given.to(torch.float64)  # itself where it is
 
 
