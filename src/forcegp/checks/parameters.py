@@ -124,6 +124,8 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
         for g, x, other in sorted(options, key=lambda option: -option[0])[1:3]
         if g > gain - np.log(1.5) and abs(x - other.stated) >= other.least
     ]
+    # a mass with and without its inertia reads the same
+    others = [text for text in dict.fromkeys(others) if text != best.seen(value)]
     also = f" Nearly as well: {'; '.join(others)}." if others else ""
     return [
         Finding(
