@@ -55,6 +55,9 @@ def shown(data):
 
 
 FACTS = {
+    "AnalyticalIdentification": ("torque", "rows", "consistent"),
+    "CheckReport": ("wrong: none", "sampling"),
+    "Predictor": ("joints: 3", "covariance"),
     "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
     "StructuredPosterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
     "IndependentPosterior": ["learned from: 20 rows"],
