@@ -4,9 +4,19 @@ from xml.etree import ElementTree
 
 import pytest
 import torch
+from tests.checks.corruptions import clean, two_links
 from tests.models.arm import arm_data, arm_system
 
-from forcegp import Coefficients, IndependentGP, NeuralNetwork, StructuredGP, ViscousJointFriction, evaluate
+from forcegp import (
+    Coefficients,
+    IndependentGP,
+    NeuralNetwork,
+    StructuredGP,
+    ViscousJointFriction,
+    check,
+    evaluate,
+    identify_analytical,
+)
 from forcegp.errors import ForceGPError
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Actuation, RigidBodyBias
@@ -26,6 +36,7 @@ def shown(data):
     friction = arm_system(known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(0.1)))
     learned = StructuredGP(friction).identify(data, Coefficients("viscous-joint-friction"), **quick)
     prediction = posterior.predict(data.q, data.v, data.u)
+    in_air = clean(two_links(), 0, seconds=5.0)
     return {
         "Dataset": data,
         "StructuredPosterior": posterior,
@@ -37,10 +48,16 @@ def shown(data):
         "Robot": data.system.robot,
         "MechanicalSystem": data.system,
         "Identification": learned.identification,
+        "AnalyticalIdentification": identify_analytical(in_air),
+        "CheckReport": check(in_air),
+        "Predictor": posterior.predictor(compile=False),
     }
 
 
 FACTS = {
+    "AnalyticalIdentification": ("torque", "rows", "consistent"),
+    "CheckReport": ("wrong: none", "sampling"),
+    "Predictor": ("joints: 3", "covariance"),
     "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
     "StructuredPosterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
     "IndependentPosterior": ["learned from: 20 rows"],

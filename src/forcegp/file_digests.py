@@ -30,6 +30,8 @@ def require_unchanged(folder: Path, remedy: str) -> bool:
     sums = folder / SUMS
     if not sums.exists():
         return False
+    if sums.is_fifo():  # to open it would wait for a writer for ever
+        raise FileFormatError(f"{folder} is damaged: {SUMS} is not a regular file; {remedy}")
     try:
         stored = sums.read_bytes().decode("utf-8")
         names = [line[66:] for line in stored.splitlines()]

@@ -119,3 +119,11 @@ def test_without_points_given_all_of_few_rows_are_taken(here, capfd):
     Dataset.load("train.h5").rows(slice(0, 24)).save("few.h5")
     assert main(["compare", "few.h5", *TWO.split(), "--iterations", "2", "--restarts", "1", "--jobs", "2"]) == 0
     assert "24 points of few.h5" in capfd.readouterr().out
+
+
+def test_the_next_fit_has_the_robot_and_the_noise_that_were_compared(forcegp, folder):
+    words = ("--prior", "joint-friction", "--prior", "none", "--points", 10, "--gravity", "0,0,-9.8", "--no-checks")
+    done = forcegp("compare", "train.h5", *words, "--noise", "0.1", *QUICK, folder=folder)
+    assert done.returncode == 0, done.stderr
+    told = " ".join(done.stdout.split())
+    assert re.search(r"Next: forcegp fit train\.h5 --gravity=0,0,-9\.8 --noise 0\.1 --prior \S+ --points 10", told)

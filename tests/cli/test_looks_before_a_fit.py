@@ -86,3 +86,22 @@ def test_the_table_of_check_is_never_cut(forcegp, folder, monkeypatch, columns):
     for row in rows:
         assert row.split()[2] == "%"
         assert len(row.split()) == 8
+
+
+def test_the_next_step_shows_what_the_fit_found(forcegp, folder):
+    """forcegp check looks at the robot of its own options, and has none for contacts: there the remedy stands."""
+    done = forcegp("fit", "clean.h5", *FIT, "--gravity", "0,0,0", folder=folder)
+    assert "See forcegp check clean.h5 --gravity=0,0,0 (--no-checks" in " ".join(done.stderr.split())
+    done = forcegp("fit", "line.h5", *FIT, "--contact", "none", folder=folder)
+    said = " ".join(done.stderr.split())
+    assert "warning: contact: " in said
+    assert "See forcegp check" not in said
+    assert "--contact" in said
+
+
+def test_the_table_of_a_search_that_stopped_names_the_option(forcegp, folder):
+    done = forcegp("fit", "clean.h5", *FIT, folder=folder)
+    shown = " ".join(done.stdout.split())
+    assert "not converged" in shown
+    assert "raise --iterations" in shown
+    assert "`" not in shown

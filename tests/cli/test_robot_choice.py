@@ -1,5 +1,6 @@
 """The options that choose a robot: as objects, and as words."""
 
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -119,3 +120,10 @@ def test_a_fit_starts_from_an_identified_system(forcegp, folder):
 
     forces = load_posterior(folder / "fitted").system.known_forces
     np.testing.assert_array_equal(forces[-1].coefficients, [0.1, 0.2, 0.3])
+
+
+def test_a_pipe_is_refused_at_once(tmp_path):
+    """To open it would wait for a writer for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ForceGPError, match="pipe is not a regular file"):
+        options("--identified", str(tmp_path / "pipe")).chosen_robot()

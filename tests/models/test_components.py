@@ -168,6 +168,8 @@ def test_a_curve_is_that_of_dense_conditioning(posterior, dense, train):
 
 
 def test_wrong_curves_are_refused(posterior, train):
+    with pytest.raises(InvalidInput, match="no latent '0' in this model"):
+        posterior.curve(0)  # a number is no name
     with pytest.raises(InvalidInput, match=r"no latent 'lift' in this model.* Valid latents: "):
         posterior.curve("lift")
     with pytest.raises(InvalidInput, match=r"'joint-friction lift' .*\(3, 2\).*\(n, 1\)"):

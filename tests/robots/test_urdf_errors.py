@@ -1,5 +1,6 @@
 """Each way in which a URDF can be wrong has its own error, which names the file, the culprit and the remedy."""
 
+import os
 import re
 from pathlib import Path
 
@@ -305,3 +306,10 @@ def test_relative_paths_and_strings_are_paths(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert Robot.from_urdf("arm.urdf").source == "arm.urdf"
     assert Robot.from_urdf(Path("arm.urdf")).nv == 1
+
+
+def test_a_pipe_is_refused_at_once(tmp_path):
+    """To open it would wait for a writer for ever."""
+    os.mkfifo(tmp_path / "pipe.urdf")
+    with pytest.raises(errors.UnreadableRobotFile, match=r"pipe\.urdf: is not a regular file"):
+        Robot.from_urdf(tmp_path / "pipe.urdf")

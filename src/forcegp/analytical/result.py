@@ -28,12 +28,13 @@ from forcegp.mechanics import (
     StribeckJointFriction,
     ViscousJointFriction,
 )
+from forcegp.summary import Summary
 
 Rows = Float[np.ndarray, "rows nv"]
 
 
-@dataclass(frozen=True, eq=False)
-class AnalyticalIdentification:
+@dataclass(frozen=True, eq=False, repr=False)
+class AnalyticalIdentification(Summary):
     """Estimates of `identify_analytical`; `given` is the system that it started from, some bodies `thickened`."""
 
     given: MechanicalSystem
@@ -47,6 +48,16 @@ class AnalyticalIdentification:
     thickened: tuple[str, ...]
     noise: NoiseLevels | None = None
     """Of accelerations and forces, after maximum likelihood in accelerations."""
+
+    def facts(self) -> dict[str, object]:
+        """The robot, what was estimated and from what."""
+        return {
+            "robot": f"{self.given.robot.name!r}, {self.given.robot.nv} joints",
+            "likelihood": self.likelihood,
+            "inertias": "free" if isinstance(self.bodies, FreeBodies) else "consistent",
+            "learned from": f"{len(self.episode)} rows",
+            "converged": self.fit.settled,
+        }
 
     # ------------------------------------------------------------------ the estimates
 

@@ -119,12 +119,13 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
     gain, value, best = max(options, key=lambda option: option[0], default=(0.0, 0.0, None))
     if best is None or gain < GAIN or abs(value - best.stated) < best.least:
         return []
-    others = [
-        other.seen(x)
+    others = {
+        other.seen(1.0): other.seen(x)
         for g, x, other in sorted(options, key=lambda option: -option[0])[1:3]
         if g > gain - np.log(1.5) and abs(x - other.stated) >= other.least
-    ]
-    also = f" Nearly as well: {'; '.join(others)}." if others else ""
+    }
+    others.pop(best.seen(1.0), None)  # a mass with and without its inertia reads the same
+    also = f" Nearly as well: {'; '.join(others.values())}." if others else ""
     return [
         Finding(
             severity="look",

@@ -24,6 +24,7 @@ from forcegp.data import Dataset, Preparation
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import require_type
 from forcegp.mechanics import MechanicalSystem
+from forcegp.summary import Summary, listed
 
 BEFORE_A_FIT = frozenset(
     ("contact", "noise_std", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
@@ -32,8 +33,8 @@ BEFORE_A_FIT = frozenset(
 """Subjects that a fit reports also where a person should judge."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CheckReport:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class CheckReport(Summary):
     """The findings, worst first, and what they rest on.
 
     `inputs` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
@@ -43,6 +44,13 @@ class CheckReport:
     findings: tuple[Finding, ...]
     inputs: CheckInput
     comparison: Hypothesis | None
+
+    def facts(self) -> dict[str, object]:
+        """The subjects of the findings, by severity."""
+        return {
+            each: listed(finding.subject for finding in self.findings if finding.severity == each)
+            for each in ("wrong", "look", "ok")
+        }
 
     @property
     def evidence(self) -> CheckInput:

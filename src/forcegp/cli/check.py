@@ -89,7 +89,7 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[
     findings.add_column(overflow="fold")
     for finding in report.findings:
         text = Text(f"{finding.subject}: ", style="bold")
-        text.append(finding.seen, style="not bold")
+        text.append(terminal.worded(finding.seen), style="not bold")
         findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
         if finding.remedy:
             findings.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))

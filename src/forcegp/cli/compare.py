@@ -163,11 +163,22 @@ class Compare(LearningOptions):
         if self.out is not None:
             following = f"Next: forcegp evaluate {self.out / folders[preferred]} TEST.h5"
         else:
+            chosen = "".join(f" {_quoted(word)}" for word in self._same_words())
             following = (
-                f"Next: forcegp fit {self.data} --prior {_quoted(preferred)} --points {comparison.points} --out run"
+                f"Next: forcegp fit {self.data}{chosen} --prior {_quoted(preferred)} --points {comparison.points} "
+                "--out run"
             )
         table = columns(title, header, rows, long_names=True)
         return [table, Text(comparison.verdict), Text(following)]
+
+    def _same_words(self) -> list[str]:
+        """Options that a fit needs, too: for another robot, contact or noise nothing was compared."""
+        words = self.system_words()
+        words += [] if self.mean == "analytical" else ["--mean", self.mean]
+        words += [] if self.noise == "dataset" else ["--noise", self.noise]
+        words += [] if self.force_noise is None else ["--force-noise", f"{self.force_noise:g}"]
+        words += [] if self.rows == "auto" else ["--rows", self.rows]
+        return words + ([] if self.hyperprior else ["--no-hyperprior"])
 
     def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best
@@ -197,4 +208,4 @@ def _folders(comparison: forcegp.PriorComparison) -> dict[str, str]:
 
 
 def _quoted(name: str) -> str:
-    return name if re.fullmatch(r"[\w.:=,/-]+", name) else f'"{name}"'
+    return name if re.fullmatch(r"[\w.:=,/@-]+", name) else f'"{name}"'

@@ -16,6 +16,7 @@ import forcegp.robots
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit_options import ModelOptions
 from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
+from forcegp.cli.option_names import with_option_names
 from forcegp.cli.output_folders import require_free_folder
 from forcegp.cli.tables import facts
 from forcegp.cli.terminal import Terminal
@@ -134,7 +135,8 @@ def _points_used(summary: Mapping[str, Any]) -> str:
 
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     forces = summary.get("force_noise_std")
-    status = summary["status"]  # names failed evaluations, too, and the number of starts
+    # the status counts failed evaluations, too, and the starts
+    status = with_option_names(summary["status"], ("iterations",))
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
         f"{run}: {summary['model']}, learned from {_points_used(summary)}",

@@ -20,6 +20,7 @@ from forcegp.cli.identify_options import IdentifyOptions
 from forcegp.cli.identify_regression import INERTIAS, identify_by_regression
 from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
 from forcegp.cli.model_choice import resolved_noise
+from forcegp.cli.option_names import with_option_names
 from forcegp.cli.output_folders import require_free_folder
 from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
@@ -119,7 +120,8 @@ def _report(command: Identify, found: forcegp.models.Identification, summary: Ma
     used = f"{points} points" if learning == points else f"{learning} of {points} points"
     title = f"{command.out}: identified from {used}, with kernels and noise free to follow"
     table = columns(title, ["parameter", "start", "identified", "std.\nerror", "95 % interval", "unit"], rows)
-    state = summary["status"] if summary["converged"] else f"not converged: {summary['status']}"
+    status = with_option_names(summary["status"], ("iterations",))
+    state = status if summary["converged"] else f"not converged: {status}"
     search = f"{summary['iterations']} iterations, {summary['cpu_seconds']:.1f} s CPU, {state}."
     last = f"Wrote {command.out / 'identified.urdf'}. Next: forcegp evaluate {command.out} TEST.h5"
     return [table, Text(found.verdict), Text(search), Text(last)]

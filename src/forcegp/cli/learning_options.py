@@ -84,7 +84,8 @@ class LearningOptions(BackendOptions, RobotOptions):
             looked_at = (dataset, system) if accelerations else (replace(dataset, system=None), None)
             found = forcegp.checks.quick_check(*looked_at)
             used = [each for each in found if accelerations or each.subject not in ("acceleration", "noise_std")]
-            line = findings_in_one_line(used, self.data)
+            # check has no --contact: it would find nothing wrong with the contacts of the data
+            line = findings_in_one_line(used, self.data, self.robot_words(), advise=bool(self.contact))
             if line is not None:
                 terminal.warn(line)
         warnings.simplefilter("ignore", ContactWarning)
@@ -98,6 +99,12 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.known_force:
             system = _with_known_forces(system, self.known_force)
         return system
+
+    def system_words(self) -> list[str]:
+        """The options that chose the system, as words of a command that is to work with the same one."""
+        words = self.robot_words()
+        words += [word for value in self.contact for word in ("--contact", value)]
+        return words + [word for value in self.known_force for word in ("--known-force", value)]
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
         """The rows to learn from, and a note to print after the fit."""

@@ -88,6 +88,19 @@ class RobotOptions(Command):
             return found
         return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
 
+    def robot_words(self) -> list[str]:
+        """The options that chose the robot, as words of a command that is to work with the same one."""
+        words = [] if self.robot is None else ["--robot", str(self.robot)]
+        words += [] if self.inertias == "strict" else ["--inertias", self.inertias]
+        words += [
+            word
+            for name, given in (("lock", self.lock), ("armature", self.armature))
+            for value in given
+            for word in (f"--{name}", value)
+        ]
+        words += [] if self.gravity is None else [f"--gravity={self.gravity}"]
+        return words + ([] if self.identified is None else ["--identified", str(self.identified)])
+
     def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
         """A robot from a URDF file, or from the recorded one's text, with what the options change."""
         if recorded is not None:
@@ -130,6 +143,8 @@ class RobotOptions(Command):
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
         if path != self.identified:
             require_unchanged(self.identified, "identify again")
+        if path.is_fifo():  # to open it would wait for a writer for ever
+            raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp identify` wrote.")
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:

@@ -23,6 +23,7 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
 from forcegp.robots.real_numbers import real_tensor, require_finite
+from forcegp.summary import Summary
 
 INSTEAD_OF_TRANSFORMS = (
     "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
@@ -41,8 +42,8 @@ class Linearization(NamedTuple):
     da_du: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class Predictor:
+@dataclass(frozen=True, eq=False, repr=False)
+class Predictor(Summary):
     """The acceleration that a posterior predicts, fast; made by `posterior.predictor()`.
 
     States are float64 tensors or arrays (nv,) or (n, nv) in the units of `posterior.predict`; results are tensors with
@@ -68,6 +69,11 @@ class Predictor:
     compressed: CompressedCovariance | None
     widening: float
     prepare_seconds: float
+
+    def facts(self) -> dict[str, object]:
+        """What it predicts, and how long preparing took."""
+        covariance = {"joints": self.nv, "covariance": self.kind, "device": self.device}
+        return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
 
     @property
     def rank(self) -> int | None:

@@ -285,6 +285,8 @@ def _document(path: Path) -> dict[str, Any]:
         what = "does not exist" if not path.exists() else "is a file"
         raise FileFormatError(f"{path} {what}; give the folder that `forcegp fit --out` wrote")
     file = path / "model.json"
+    if file.is_fifo():  # to open it would wait for a writer for ever
+        raise FileFormatError(f"{file} is not a regular file; give the folder that `forcegp fit --out` wrote")
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except OSError:

@@ -11,6 +11,8 @@ from forcegp.errors import UnreadableRobotFile
 def read_text(path: str | Path) -> str:
     """Decode a URDF file; :class:`UnreadableRobotFile` where there is none or it is not text."""
     path = Path(path)
+    if path.is_fifo():  # to open it would wait for a writer for ever
+        raise UnreadableRobotFile(f"{path}: is not a regular file; give the path of a URDF file.")
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -229,7 +229,7 @@ class StructuredPosterior(Posterior):
         """
         names = self.latent_names
         if latent not in names:
-            raise InvalidInput(unknown_name_message("latent", latent, "this model", names))
+            raise InvalidInput(unknown_name_message("latent", str(latent), "this model", names))
         index = names.index(latent)
         prior, robot = self.model.prior, self.model.system.robot
         with torch.no_grad():
