@@ -21,7 +21,10 @@ OTHERWISE = {
 }
 """Options whose argument has another name in Python."""
 
-ELSEWHERE = {"`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)"}
+ELSEWHERE = {
+    "`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)",
+    "forcegp.data.rows_in_contact": "--rows in-contact",
+}
 """Calls of Python that an option stands for."""
 
 

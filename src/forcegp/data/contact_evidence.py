@@ -178,7 +178,7 @@ def _missing(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[
     gain, contact = found
     surface = contact.surface
     if isinstance(surface, forcegp.mechanics.Plane):
-        normal = ", ".join(f"{value + 0.0:.2f}" for value in surface.normal)
+        normal = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in surface.normal)
         where = f"a plane with the normal ({normal})"
     else:
         where = "a sphere" if isinstance(surface, forcegp.mechanics.Sphere) else "a surface"

@@ -20,6 +20,8 @@ from forcegp.models.protocol import Posterior
 TRIED_ROWS = 200
 """Rows on which both systems are tried before one is advised."""
 
+KEPT = "; it stays as it is"
+
 WORTH_MOVING = 0.9
 """Error in the system of the data over that in the model's own, below which the model is worth carrying over."""
 
@@ -69,7 +71,9 @@ def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
     are, those = ("are", "those") if contacts else ("is", "that")
     measured = f"; the constraint error is measured on {those} of the data" if contacts else ""
-    yield f"the {what} of the model {are} not {those} of the data{measured}{_tried(posterior, dataset, own)}"
+    tried = _tried(posterior, dataset, own)
+    if contacts or not tried.startswith(KEPT):  # a robot that serves these data better than theirs was identified
+        yield f"the {what} of the model {are} not {those} of the data{measured}{tried}"
 
 
 def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> str:
@@ -93,7 +97,7 @@ def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> 
             f"; carried over to them, the error of its mean is {there:.3g} instead of {here:.3g} on "
             f"{len(rows)} of these rows: `posterior.with_system(dataset.system)`"
         )
-    return f"; it stays as it is, for carried over to them its error would be {there:.3g} instead of {here:.3g}"
+    return f"{KEPT}, for carried over to them its error would be {there:.3g} instead of {here:.3g}"
 
 
 def moved_system(posterior: Posterior, system: MechanicalSystem) -> MechanicalSystem:
