@@ -142,8 +142,6 @@ class ModelConformance:
         assert not any("of the data" in warning or "training rows" in warning for warning in evaluation.warnings)
         speaks = fitted.predict(test.q[:1], test.v[:1], test.u[:1]).unknown_force is not None
         assert fitted.predicts_forces == speaks
-        with pytest.warns(DeprecationWarning, match="predicts_forces"):
-            assert fitted.speaks_of_forces == speaks
         assert (evaluation.unknown_force_mae is not None) == speaks
         assert (evaluation.multiplier_mae is not None) == speaks
         bare = dataclasses.replace(test, truth={}, noise_std=None, system=None)

@@ -193,19 +193,3 @@ def test_equal_seeds_give_equal_models_from_several_starts():
     first, second = (StructuredGP(data.system, JointFriction()).fit_windows(data, **how) for _ in range(2))
     assert first.result.value == second.result.value
     assert len(first.settings["restart_objective"]) == 2
-
-
-def test_the_keywords_of_version_0_1_still_work_and_name_their_successors():
-    data = motion()
-    model = StructuredGP(data.system, JointFriction())
-    how = {"points": 6, "restarts": 1, "options": OptimizerOptions(iterations=2)}
-    with pytest.warns(DeprecationWarning, match="fit_windows"):
-        before = model.fit(data, observe=HOW, **how)
-    assert before.result.value == model.fit_windows(data, HOW, **how).result.value
-    mass = LinkInertia("hand", ("mass",))
-    with pytest.warns(DeprecationWarning, match="identify"):
-        before = model.fit(data, observe=HOW, learn=mass, prior_strength=1.0, **how)
-    now = model.identify(data, mass, observe=HOW, prior_strength=1.0, **how)
-    assert before.identification.values == now.identification.values
-    with pytest.raises(TypeError, match="point"):
-        model.fit(data, point=6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,12 +50,6 @@ class CheckReport(Summary):
             each: listed(finding.subject for finding in self.findings if finding.severity == each)
             for each in ("wrong", "look", "ok")
         }
-
-    @property
-    def evidence(self) -> CheckInput:
-        """Deprecated name of `inputs`."""
-        warnings.warn("CheckReport.evidence is now called inputs.", DeprecationWarning, stacklevel=2)
-        return self.inputs
 
     @property
     def severity(self) -> Severity:

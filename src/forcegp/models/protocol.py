@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -113,12 +112,6 @@ class Posterior(Summary, ABC):
     def predicts_forces(self) -> bool:
         """Whether predictions hold the forces behind the acceleration."""
         return True
-
-    @property
-    def speaks_of_forces(self) -> bool:
-        """`predicts_forces` under its name of version 0.1."""
-        warnings.warn("speaks_of_forces is deprecated; use predicts_forces", DeprecationWarning, stacklevel=2)
-        return self.predicts_forces
 
     @property
     def carries_known_forces(self) -> bool:

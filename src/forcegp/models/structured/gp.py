@@ -43,9 +43,6 @@ from forcegp.priors.stored_priors import described_prior
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
 
-MOVED = {"observe", "learn", "prior_strength"}
-"""Keywords that `fit` had in version 0.1, when it was also `fit_windows` and `identify`."""
-
 
 @dataclass(frozen=True, eq=False)
 class StructuredGP(StructuredModel):
@@ -79,7 +76,6 @@ class StructuredGP(StructuredModel):
         engine: Engine | str = "auto",
         learning_points: int | None = None,
         progress: FitProgress | None = None,
-        **moved: Any,
     ) -> StructuredPosterior:
         """Find all kernel and learned noise parameters by marginal likelihood, then condition on the points.
 
@@ -110,7 +106,6 @@ class StructuredGP(StructuredModel):
 
         Where the prior has a friction that is proportional to the normal force, and no `expected` friction is given,
         the fit is repeated with the normal force under the friction that was found, until it settles.
-        The keywords `observe`, `learn` and `prior_strength` of version 0.1 warn (DeprecationWarning) and still work.
 
         Raises
         ------
@@ -121,8 +116,6 @@ class StructuredGP(StructuredModel):
         NumericalError: the engine failed, for example to reach its tolerance.
         """
         search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
-        if moved:
-            return self._fit_as_before(dataset, points, search, engine, learning_points, moved)
         return self._fit_rows(dataset, points, search, engine, learning_points)
 
     def fit_windows(
@@ -268,30 +261,6 @@ class StructuredGP(StructuredModel):
         return widened(fitted, search.hyperprior).with_settings(
             **described, engine=Exact().to_dict(), engine_reason=reason
         )
-
-    def _fit_as_before(
-        self,
-        dataset: Dataset,
-        points: int | None,
-        search: Search,
-        engine: Engine | str,
-        learning_points: int | None,
-        moved: Mapping[str, Any],
-    ) -> StructuredPosterior:
-        """`fit` with the keywords of version 0.1. Raises TypeError for any other keyword."""
-        unknown = moved.keys() - MOVED
-        if unknown:
-            raise TypeError(f"StructuredGP.fit() got an unexpected keyword argument {min(unknown)!r}")
-        now = "identify(dataset, learn, ...)"
-        if moved.get("learn") is None:
-            now = "fit(dataset)" if moved.get("observe") is None else "fit_windows(dataset, observe, ...)"
-        message = f"fit({'=..., '.join(moved)}=...) is deprecated and will be removed; call {now}"
-        warnings.warn(message, DeprecationWarning, stacklevel=3)
-        learning = moved.get("learn"), moved.get("prior_strength", 0.0)
-        if moved.get("observe") is None:
-            return self._fit_rows(dataset, points, search, engine, learning_points, *learning)
-        _require_exact(engine, learning_points)
-        return self._fit_windows(dataset, moved["observe"], points, search, *learning)
 
     def _continuation(self, rows: Dataset, dataset: Dataset, search: Search) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
