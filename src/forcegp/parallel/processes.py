@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from collections.abc import Callable, Hashable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -18,6 +19,9 @@ from forcegp.parallel.worker import ONE_THREAD, begin_process, recorded, replaye
 
 IDLE_SECONDS = 300
 """So long processes without work are kept for the next call."""
+
+HANDED_OVER = 5.0
+"""Seconds in which a task is handed over to a process at the latest."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,10 @@ class _Processes(Workers):
     @override
     def stop(self) -> None:
         if self._at_work:
+            # joblib's own thread raises a KeyError where it is stopped before it has handed a task over
+            last = time.monotonic() + HANDED_OVER
+            while time.monotonic() < last and not all(task.running() or task.done() for task in self._at_work):
+                time.sleep(0.001)
             self._executor().shutdown(wait=True, kill_workers=True)
             self._at_work.clear()
 
