@@ -4,7 +4,9 @@ import json
 
 import pytest
 
-from forcegp.experiments.fits import FitSettings, fit_series
+from forcegp.data import farthest_rows
+from forcegp.experiments.fits import FitSettings, fit_series, fitted
+from forcegp.experiments.model_names import MODELS, NETWORKS
 
 SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, tolerance={"0": 1e-6, "400": 1e-5})
 
@@ -32,3 +34,13 @@ def test_a_series_begins_where_the_fit_with_fewer_points_ended():
     assert jobs[0].inputs == ("data/seed3",)
     assert all(job.inputs == ("data/seed3", job.spec["start"]) for job in jobs[1:])
     assert all(job.spec["seed"] == 3 for job in jobs)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("model", sorted(MODELS))
+def test_every_model_of_the_experiments_can_be_fitted(motion, model):
+    """A few steps each; `analytical-fitted` is identified, and once a change of `fit` stopped it without a test."""
+    rows = farthest_rows(motion, 20)
+    search = {"steps": 2} if model in NETWORKS else {"restarts": 1, "iterations": 2, "tolerance": 1e-2}
+    posterior = fitted({"model": model, "seed": 0, **search}, rows)
+    assert posterior.predict(motion.q[:2], motion.v[:2], motion.u[:2]).mean.shape == (2, 7)

@@ -115,7 +115,8 @@ def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] 
     if "iterations" in spec:
         more["options"] = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
         more |= {"restarts": spec["restarts"], "start": start}
-    return model.fit(train, seed=spec["seed"], **more)
+    learn = model.identify if "learn" in more else model.fit
+    return learn(train, seed=spec["seed"], **more)
 
 
 def search_report(posterior: Any) -> dict[str, Any] | None:

@@ -359,7 +359,7 @@ class StructuredPosterior(Posterior):
         kept = self.result.iterates
         if not 0 <= iteration < len(kept):
             raise InvalidInput(
-                f"iteration {iteration} was not kept; there are {len(kept)}, from 0. Fit with learn=..., or with "
+                f"iteration {iteration} was not kept; there are {len(kept)}, from 0. Call identify, or give "
                 "options=OptimizerOptions(keep_iterates=True)"
             )
         point = {**self.parameters, **kept[iteration]}
