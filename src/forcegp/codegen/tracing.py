@@ -59,7 +59,7 @@ def trace(
 
     with torch.no_grad(), StraightLineAlgebra():
         table = dict(core_aten_decompositions().items())
-        traced = make_fx(function, decomposition_table=table)(*examples).graph  # type: ignore[arg-type]  # its keys are operations
+        traced = make_fx(lambda *x: function(*x), decomposition_table=table)(*examples).graph  # type: ignore[arg-type]  # its keys are operations
     graph = Graph(sum(x.numel() for x in examples)) if graph is None else graph
     nodes = torch.tensor([x.node for x in inputs] or graph.inputs).split([x.numel() for x in examples])
     given = iter([_Numbers(part.view(x.shape)) for part, x in zip(nodes, examples, strict=True)])
