@@ -1,4 +1,4 @@
-"""One step of time: symplectic Euler, classical Runge-Kutta, and a projected scheme that stays on the constraint.
+"""One step of time: symplectic Euler, Runge-Kutta, implicit midpoint, and a scheme that stays on the constraint.
 
 An integrator asks for accelerations a(q, v) wherever they come from; actuator forces are constant
 over the step. All states are batched, (n, nv).
@@ -17,20 +17,27 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.integration.constraint_manifold import ConstraintManifold
+from forcegp.integration.newton import find_roots
 from forcegp.mechanics import MechanicalSystem
 
 Acceleration = Callable[[Tensor, Tensor], Tensor]
 """(q, v), each (n, nv), -> a (n, nv)."""
+AccelerationSlopes = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+"""(q, v) -> a (n, nv), da/dq and da/dv (n, nv, nv)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The state after one step, the acceleration at its beginning, and whether the constraint could be met."""
+    """The state after one step, the acceleration at its beginning, and whether the constraint could be met.
+
+    `solved` is whether an implicit method found its solution; None for explicit ones.
+    """
 
     q: Float[Tensor, "n nv"]
     v: Float[Tensor, "n nv"]
     a: Float[Tensor, "n nv"]
     on_constraint: Bool[Tensor, " n"]
+    solved: Bool[Tensor, " n"] | None = None
 
 
 class Integrator(ABC):
@@ -76,6 +83,31 @@ class RungeKutta4(Integrator):
 
 
 @dataclass(frozen=True, eq=False)
+class ImplicitMidpoint(Integrator):
+    """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
+
+    Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3 and VI.4.2), by Newton's
+    method with the Jacobian I - dt/2 (da/dv + dt/2 da/dq), which takes nv backward passes where `slopes` is None.
+    """
+
+    slopes: AccelerationSlopes | None = None
+
+    @override
+    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
+        def residual(middle: Tensor) -> Tensor:
+            return middle - v - 0.5 * dt * acceleration(q + 0.5 * dt * middle, middle)
+
+        def with_slopes(middle: Tensor) -> tuple[Tensor, Tensor]:
+            assert self.slopes is not None, "it is asked for only where it is there"
+            a, da_dq, da_dv = self.slopes(q + 0.5 * dt * middle, middle)
+            J = torch.eye(q.shape[-1], dtype=q.dtype, device=q.device) - 0.5 * dt * (da_dv + 0.5 * dt * da_dq)
+            return middle - v - 0.5 * dt * a, J
+
+        middle, solved = find_roots(residual, v, None if self.slopes is None else with_slopes)
+        return Step(q + dt * middle, 2.0 * middle - v, acceleration(q, v), _all(q), solved)
+
+
+@dataclass(frozen=True, eq=False)
 class Projected(Integrator):
     """A RATTLE-like scheme of second order: after every step c(q) = 0 to 1e-12 m and A v = 0 to rounding.
 
@@ -107,6 +139,7 @@ class Projected(Integrator):
 INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
     "symplectic-euler": lambda system: SymplecticEuler(),
     "rk4": lambda system: RungeKutta4(),
+    "implicit-midpoint": lambda system: ImplicitMidpoint(),
     "projected": lambda system: Projected(ConstraintManifold(system)),
 }
 """Integrators by the name that rollouts and the command line use."""

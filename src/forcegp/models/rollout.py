@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import ConstraintManifold, Feedback, Trajectory, integrate, integrator_named
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.search import blas_threads
@@ -110,16 +110,18 @@ def roll_out(
     feedback: Feedback | None = None,
     samples: int = 0,
     seed: int = 0,
+    grad: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rollout:
     """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model.system)
-    q, v, forces, batch = _checked_start(model, q0, v0, u)
+    require_type("grad", grad, bool)
+    q, v, forces, batch = _checked_start(model, q0, v0, u, grad)
     runs = _Runs(model, integrator, dt)
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
-    with torch.no_grad(), blas_threads(0):
+    with torch.set_grad_enabled(grad), blas_threads(0):
         report = None if progress is None else lambda done, _: progress(done, total)
         control = None if feedback is None else _flat_feedback(feedback, batch)
         mean = integrate(method, model.mean(), q, v, forces, dt, feedback=control, what="rollouts", progress=report)
@@ -208,14 +210,21 @@ def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunc
     return flat
 
 
-def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
+def _checked_start(
+    model: AccelerationModel, q0: Any, v0: Any, u: Any, grad: bool
+) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
     """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions."""
     robot = model.system.robot
     given = {
-        name: real_tensor(name, values, robot.device).detach().to(robot.device)
+        name: real_tensor(name, values, robot.device).to(robot.device)
         for name, values in (("q0", q0), ("v0", v0), ("u", u))
     }
     for name, values in given.items():
+        if values.requires_grad and torch.is_grad_enabled() and not grad:
+            raise InvalidInput(
+                f"{name} requires a gradient, which a rollout drops unless asked to keep it; give grad=True, or "
+                f"{name}.detach()."
+            )
         least = 2 if name == "u" else 1
         if values.dim() < least or values.shape[-1] != robot.nv:
             wanted = f"(..., T, {robot.nv})" if name == "u" else f"(..., {robot.nv})"
