@@ -3,6 +3,7 @@ from .baselines.independent_posterior import IndependentPosterior as Independent
 from .baselines.network_ensemble import NetworkEnsemble as NetworkEnsemble
 from .baselines.network_posterior import NetworkPosterior as NetworkPosterior
 from .baselines.neural_network import NeuralNetwork as NeuralNetwork
+from .discrete_steps import StepLinearization as StepLinearization
 from .identification.identification import Identification as Identification
 from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned
 from .noise import Noise as Noise
@@ -15,4 +16,5 @@ from .storage import load_posterior as load_posterior, save_posterior as save_po
 from .structured.gp import StructuredGP as StructuredGP
 from .structured.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .structured.posterior import StructuredPosterior as StructuredPosterior
+from .structured.state_forces import PredictedForces as PredictedForces
 from .training_data import TrainingData as TrainingData

@@ -17,11 +17,15 @@ import torch
 from torch import Tensor
 
 from forcegp.codegen.native_code import require_plain
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
+from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
+from forcegp.models.structured.inverse_dynamics import inverse_dynamics
+from forcegp.models.structured.state_forces import PredictedForces, StateForces
 from forcegp.robots.real_numbers import real_tensor, require_finite
 from forcegp.summary import Summary
 
@@ -69,6 +73,7 @@ class Predictor(Summary):
     compressed: CompressedCovariance | None
     widening: float
     prepare_seconds: float
+    state_forces: StateForces | None = None  # what forces and inverse_dynamics are computed from
 
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
@@ -114,6 +119,59 @@ class Predictor(Summary):
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
         return Linearization(a, *jacobian.split(self.nv, dim=-1))
 
+    def step(
+        self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
+    ) -> tuple[Tensor, Tensor]:
+        """The state (q, v) that is `dt` seconds later under constant u, each (nv,) or (n, nv).
+
+        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/rollouts.md). Differentiable as `mean`.
+        Raises InvalidInput for other names, "projected" among them, and for a dt that is no positive number,
+        NumericalError where an implicit step is not found.
+        """
+        x, single = self._rows(q, v, u)
+        step = stepped(self.mean, self.linearize, x.split(self.nv, dim=-1), dt, integrator)
+        return (step.q[0], step.v[0]) if single else (step.q, step.v)
+
+    def linearize_step(
+        self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
+    ) -> StepLinearization:
+        """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph."""
+        x, single = self._rows(q, v, u)
+        linear = linearized_step(self.mean, self.linearize, x.split(self.nv, dim=-1), dt, integrator)
+        return StepLinearization(*(part[0] for part in linear)) if single else linear
+
+    def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> PredictedForces:
+        """The forces behind the acceleration, and every component of the prior, with exact covariances.
+
+        By torch: milliseconds. Raises InvalidInput for a covariance where the predictor has none, and for a predictor
+        that no posterior has made.
+        """
+        if require_type("covariance", covariance, bool) and self.kind == "none":
+            raise InvalidInput("this predictor has no covariance; give covariance=False, or make it with 'exact'.")
+        x, single = self._rows(q, v, u)
+        found = self._forces.predicted(*x.split(self.nv, dim=-1), covariance)
+        return found.of(0) if single else found
+
+    def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
+        """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2, m/s^2).
+
+        u = M a + h - A^T lambda - Q_U with the bias and other known forces h: friction under load is that of this
+        lambda. `normal_force` (m,) or (n, m) is the wanted lambda in N, positive where the surface pushes the robot
+        off, as in `predict(...).multiplier`; None is none. The covariance is that of Q_U at u, to first order, and None
+        for a predictor without. `a` has to obey A a = b: what the contacts do not allow, they change. Without a graph.
+        Raises InvalidInput for models without analytical mean, NumericalError where no u makes the acceleration.
+        """
+        x, single = self._rows(q, v, a, "qva")
+        rows = x.detach().split(self.nv, dim=-1)
+        found = inverse_dynamics(self._forces, *rows, normal_force, self.kind != "none")
+        return found[0] if single else found
+
+    @property
+    def _forces(self) -> StateForces:
+        if self.state_forces is None:
+            raise InvalidInput("this predictor was made without the forces of its model; call posterior.predictor().")
+        return self.state_forces
+
     def _mean(self, terms: PredictorTerms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
         if not terms.W.shape[-1]:
             return terms.offset, []
@@ -137,21 +195,21 @@ class Predictor(Summary):
         a = terms.offset + (terms.W @ f[..., None])[..., 0]
         return a, slopes.offset + (f[:, None, None] @ slopes.W)[:, :, 0] + terms.W @ df
 
-    def _rows(self, q: Any, v: Any, u: Any) -> tuple[Tensor, bool]:
+    def _rows(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[Tensor, bool]:
         """One row [q, v, u] per state, and whether it was a single state."""
-        states = [real_tensor(name, x, self.device) for name, x in zip("qvu", (q, v, u), strict=True)]
-        shape = states[0].shape
+        states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
+        shape, named = states[0].shape, f"{names[0]}, {names[1]} or {names[2]}"
         if shape[-1:] != (self.nv,) or len(shape) > 2 or any(x.shape != shape for x in states):
-            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", states, strict=True))
+            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
             raise InvalidInput(
                 f"a predictor was given {shapes}; give all three ({self.nv},) for one state or (n, {self.nv})."
             )
         if any(x.device.type != self.device.type for x in states):
-            raise InvalidInput(f"q, v or u is on another device than the predictor; move all three to {self.device}.")
+            raise InvalidInput(f"{named} is on another device than the predictor; move all three to {self.device}.")
         x = torch.cat(states, dim=-1)
         if isinstance(self.tape, TapedTerms):
             require_plain([x], "a compiled predictor", INSTEAD_OF_TRANSFORMS)
-        require_finite("q, v or u", x)
+        require_finite(named, x)
         return (x[None], True) if len(shape) == 1 else (x, False)
 
     def _blocks(self, x: Tensor) -> Sequence[Tensor]:
