@@ -6,9 +6,11 @@ over the step. All states are batched, (n, nv).
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,26 +24,23 @@ from forcegp.mechanics import MechanicalSystem
 
 Acceleration = Callable[[Tensor, Tensor], Tensor]
 """(q, v), each (n, nv), -> a (n, nv)."""
-AccelerationSlopes = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-"""(q, v) -> a (n, nv), da/dq and da/dv (n, nv, nv)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The state after one step, the acceleration at its beginning, and whether the constraint could be met.
-
-    `solved` is whether an implicit method found its solution; None for explicit ones.
-    """
+    """The state after one step, the acceleration at its beginning, and whether there is such a state (`failure`)."""
 
     q: Float[Tensor, "n nv"]
     v: Float[Tensor, "n nv"]
     a: Float[Tensor, "n nv"]
-    on_constraint: Bool[Tensor, " n"]
-    solved: Bool[Tensor, " n"] | None = None
+    found: Bool[Tensor, " n"]
 
 
 class Integrator(ABC):
     """A one-step method for q'' = a(q, q')."""
+
+    failure: ClassVar[str] = ""
+    """Why a step can have no end, for a warning."""
 
     def start(
         self, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"]
@@ -86,25 +85,17 @@ class RungeKutta4(Integrator):
 class ImplicitMidpoint(Integrator):
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
-    Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3 and VI.4.2), by Newton's
-    method with the Jacobian I - dt/2 (da/dv + dt/2 da/dq), which takes nv backward passes where `slopes` is None.
+    Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method, for
+    which torch has to be able to differentiate the acceleration.
     """
 
-    slopes: AccelerationSlopes | None = None
+    failure = "Newton's method found no solution of the implicit step"
 
     @override
     def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
-        def residual(middle: Tensor) -> Tensor:
-            return middle - v - 0.5 * dt * acceleration(q + 0.5 * dt * middle, middle)
-
-        def with_slopes(middle: Tensor) -> tuple[Tensor, Tensor]:
-            assert self.slopes is not None, "it is asked for only where it is there"
-            a, da_dq, da_dv = self.slopes(q + 0.5 * dt * middle, middle)
-            J = torch.eye(q.shape[-1], dtype=q.dtype, device=q.device) - 0.5 * dt * (da_dv + 0.5 * dt * da_dq)
-            return middle - v - 0.5 * dt * a, J
-
-        middle, solved = find_roots(residual, v, None if self.slopes is None else with_slopes)
-        return Step(q + dt * middle, 2.0 * middle - v, acceleration(q, v), _all(q), solved)
+        half = 0.5 * dt
+        middle, found = find_roots(lambda at: at - v - half * acceleration(q + half * at, at), v)
+        return Step(q + dt * middle, 2.0 * middle - v, acceleration(q, v), found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +109,7 @@ class Projected(Integrator):
     """
 
     manifold: ConstraintManifold
+    failure = "no position on the surfaces of the contacts near the predicted one"
 
     @override
     def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -150,6 +142,12 @@ def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
     if not isinstance(name, str) or name not in INTEGRATORS:
         raise InvalidInput(unknown_name_message("integrator", str(name), "forcegp", INTEGRATORS, cutoff=0.4))
     return INTEGRATORS[name](system)
+
+
+def check_time_step(dt: Any) -> None:
+    """Raise InvalidInput for what is no positive number."""
+    if isinstance(dt, bool) or not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
+        raise InvalidInput(f"dt is {dt!r}; give the time step as a positive number of seconds.")
 
 
 def _all(q: Tensor) -> Tensor:

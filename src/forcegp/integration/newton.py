@@ -3,67 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from typing_extensions import override
+
+from forcegp.errors import InvalidInput
 
 MOST_STEPS, MOST_TRIALS = 200, 12
 TOLERANCE = 1e-9
-"""The step after which x counts as found, relative to 1 + |x|: Newton's steps leave an error of about its square."""
+"""x counts as found after a step so small, relative to 1 + |x|."""
 SMALLEST_SLOPE = 0.1
-"""Smallest real part of an eigenvalue of the Jacobian that is used, where friction without the rest has 1 or more."""
+"""Smallest real part of an eigenvalue of a Jacobian that is used."""
 OVERSHOOT = 0.5
 
-Residual = Callable[[Tensor], Tensor]
-"""x (n, k) -> r (n, k), each row of its own."""
-Slopes = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""x (n, k) -> r (n, k) and dr/dx (n, k, k)."""
+Rows = Callable[[Tensor], Tensor]
+"""x (n, k) -> (n, m), each row of its own."""
 
 
-class Roots(NamedTuple):
-    """Where r(x) = 0, and the rows in which it was found."""
+def find_roots(residual: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], Bool[Tensor, " n"]]:
+    """The roots that Newton's method reaches from x, and where it found them; differentiable once in `residual`'s own.
 
-    x: Float[Tensor, "n k"]
-    converged: Bool[Tensor, " n"]
-
-
-def find_roots(residual: Residual, x: Float[Tensor, "n k"], slopes: Slopes | None = None) -> Roots:
-    """The roots that Newton's method reaches from x, differentiable once in all that `residual` depends on.
-
-    A step along d is accepted where J^-1 r has not turned round by more than half of what it was: in one dimension, as
-    long as the root is not overshot by more than that; else it is shortened by the secant rule. Requiring |r| to fall,
-    as textbooks do, stops at every bump of a friction curve (3 to 98 of 100 random states of seven joints, where this
-    finds all). A Jacobian with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with speed, the
-    plain step leads away from the root. `slopes` gives r and its Jacobian; without, they come from backward passes.
+    A step d is shortened, by the secant rule, where J^-1 r has turned round by more than half at its end: in one
+    dimension, where it overshoots the root by more. To ask for a smaller |r|, as textbooks do, ends at bumps of a
+    friction curve. A Jacobian with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with speed,
+    the plain step leads away from the root.
     """
-    slopes = slopes or (lambda at: rows_jacobian(residual, at))
     with torch.no_grad():
         x = x.detach()
-        identity = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
         found = torch.zeros(len(x), dtype=torch.bool, device=x.device)
         for _ in range(MOST_STEPS):
-            r, J = _finite(*slopes(x), identity)
-            lost = ~torch.isfinite(r).all(-1)
+            r, J = rows_jacobian(residual, x)
+            finite = torch.isfinite(r).all(-1) & torch.isfinite(J).flatten(1).all(-1)
+            identity = torch.eye(J.shape[-1], dtype=J.dtype, device=J.device)
+            J = torch.where(finite[:, None, None], J, identity)
             least = torch.linalg.eigvals(J).real.amin(-1)
             J = J + (SMALLEST_SLOPE - least).clamp_min(0.0)[:, None, None] * identity
-            d = -_solve(J, torch.where(lost[:, None], 0.0, r))
-            last = ~lost & ~found & (_norm(d) <= TOLERANCE * (1.0 + _norm(x)))
-            x = torch.where(last[:, None], x + d, x)
-            found |= last
-            open_ = ~found & ~lost
-            if not bool(open_.any()):
+            d = torch.where((finite & ~found)[:, None], -_solve(J, r), 0.0)
+            small = torch.linalg.vector_norm(d, dim=-1) <= TOLERANCE * (1.0 + torch.linalg.vector_norm(x, dim=-1))
+            found |= finite & small
+            x = x + (d if bool(small.all()) else _length(residual, x, d, J)[:, None] * d)
+            if bool(small.all()):
                 break
-            x = _shortened(residual, x, d, J, open_)
     if torch.is_grad_enabled() and (r := residual(x)).requires_grad:
-        x = _AtRoot.apply(x, _finite(*slopes(x), identity)[1], r)  # type: ignore[assignment]  # apply has no types
-    return Roots(x, found)
+        x = _AtRoot.apply(x, rows_jacobian(residual, x)[1], r)  # type: ignore[assignment]  # apply has no types
+    return x, found
 
 
-def rows_jacobian(function: Residual, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m k"]]:
+def rows_jacobian(function: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m k"]]:
     """The value and the Jacobian of a function of rows, by one backward pass for each entry of the value."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()
@@ -72,31 +61,21 @@ def rows_jacobian(function: Residual, x: Float[Tensor, "n k"]) -> tuple[Float[Te
     return y.detach(), torch.stack(rows, dim=-2)
 
 
-def _shortened(residual: Residual, x: Tensor, d: Tensor, J: Tensor, open_: Tensor) -> Tensor:
-    """x + t d for the open rows, with the largest t tried that does not overshoot."""
+def _length(residual: Rows, x: Tensor, d: Tensor, J: Tensor) -> Float[Tensor, " n"]:
+    """The largest fraction tried of each step that does not overshoot."""
     t = torch.ones_like(x[:, 0])
     square = d.square().sum(-1).clamp_min(torch.finfo(d.dtype).tiny)
-    for trial in range(MOST_TRIALS):
-        at = torch.where(open_[:, None], x + t[:, None] * d, x)
-        ahead = -(d * _solve(J, residual(at))).sum(-1) / square  # 1 at t = 0, below 0 beyond the root
-        turned = open_ & ~(ahead >= -OVERSHOOT)
-        if trial == MOST_TRIALS - 1 or not bool(turned.any()):
+    for _ in range(MOST_TRIALS):
+        ahead = -(d * _solve(J, residual(x + t[:, None] * d))).sum(-1) / square  # 1 at t = 0, < 0 beyond the root
+        turned = ~(ahead >= -OVERSHOOT)
+        if not bool(turned.any()):
             break
         t = torch.where(turned, t * torch.nan_to_num(1.0 / (1.0 - ahead), 0.1).clamp(0.1, 0.5), t)
-    return at
-
-
-def _finite(r: Tensor, J: Tensor, identity: Tensor) -> tuple[Tensor, Tensor]:
-    """A derivative that does not exist, as at |0|, counts as that of x itself."""
-    return r.detach(), torch.where(torch.isfinite(J).all(-1).all(-1)[:, None, None], J, identity)
+    return t
 
 
 def _solve(J: Tensor, r: Tensor) -> Tensor:
     return torch.linalg.solve_ex(J, r[..., None])[0][..., 0]
-
-
-def _norm(x: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(x, dim=-1)
 
 
 class _AtRoot(torch.autograd.Function):
@@ -110,7 +89,9 @@ class _AtRoot(torch.autograd.Function):
 
     @staticmethod
     @override
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (J,) = ctx.saved_tensors
-        return None, None, -_solve(J.mT, grad)
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None, Tensor]:  # type: ignore[override]  # as in torch's guide
+        if torch.is_grad_enabled():
+            raise InvalidInput(
+                "an implicit step is differentiable once; leave out create_graph, or take explicit steps."
+            )
+        return None, None, -_solve(ctx.saved_tensors[0].mT, grads[0])

@@ -16,5 +16,4 @@ from .storage import load_posterior as load_posterior, save_posterior as save_po
 from .structured.gp import StructuredGP as StructuredGP
 from .structured.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .structured.posterior import StructuredPosterior as StructuredPosterior
-from .structured.state_forces import PredictedForces as PredictedForces
 from .training_data import TrainingData as TrainingData

@@ -17,15 +17,15 @@ import torch
 from torch import Tensor
 
 from forcegp.codegen.native_code import require_plain
-from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
 from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
+from forcegp.models.structured.components import Components
 from forcegp.models.structured.inverse_dynamics import inverse_dynamics
-from forcegp.models.structured.state_forces import PredictedForces, StateForces
 from forcegp.robots.real_numbers import real_tensor, require_finite
 from forcegp.summary import Summary
 
@@ -73,7 +73,7 @@ class Predictor(Summary):
     compressed: CompressedCovariance | None
     widening: float
     prepare_seconds: float
-    state_forces: StateForces | None = None  # what forces and inverse_dynamics are computed from
+    posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
 
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
@@ -119,58 +119,43 @@ class Predictor(Summary):
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
         return Linearization(a, *jacobian.split(self.nv, dim=-1))
 
-    def step(
-        self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
-    ) -> tuple[Tensor, Tensor]:
-        """The state (q, v) that is `dt` seconds later under constant u, each (nv,) or (n, nv).
+    def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
+        """The state (q, v) `dt` seconds later under constant u, each (nv,) or (n, nv); differentiable as `mean`.
 
-        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/rollouts.md). Differentiable as `mean`.
-        Raises InvalidInput for other names, "projected" among them, and for a dt that is no positive number,
-        NumericalError where an implicit step is not found.
+        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/rollouts.md), which is differentiable
+        once. Raises InvalidInput for "projected", other names and a dt that is no positive number, NumericalError where
+        an implicit step is not found.
         """
         x, single = self._rows(q, v, u)
-        step = stepped(self.mean, self.linearize, x.split(self.nv, dim=-1), dt, integrator)
-        return (step.q[0], step.v[0]) if single else (step.q, step.v)
+        state = stepped(self.mean, self.posterior.system, x, dt, integrator)
+        q, v = (state[0] if single else state).split(self.nv, dim=-1)
+        return q, v
 
     def linearize_step(
         self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
     ) -> StepLinearization:
         """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph."""
         x, single = self._rows(q, v, u)
-        linear = linearized_step(self.mean, self.linearize, x.split(self.nv, dim=-1), dt, integrator)
+        linear = linearized_step(self.mean, self.posterior.system, x, dt, integrator)
         return StepLinearization(*(part[0] for part in linear)) if single else linear
 
-    def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> PredictedForces:
-        """The forces behind the acceleration, and every component of the prior, with exact covariances.
-
-        By torch: milliseconds. Raises InvalidInput for a covariance where the predictor has none, and for a predictor
-        that no posterior has made.
-        """
-        if require_type("covariance", covariance, bool) and self.kind == "none":
-            raise InvalidInput("this predictor has no covariance; give covariance=False, or make it with 'exact'.")
-        x, single = self._rows(q, v, u)
-        found = self._forces.predicted(*x.split(self.nv, dim=-1), covariance)
-        return found.of(0) if single else found
+    def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
+        """Unknown force, multipliers, contact force and every component of the prior, with exact covariances."""
+        self._rows(q, v, u)
+        return self.posterior.components(q, v, u, covariance=covariance)
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
-        """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2, m/s^2).
+        """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
 
-        u = M a + h - A^T lambda - Q_U with the bias and other known forces h: friction under load is that of this
-        lambda. `normal_force` (m,) or (n, m) is the wanted lambda in N, positive where the surface pushes the robot
-        off, as in `predict(...).multiplier`; None is none. The covariance is that of Q_U at u, to first order, and None
-        for a predictor without. `a` has to obey A a = b: what the contacts do not allow, they change. Without a graph.
-        Raises InvalidInput for models without analytical mean, NumericalError where no u makes the acceleration.
+        u = M a + h - A^T lambda - Q_U with the known forces -h: friction under load is that of this lambda, which
+        `normal_force` (m,) or (n, m) gives in N, positive where the surface pushes the robot off, as in
+        `predict(...).multiplier`; None is 0. The covariance is that of Q_U at u, to first order, and None for a
+        predictor without one. `a` has to obey A a = b, else the contacts change it. Results have no graph.
+        Raises InvalidInput for models without analytical mean or actuation, NumericalError where no u is found.
         """
         x, single = self._rows(q, v, a, "qva")
-        rows = x.detach().split(self.nv, dim=-1)
-        found = inverse_dynamics(self._forces, *rows, normal_force, self.kind != "none")
+        found = inverse_dynamics(self.posterior, x, normal_force, self.kind != "none")
         return found[0] if single else found
-
-    @property
-    def _forces(self) -> StateForces:
-        if self.state_forces is None:
-            raise InvalidInput("this predictor was made without the forces of its model; call posterior.predictor().")
-        return self.state_forces
 
     def _mean(self, terms: PredictorTerms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
         if not terms.W.shape[-1]:
@@ -198,7 +183,7 @@ class Predictor(Summary):
     def _rows(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[Tensor, bool]:
         """One row [q, v, u] per state, and whether it was a single state."""
         states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
-        shape, named = states[0].shape, f"{names[0]}, {names[1]} or {names[2]}"
+        shape, named = states[0].shape, f"q, v or {names[2]}"
         if shape[-1:] != (self.nv,) or len(shape) > 2 or any(x.shape != shape for x in states):
             shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
             raise InvalidInput(

@@ -5,67 +5,50 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.integration.newton import find_roots, rows_jacobian
 from forcegp.mechanics import Actuation
 from forcegp.models.prediction import Gaussian
-from forcegp.models.structured.state_forces import StateForces
 from forcegp.robots.real_numbers import real_tensor, require_finite
 
 
-def inverse_dynamics(
-    forces: StateForces, q: Tensor, v: Tensor, a: Tensor, normal_force: Any, covariance: bool
-) -> Gaussian:
-    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda at rows of states; what `Predictor.inverse_dynamics` documents.
+def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: Any, covariance: bool) -> Gaussian:
+    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a StructuredPosterior at rows x = [q, v, a].
 
-    u stands on both sides: friction in proportion to the load depends on what presses the robot on the surface, and
-    processes may have u among their features. Newton's method solves for it, in one step where neither is so. With the
-    processes f of covariance S at that u, and J = d(Q_K + Q_U)/du, u has to first order the covariance
-    J^-1 B S B^T J^-T.
+    u stands on both sides: friction in proportion to the load changes with what presses the robot onto the surface,
+    and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
+    J = d(Q_K + Q_U)/du and the covariance S of the processes, that of u is to first order J^-1 B S B^T J^-T.
     """
-    if not forces.known:
+    actuated = any(isinstance(force, Actuation) for force in posterior.system.known_forces)
+    if posterior.carries_known_forces or not actuated:
+        lacks = "analytical mean (fit with mean='analytical')" if actuated else "Actuation() among its known_forces"
+        raise InvalidInput(f"this model has no {lacks}, so no u can be solved for; call `predict` or give it one.")
+    q, v, a = x.detach().chunk(3, dim=-1)
+    shape = (len(q), len(posterior.system.contacts))
+    wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
+    if wanted.shape not in (shape, shape[1:]):
         raise InvalidInput(
-            "the model has no analytical mean, so its processes hold what u does and u cannot be solved for; fit with "
-            "mean='analytical'."
+            f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, one per contact."
         )
-    if not any(isinstance(force, Actuation) for force in forces.system.known_forces):
-        raise InvalidInput("no u acts on this system; list Actuation() among its known_forces.")
-    multiplier = _multiplier(forces, normal_force, q)
+    require_finite("normal_force", wanted)
 
-    def residual(u: Tensor) -> Tensor:
-        dynamics = forces.dynamics(q, v, u)
-        Q_U = forces.latents(dynamics, False).through(forces.prior.mixing(dynamics)).mean
-        constraint = (dynamics.A.mT @ multiplier[..., None])[..., 0]
-        return dynamics.Q_K + Q_U + constraint - (dynamics.M @ a[..., None])[..., 0]
+    def surplus(u: Tensor) -> Tensor:
+        at = posterior.dynamics(q, v, u)
+        Q_U = posterior.latents(at, False).through(posterior.model.prior.mixing(at)).mean
+        return at.Q_K + Q_U + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
 
     with torch.no_grad():
-        u, solved = find_roots(residual, torch.zeros_like(q))
-        if not bool(solved.all()):
+        u, found = find_roots(surplus, torch.zeros_like(a))
+        if not bool(found.all()):
             raise NumericalError(
-                f"no u was found that makes the acceleration of state {int((~solved).nonzero()[0])}: friction under "
-                "that load takes as much as u adds, or q, v or a is too large; check them, or ask for a smaller "
-                "normal_force."
+                f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration: friction takes as much "
+                "as u adds, or a number is too large; check q, v, a and normal_force of that row."
             )
         if not covariance:
             return Gaussian(u, None)
-        dynamics = forces.dynamics(q, v, u)
-        _, J = rows_jacobian(residual, u)
-        spread = torch.linalg.solve(J, forces.prior.mixing(dynamics))
-        return Gaussian(u, forces.latents(dynamics, True).through(spread).covariance)
-
-
-def _multiplier(forces: StateForces, given: Any, q: Tensor) -> Tensor:
-    """lambda (n, m), checked."""
-    wanted = (len(q), len(forces.system.contacts))
-    if given is None:
-        return q.new_zeros(wanted)
-    value = real_tensor("normal_force", given, q.device).detach()
-    if value.shape not in (wanted, wanted[1:]):
-        raise InvalidInput(
-            f"normal_force has shape {tuple(value.shape)}; give one number for each of the {wanted[1]} contacts, "
-            f"({wanted[1]},) or {wanted}, in N."
-        )
-    require_finite("normal_force", value)
-    return value.expand(wanted)
+        at = posterior.dynamics(q, v, u)
+        response = torch.linalg.solve(rows_jacobian(surplus, u)[1], posterior.model.prior.mixing(at))
+        return Gaussian(u, posterior.latents(at, True).through(response).covariance)

@@ -38,12 +38,11 @@ from forcegp.models.predictor_terms import TermsFunction
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
-from forcegp.models.structured.components import Components, Curve, components_of, term_slices
+from forcegp.models.structured.components import Components, Curve, Latents, components_of, term_slices
 from forcegp.models.structured.definition import StructuredModel
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.measured_torque import plus, second_moments, shrunk, without_force_noise
 from forcegp.models.structured.predictor_preparation import prepared_predictor
-from forcegp.models.structured.state_forces import StateForces
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
@@ -119,7 +118,7 @@ class StructuredPosterior(Posterior):
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
-        latents = self._forces.latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
 
         def through(affine: AffineMap) -> Gaussian:
             return latents.through(affine.matrix @ B, affine.offset)
@@ -144,11 +143,19 @@ class StructuredPosterior(Posterior):
             return affine, None
         return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
-    @property
-    def _forces(self) -> StateForces:
-        inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
-        prior, known, standardize = self.model.prior, not self.carries_known_forces, self.likelihood.standardization
-        return StateForces(self.system, prior, known, inertials, standardize, self.latent, self.widening)
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
+        """All processes at a batch of states."""
+        batch = dynamics.state.q.shape[:-1]
+        given = self.likelihood.standardization(self.model.prior.features(dynamics))
+        features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
+        latents = len(features)
+        if not latents:
+            nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
+            return Latents(nothing.flatten(-2), nothing if covariance else None)
+        mean = self.latent.mean(features).reshape(*batch, latents)
+        if not covariance:
+            return Latents(mean, None)
+        return Latents(mean, self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents))
 
     @property
     def widening(self) -> float:
@@ -175,7 +182,7 @@ class StructuredPosterior(Posterior):
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
         prepared = prepared_predictor(self.latent, self.widening, self.training, self._terms_function, **how)
-        return replace(prepared, state_forces=self._forces)
+        return replace(prepared, posterior=self)
 
     def _terms_function(self, prepared: PreparedKernels, features: bool) -> TermsFunction:
         """The terms of a predictor as a function of the state, differentiable, by the same code as `predict`.
@@ -204,7 +211,7 @@ class StructuredPosterior(Posterior):
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
-        latents = self._forces.latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
     @override
