@@ -127,16 +127,9 @@ def roll_out(
     def run(function: AccelerationFunction, copies: tuple[int, ...], what: str, before: int) -> Rollout:
         shape, count = (*copies, *batch), math.prod(copies)
         start = q.repeat(count, 1), v.repeat(count, 1)
-        motion = integrate(
-            method,
-            function,
-            *start,
-            forces.repeat(1, count, 1),
-            dt,
-            feedback=None if feedback is None else _flat_feedback(feedback, shape),
-            what=what,
-            progress=None if counted is None else counted(before),
-        )
+        control = None if feedback is None else _flat_feedback(feedback, shape)
+        how = {"feedback": control, "what": what, "progress": None if counted is None else counted(before)}
+        motion = integrate(method, function, *start, forces.repeat(1, count, 1), dt, **how)
         q_rows, v_rows, a_rows = (
             x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
         )
@@ -144,18 +137,10 @@ def roll_out(
         parts = zip(*(ConstraintManifold(model.system).violation(*block) for block in blocks), strict=True)
         c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
         change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
-        return Rollout(
-            time=dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device),
-            q=q_rows,
-            v=v_rows,
-            a=a_rows,
-            constraint=c,
-            velocity_constraint=rate,
-            initial_correction=torch.stack(change, dim=-1).reshape(*shape, 2),
-            diverged_at=motion.diverged_at.reshape(shape),
-            integrator=integrator,
-            baumgarte=model.baumgarte,
-        )
+        correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
+        time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
+        moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
+        return Rollout(time, *moved, integrator, model.baumgarte)
 
     with torch.set_grad_enabled(grad), blas_threads(0):
         mean = run(model.mean(), (), "rollouts", 0)
