@@ -153,7 +153,9 @@ class FusedLoop:
         self._held = tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
-        self._evaluate.argtypes = [ctypes.c_long] * 2 + [ctypes.c_void_p, ctypes.c_long, ctypes.c_double] + [ctypes.c_void_p] * 7
+        self._evaluate.argtypes = (
+            [ctypes.c_long] * 2 + [ctypes.c_void_p, ctypes.c_long, ctypes.c_double] + [ctypes.c_void_p] * 7
+        )
 
     def __call__(
         self, q: Tensor, v: Tensor, u: Tensor, dt: float, threads: int

@@ -22,7 +22,11 @@ from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
+from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_code import PredictorCode, TermsFunction
+from forcegp.models.structured.components import Components
+from forcegp.models.structured.inverse_dynamics import inverse_dynamics
 from forcegp.robots.real_numbers import real_tensor, require_finite
 from forcegp.summary import Summary
 
@@ -71,6 +75,7 @@ class Predictor(Summary):
     compressed: CompressedCovariance | None
     widening: float
     prepare_seconds: float
+    posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
     _functions: dict[str, RowFunction] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -141,6 +146,44 @@ class Predictor(Summary):
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
         return Linearization(a, *jacobian.split(nv, dim=-1))
 
+    def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
+        """The state (q, v) `dt` seconds later under constant u, each (nv,) or (n, nv); differentiable as `mean`.
+
+        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/rollouts.md), which is differentiable
+        once. Raises InvalidInput for "projected", other names and a dt that is no positive number, NumericalError where
+        an implicit step is not found.
+        """
+        states, single = self._states(q, v, u)
+        state = stepped(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
+        q, v = (state[0] if single else state).split(self.nv, dim=-1)
+        return q, v
+
+    def linearize_step(
+        self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
+    ) -> StepLinearization:
+        """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph."""
+        states, single = self._states(q, v, u)
+        linear = linearized_step(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
+        return StepLinearization(*(part[0] for part in linear)) if single else linear
+
+    def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
+        """Unknown force, multipliers, contact force and every component of the prior, with exact covariances."""
+        self._states(q, v, u)
+        return self.posterior.components(q, v, u, covariance=covariance)
+
+    def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
+        """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
+
+        u = M a + h - A^T lambda - Q_U with the known forces -h: friction under load is that of this lambda, which
+        `normal_force` (m,) or (n, m) gives in N, positive where the surface pushes the robot off, as in
+        `predict(...).multiplier`; None is 0. The covariance is that of Q_U at u, to first order, and None for a
+        predictor without one. `a` has to obey A a = b, else the contacts change it. Results have no graph.
+        Raises InvalidInput for models without analytical mean or actuation, NumericalError where no u is found.
+        """
+        states, single = self._states(q, v, a, "qva")
+        found = inverse_dynamics(self.posterior, torch.cat(states, dim=-1), normal_force, self.kind != "none")
+        return found[0] if single else found
+
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
         """The outputs (n, size) of a compiled program at states (n, nv) that were checked."""
         function, count = self._function(kind), len(states[0])
@@ -195,21 +238,21 @@ class Predictor(Summary):
             ]
         return a.detach(), torch.stack([torch.cat(row, dim=-1) for row in rows], dim=1)
 
-    def _states(self, q: Any, v: Any, u: Any) -> tuple[list[Tensor], bool]:
+    def _states(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[list[Tensor], bool]:
         """q, v and u as rows (n, nv), and whether it was a single state."""
-        states = [real_tensor(name, x, self.device) for name, x in zip("qvu", (q, v, u), strict=True)]
-        shape = states[0].shape
+        states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
+        shape, named = states[0].shape, f"q, v or {names[2]}"
         if shape[-1:] != (self.nv,) or len(shape) > 2 or any(x.shape != shape for x in states):
-            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", states, strict=True))
+            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
             raise InvalidInput(
                 f"a predictor was given {shapes}; give all three ({self.nv},) for one state or (n, {self.nv})."
             )
         if any(x.device.type != self.device.type for x in states):
-            raise InvalidInput(f"q, v or u is on another device than the predictor; move all three to {self.device}.")
+            raise InvalidInput(f"{named} is on another device than the predictor; move all three to {self.device}.")
         if self.code is not None:
             require_plain(states, "a compiled predictor", INSTEAD_OF_TRANSFORMS)
         for x in states:
-            require_finite("q, v or u", x)
+            require_finite(named, x)
         single = len(shape) == 1
         return [x[None] if single else x for x in states], single
 

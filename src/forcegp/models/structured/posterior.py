@@ -116,7 +116,7 @@ class StructuredPosterior(Posterior):
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
-        latents = self._latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
 
         def through(affine: AffineMap) -> Gaussian:
             return latents.through(affine.matrix @ B, affine.offset)
@@ -141,7 +141,7 @@ class StructuredPosterior(Posterior):
             return affine, None
         return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
-    def _latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
         """All processes at a batch of states."""
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.model.prior.features(dynamics))
@@ -184,7 +184,7 @@ class StructuredPosterior(Posterior):
         physics = PredictorPhysics(
             self.system, self.model.prior, analytical, inertials, self.likelihood.standardization
         )
-        return prepared_predictor(self.latent, self.widening, self.training, physics, **how)
+        return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
 
     @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
@@ -196,7 +196,7 @@ class StructuredPosterior(Posterior):
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
-        latents = self._latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
     @override
