@@ -69,7 +69,7 @@ class StackedKernels:
         """k_c(z, z_j) for points from `scaled`."""
         squares = scaled.square().sum(-1)[..., :, None] + self.training.square().sum(-1)[..., None, :]
         distance = torch.baddbmm(squares, scaled, self.training.mT, alpha=-2.0).clamp_min_(0.0)
-        return distance.mul_(-0.5).exp_().mul_(self.variances[:, None, None])
+        return distance.mul_(-0.5).exp_() * self.variances[:, None, None]  # not in place: exp needs its result
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,185 +1,185 @@
-"""Functions of one input in pieces, stored as one array of numbers that C code reads, and cubic tables of any function.
+"""R functions of one input s in pieces, kept as one array of numbers that C code reads.
 
-The array holds, in this order: a header (see `HEADER`), parameters, constants of every function, the first segment of
-every bucket, breakpoints, and one row of numbers for every segment, whose functions follow each other. A bucket and a
-search among the few breakpoints within it find the segment, so that time does not grow with their number.
+    f_r(s) = sum_e envelope_e(s) (c_re + sum_i w_ri(u_i) exp(-u_i)),   u_i = rate_i (y_i(s) - start_i)
+
+An envelope is a product of curves y(s) (`CURVES`). Every segment has its own starts and polynomials w; a binary search
+finds it. Without the exponential, and with w of degree 3, it is a cubic table of any function.
 """
 
 from __future__ import annotations
 
+import math
 import sys
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from typing_extensions import Self, override
-
-HEADER = ("breakpoints", "functions", "low", "high", "buckets", "first", "buckets per unit", "row", "parameters")
-"""What the first numbers of a table are; it holds from `low` to `high`, and is NaN elsewhere."""
-
-FARTHEST = sys.float_info.max
 
 TOLERANCE = 1e-8
-"""Largest error of a cubic table, relative to the largest value."""
+MOST_INTERVALS = 2**15  # of a cubic table: 2 MB for one function
+AT_ONCE = 1024  # points at which a function is differentiated together: its kernel functions are kept until then
+FARTHEST = sys.float_info.max
 
-MOST_INTERVALS = 2**15
-"""Of a cubic table: 1.5 MB for one function."""
-
-AT_ONCE = 1024
-"""Points at which a function is differentiated together: its kernel functions are kept until then."""
+CURVES: dict[str, tuple[Callable[[Tensor], Tensor], str, str]] = {
+    "identity": (lambda z: z, "{z}", "{rate}"),
+    "tanh": (torch.tanh, "r_tanh({z})", "{rate} * (1.0 - {y} * {y})"),
+    "asinh": (torch.asinh, "r_asinh({z})", "{rate} / r_sqrt(1.0 + {z} * {z})"),
+}
+"""y as a function of z = rate * s: in torch, in C, and its derivative to s in C."""
 
 SEARCH = """
-/* The row of the segment that holds s: as many breakpoints are <= s as rows stand before it. */
+/* The row of numbers of the segment of s: as many breakpoints are <= s as rows stand before it. */
 static const double *one_input_segment(const double *table, double s) {
-  const int breakpoints = (int)table[0], buckets = (int)table[4];
-  const double *first = table + 9 + (int)table[8], *knot = first + buckets + 1;
-  const double place = (s - table[5]) * table[6];
-  const int bucket = place >= buckets ? buckets - 1 : place > 0.0 ? (int)place : 0;
-  int low = (int)first[bucket], high = (int)first[bucket + 1];
+  const double *knot = table + 6 + (int)table[5];
+  int low = 0, high = (int)table[0];
   while (low < high) {
     const int middle = (low + high) / 2;
     if (s < knot[middle]) high = middle; else low = middle + 1;
   }
-  return knot + breakpoints + (int)table[7] * low;
+  return knot + (int)table[0] + (int)table[4] * low;
 }
 """
-"""C text that the text of every `c_source` needs before it, once."""
+"""C text that the texts of `OneInputFunctions.c_source` need before them, once."""
+
+
+class Side(NamedTuple):
+    """One polynomial w of `size` coefficients, of the distance on a curve, times an envelope."""
+
+    envelope: int
+    curve: int
+    size: int
+    decays: bool = True
 
 
 @dataclass(frozen=True, eq=False)
-class OneInputFunctions(ABC):
-    """R functions of one input, given on K + 1 segments between and beyond K breakpoints, each of which starts one."""
+class OneInputFunctions:
+    """R functions on K + 1 segments; known from `low` to `high` and NaN elsewhere, where the caller has to evaluate.
+
+    `error` is the largest that was found while it was made, relative to the largest value: 0 for exact forms.
+    """
 
     knots: Float[Tensor, " K"]
-    shared: Float[Tensor, "K+1 _"]  # numbers of a segment that all functions have in common
-    own: Float[Tensor, "K+1 R _"]
-    parameters: Float[Tensor, " P"]
+    starts: Float[Tensor, "K+1 I"]
+    polynomials: Float[Tensor, "K+1 R W"]
+    rates: Float[Tensor, " _"]  # of the curves, then of the sides
     constants: Float[Tensor, "R E"]
-    low: float
-    high: float
-
-    @abstractmethod
-    def values(self, s: Float[Tensor, " n"]) -> Float[Tensor, "n R"]:
-        """The functions, differentiable in s; NaN where they are not known (`covers`)."""
-
-    @abstractmethod
-    def c_source(self, name: str) -> str:
-        """`static void name(const double *table, real s, real *f, real *slope)` in C99, for arrays from `table`.
-
-        f and slope hold R entries; slope may be NULL. Functions with the same text differ by their table only. Needs
-        <math.h>, `SEARCH`, the type `real`, LANES, AT(x, lane) and r_exp, r_tanh, r_asinh, r_sqrt of a `real`.
-        """
+    curves: tuple[str, ...]
+    envelopes: tuple[tuple[int, ...], ...]
+    sides: tuple[Side, ...]
+    low: float = -FARTHEST
+    high: float = FARTHEST
+    error: float = 0.0
 
     def evaluate(self, s: Float[Tensor, " n"]) -> tuple[Float[Tensor, "n R"], Float[Tensor, "n R"]]:
-        """The functions and their derivatives; at a kink that on its right."""
+        """The functions and their derivatives; at a kink that to the right."""
         return value_and_slope(self.values, s)
 
-    def covers(self, s: Float[Tensor, " n"]) -> Tensor:
-        """Whether the functions are known at the points."""
-        return (s >= self.low) & (s <= self.high)
+    def values(self, s: Float[Tensor, " n"]) -> Float[Tensor, "n R"]:
+        """The functions, differentiable in s."""
+        segment = torch.searchsorted(self.knots, s.detach().contiguous(), right=True)
+        s = s * torch.where((s >= self.low) & (s <= self.high), 1.0, torch.nan).to(s)
+        y = [CURVES[kind][0](rate * s) for kind, rate in zip(self.curves, self.rates, strict=False)]
+        levels, first = list(self.constants.mT[:, None].unbind()), 0
+        for i, (envelope, curve, size, decays) in enumerate(self.sides):
+            # Beyond the outermost centres of a Matern one side has none, and coefficients of zero.
+            u = (self.rates[len(y) + i] * (y[curve] - self.starts[segment, i])).clamp_min(0.0)
+            powers = torch.stack([u**a for a in range(size)], dim=-1) * ((-u).exp()[:, None] if decays else 1.0)
+            w = self.polynomials[segment, :, first : first + size]
+            levels[envelope] = levels[envelope] + (w @ powers[..., None])[..., 0]
+            first += size
+        products = [math.prod((y[i] for i in factors), start=torch.ones_like(s)) for factors in self.envelopes]
+        return torch.stack([p[:, None] * g for p, g in zip(products, levels, strict=True)]).sum(0)
 
-    def only(self, function: int) -> Self:
-        """One of the R functions by itself."""
-        one = slice(function, function + 1)
-        return replace(self, own=self.own[:, one], constants=self.constants[one])
+    def only(self, r: int) -> OneInputFunctions:
+        """One of the functions."""
+        return replace(self, polynomials=self.polynomials[:, r : r + 1], constants=self.constants[r : r + 1])
 
     def table(self) -> Float[np.ndarray, " _"]:
-        """All numbers, for C; they are finite."""
-        knots = self.knots.detach().cpu().numpy()
-        width, buckets = knots[-1] - knots[0], 2 * len(knots)
-        per_unit = buckets / width if width > 0.0 else 0.0
-        # By the arithmetic of the C code, which is monotone: rounding moves no point across the bounds of its bucket.
-        bucket = np.clip((knots - knots[0]) * per_unit, 0, buckets - 1).astype(int)
-        rows = torch.cat([self.shared, self.own.flatten(1)], dim=1)
-        parameters = torch.cat([self.parameters, self.constants.flatten()])
-        sizes = len(knots), self.own.shape[1], self.low, self.high, buckets, knots[0], per_unit
-        header = np.array([*sizes, rows.shape[1], len(parameters)])
-        first = np.searchsorted(bucket, np.arange(buckets + 1))
-        numbers = [part.detach().cpu().numpy().ravel() for part in (parameters, rows)]
-        return np.concatenate([header, numbers[0], first, knots, numbers[1]])
+        """K, R, low, high, sizes of a row and of rates and constants; these, knots, a row per segment; all finite."""
+        parameters = torch.cat([self.rates, self.constants.flatten()])
+        rows = torch.cat([self.starts, self.polynomials.flatten(1)], dim=1)
+        header = [len(self.knots), len(self.constants), self.low, self.high, rows.shape[1], len(parameters)]
+        return torch.cat([rows.new_tensor(header), parameters, self.knots, rows.flatten()]).cpu().numpy()
 
-
-@dataclass(frozen=True, eq=False)
-class CubicTable(OneInputFunctions):
-    """Piecewise cubic functions with a continuous derivative; `error` is the largest that was found, relative."""
-
-    error: float
-
-    @override
-    def values(self, s: Float[Tensor, " n"]) -> Float[Tensor, "n R"]:
-        segment = torch.searchsorted(self.knots, s.detach().contiguous(), right=True)
-        start, per_unit = self.shared[segment].unbind(-1)
-        t = torch.where(self.covers(s), (s - start) * per_unit, torch.nan)[:, None]
-        c = self.own[segment]
-        return c[..., 0] + t * (c[..., 1] + t * (c[..., 2] + t * c[..., 3]))
-
-    @override
     def c_source(self, name: str) -> str:
+        """`static void name(const double *table, real s, real *f, real *slope)`, R entries of f and of slope or NULL.
+
+        Functions of the same text differ by their tables only. Plain C99 for one state, where `real` is double and
+        AT(x, k) is x, and for several in the lanes of a GCC vector; needs <math.h>, `SEARCH`, r_exp, r_tanh, ...
+        """
+        n, E, first = len(self.curves), range(len(self.envelopes)), 0
+        names = [{"z": f"(p[{i}] * s)", "y": f"y{i}", "rate": f"p[{i}]"} for i in range(n)]
+        ready = [f"const real y{i} = {CURVES[kind][1].format(**names[i])};" for i, kind in enumerate(self.curves)]
+        slopes = [f"({CURVES[kind][2].format(**names[i])})" for i, kind in enumerate(self.curves)]
+        found, values = ["row[k] = one_input_segment(table, AT(s, k)); (void)row;"], []
+        lanes, changes = [f"AT(g{e}, k) = c[{e}];" for e in E], [[] for _ in E]
+        for i, (envelope, curve, size, decays) in enumerate(self.sides):
+            w, rate, decay = [f"w{first + a}" for a in range(size)], f"p[{n + i}]", f"exp{i}" if decays else "1.0"
+            found += [f"AT(u{i}, k) = {rate} * (AT(y{curve}, k) - row[k][{i}]);", f"AT(u{i}, k) *= AT(u{i}, k) > 0.0;"]
+            lanes += [f"AT({c}, k) = row[k][{len(self.sides)} + {self.polynomials.shape[2]} * r + {c[1:]}];" for c in w]
+            values.append(f"const real a{i} = {_horner(w, f'u{i}')} * {decay}; g{envelope} = g{envelope} + a{i};")
+            change = _horner([f"{a}.0 * {w[a]}" for a in range(1, size)] or ["0.0"], f"u{i}")
+            changes[envelope].append(f"{rate} * {slopes[curve]} * ({change} * {decay}{f' - a{i}' * decays})")
+            first += size
+        decays = [f"const real exp{i} = r_exp(-u{i});" for i, side in enumerate(self.sides) if side.decays]
+        slope = [_times(self.envelopes[e], f"({' + '.join(part)})") for e, part in enumerate(changes) if part]
+        for e, factors in enumerate(self.envelopes):
+            slope += [f"{slopes[i]} * {_times(factors[:k] + factors[k + 1 :], f'g{e}')}" for k, i in enumerate(factors)]
+        real = [f"u{i}" for i in range(len(self.sides))], [f"g{e}" for e in E] + [f"w{i}" for i in range(first)]
         return f"""
 static void {name}(const double *table, real s, real *f, real *slope) {{
-  const double *row[LANES];
-  real t, per_unit;
-  for (int k = 0; k < LANES; ++k) {{
-    row[k] = one_input_segment(table, AT(s, k));
-    const int covered = AT(s, k) >= table[2] && AT(s, k) <= table[3];
-    AT(t, k) = covered ? (AT(s, k) - row[k][0]) * row[k][1] : NAN;
-    AT(per_unit, k) = row[k][1];
-  }}
+  const double *p = table + 6, *row[LANES];
+  for (int k = 0; k < LANES; ++k) if (!(AT(s, k) >= table[2] && AT(s, k) <= table[3])) AT(s, k) = NAN;
+  {" ".join(ready)}
+  {f"real {', '.join(real[0])};" * bool(self.sides)}
+  for (int k = 0; k < LANES; ++k) {{ {" ".join(found)} }}
+  {" ".join(decays)}
   for (int r = 0; r < (int)table[1]; ++r) {{
-    real a, b, c, d;
-    for (int k = 0; k < LANES; ++k) {{
-      const double *own = row[k] + 2 + 4 * r;
-      AT(a, k) = own[0]; AT(b, k) = own[1]; AT(c, k) = own[2]; AT(d, k) = own[3];
-    }}
-    f[r] = a + t * (b + t * (c + t * d));
-    if (slope) slope[r] = (b + t * (2.0 * c + 3.0 * t * d)) * per_unit;
+    const double *c = p + {len(self.rates)} + {len(E)} * r;
+    real {", ".join(real[1])};
+    for (int k = 0; k < LANES; ++k) {{ {" ".join(lanes)} }}
+    {" ".join(values)}
+    f[r] = {" + ".join(_times(factors, f"g{e}") for e, factors in enumerate(self.envelopes))};
+    if (slope) slope[r] = {" + ".join(slope) or "g0 - g0"};
   }}
 }}
 """
 
 
 def cubic_table(
-    function: Callable[[Tensor], Tensor],
-    low: float,
-    high: float,
-    *,
-    tolerance: float = TOLERANCE,
-    places: Float[Tensor, " _"] | None = None,
-) -> CubicTable | None:
-    """A table of `function`, s (n,) -> (n, R), from `low` to `high`, which is differentiated at the breakpoints.
+    function: Callable[[Tensor], Tensor], low: float, high: float, tolerance: float, places: Float[Tensor, " _"]
+) -> OneInputFunctions | None:
+    """Cubic polynomials between values and slopes of `function`, s (n,) -> (n, R), with a continuous derivative.
 
-    Intervals are halved until the error is at most `tolerance` of the largest value at five points in each, and at
-    `places` where the functions may be narrow. None where `MOST_INTERVALS` do not suffice.
+    Intervals are halved until the error at five points of each, and at `places` where the functions may be narrow, is
+    at most `tolerance` of the largest value. None where `MOST_INTERVALS` do not suffice.
     """
-    x = torch.linspace(low, high, 33, dtype=torch.float64, device=None if places is None else places.device)
-    f, d = value_and_slope(function, x)
+    x, done = torch.linspace(low, high, 33).to(places), torch.zeros(32, dtype=torch.bool, device=places.device)
     inner = x.new_tensor([0.11, 0.3, 0.5, 0.71, 0.88])
-    places = x.new_zeros(0) if places is None else places[(places >= low) & (places <= high)]
-    done, largest, error = torch.zeros(len(x) - 1, dtype=torch.bool, device=x.device), f.abs().max(), 0.0
+    f, d, error = *value_and_slope(function, x), x.new_zeros(())
     while True:
         table = _hermite(x, f, d)
         points = torch.cat([(x[:-1, None] + inner * x.diff()[:, None])[~done].flatten(), places])
         inside = torch.searchsorted(x[1:-1].contiguous(), points, right=True)
         points, inside = points[~done[inside]], inside[~done[inside]]
-        exact = torch.cat([_plain(function, part) for part in points.split(AT_ONCE)])
-        largest = torch.maximum(largest, exact.abs().max())
-        found = (table.values(points) - exact).abs().amax(-1)
-        worst = torch.zeros_like(done, dtype=x.dtype).scatter_reduce(0, inside, found, "amax")
-        good = done | (worst <= tolerance * largest)  # False where NaN
-        error = max(error, float(worst[good].max() / largest) if good.any() and largest > 0.0 else 0.0)
-        if good.all():
-            return replace(table, error=error)
-        if len(x) + int((~good).sum()) > MOST_INTERVALS:
+        with torch.no_grad():
+            exact = torch.cat([function(part) for part in points.split(AT_ONCE)])
+        largest = torch.cat([f, exact]).abs().max()
+        worst = x.new_zeros(len(done)).scatter_reduce(0, inside, (table.values(points) - exact).abs().amax(1), "amax")
+        done |= worst <= 0.5 * tolerance * largest  # half: it may be larger in between; False where NaN
+        error = torch.maximum(error, worst[done].max() / largest) if done.any() and largest > 0.0 else error
+        if done.all():
+            return replace(table, error=float(error))
+        if len(x) > MOST_INTERVALS:
             return None
-        middles = (0.5 * (x[:-1] + x[1:]))[~good]
-        new_f, new_d = value_and_slope(function, middles)
-        order = torch.cat([x, middles]).argsort()
-        x, f, d = torch.cat([x, middles])[order], torch.cat([f, new_f])[order], torch.cat([d, new_d])[order]
-        done = good.repeat_interleave(torch.where(good, 1, 2))
+        middles = (0.5 * (x[:-1] + x[1:]))[~done]
+        at, (new_f, new_d) = torch.cat([x, middles]), value_and_slope(function, middles)
+        x, order = at.sort()
+        f, d, done = torch.cat([f, new_f])[order], torch.cat([d, new_d])[order], done.repeat_interleave(2 - done.int())
 
 
 def value_and_slope(function: Callable[[Tensor], Tensor], s: Float[Tensor, " n"]) -> tuple[Tensor, Tensor]:
@@ -189,25 +189,26 @@ def value_and_slope(function: Callable[[Tensor], Tensor], s: Float[Tensor, " n"]
         with torch.enable_grad():
             at = part.clone().requires_grad_()
             f = function(at)
-            columns = f.sum(0).unbind() if f.requires_grad else ()  # constant functions do not depend on s
-            given = [torch.autograd.grad(column, at, retain_graph=True, allow_unused=True)[0] for column in columns]
-        zero = torch.zeros_like(at)
-        slopes = [zero if slope is None else slope for slope in given] or [zero] * f.shape[1]
+            sums = (f + 0.0 * at[:, None]).sum(0).unbind()  # constants have a derivative, too
+            slopes = [torch.autograd.grad(column, at, retain_graph=True)[0] for column in sums]
         found.append((f.detach(), torch.stack(slopes, dim=-1)))
     values, slopes = zip(*found, strict=True)
     return torch.cat(values), torch.cat(slopes)
 
 
-def _plain(function: Callable[[Tensor], Tensor], s: Tensor) -> Tensor:
-    with torch.no_grad():
-        return function(s)
+def _hermite(x: Float[Tensor, " K"], f: Float[Tensor, "K R"], d: Float[Tensor, "K R"]) -> OneInputFunctions:
+    h = x.diff()[:, None]
+    step, left, right = (f[1:] - f[:-1]) / h, d[:-1], d[1:]
+    w = torch.stack([f[:-1], left, (3.0 * step - 2.0 * left - right) / h, (left + right - 2.0 * step) / h**2], dim=-1)
+    rows = [torch.cat([part[:1], part, part[-1:]]) for part in (x[:-1, None], w)]  # at `high` it is still known
+    one, none = x.new_ones(2), x.new_zeros(f.shape[1], 1)
+    sides = (Side(0, 0, 4, decays=False),)
+    return OneInputFunctions(x, *rows, one, none, ("identity",), ((),), sides, float(x[0]), float(x[-1]))
 
 
-def _hermite(x: Float[Tensor, " K"], f: Float[Tensor, "K R"], d: Float[Tensor, "K R"]) -> CubicTable:
-    h = x.diff()
-    step, left, right = f[1:] - f[:-1], h[:, None] * d[:-1], h[:, None] * d[1:]
-    own = torch.stack([f[:-1], left, 3.0 * step - 2.0 * left - right, left + right - 2.0 * step], dim=-1)
-    shared = torch.stack([x[:-1], 1.0 / h], dim=-1)
-    rows = [torch.cat([part[:1], part, part[-1:]]) for part in (shared, own)]  # at its ends the table still holds
-    none = x.new_zeros(0), x.new_zeros(f.shape[1], 0)
-    return CubicTable(x, *rows, *none, float(x[0]), float(x[-1]), 0.0)
+def _horner(coefficients: list[str], u: str) -> str:
+    return f"({coefficients[0]} + {u} * {_horner(coefficients[1:], u)})" if coefficients[1:] else coefficients[0]
+
+
+def _times(factors: tuple[int, ...], value: str) -> str:
+    return " * ".join([*(f"y{i}" for i in factors), value])
