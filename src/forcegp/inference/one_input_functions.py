@@ -63,8 +63,9 @@ def drawn_form(
     Those of a Matern of smoothness 1/2 have cosines of any frequency and need a larger `tolerance`.
     """
     centers = latent.features[index].detach()
-    several = centers.shape[-1] != 1
-    return None if several else cubic_table(lambda s: drawn.one(index, s[:, None]).mT, centers[:, 0], MARGIN, tolerance)
+    if centers.shape[-1] != 1:
+        return None
+    return cubic_table(lambda s: drawn.one(index, s[:, None]).mT, centers[:, 0], MARGIN, tolerance)
 
 
 def markov_functions(

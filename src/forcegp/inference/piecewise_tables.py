@@ -75,18 +75,15 @@ class OneInputFunctions:
 
     def table(self) -> Float[np.ndarray, " _"]:
         """All numbers, finite: 8 of the header, rates and constants, buckets, knots, one row for every segment."""
-        numbers = [
-            x.detach().cpu().numpy() for x in (self.rates, self.constants, self.knots, self.starts, self.polynomials)
-        ]
-        rates, constants, knots, starts, polynomials = numbers
-        rows = np.concatenate([starts, polynomials.reshape(len(starts), -1)], axis=1)
-        count, width = 2 * len(knots), knots[-1] - knots[0]
-        per_unit = count / width if width > 0.0 else 0.0
+        parameters = torch.cat([self.rates, self.constants.flatten()]).cpu().numpy()
+        rows = torch.cat([self.starts, self.polynomials.flatten(1)], dim=1).cpu().numpy()
+        knots, count = self.knots.cpu().numpy(), 2 * len(self.knots)
+        per_unit = count / (knots[-1] - knots[0]) if knots[-1] > knots[0] else 0.0
         # by the arithmetic of the C text, which is monotone: no rounding moves a point into a wrong bucket
         bucket = np.clip((knots - knots[0]) * per_unit, 0, count - 1).astype(int)
-        header = [len(knots), len(constants), self.low, self.high, rows.shape[1], rates.size + constants.size]
-        parts = [header, [knots[0], per_unit], rates, constants.ravel(), bucket.searchsorted(np.arange(count + 1))]
-        return np.concatenate([*parts, knots, rows.ravel()])
+        sizes = [len(knots), len(self.constants), self.low, self.high, rows.shape[1], len(parameters)]
+        parts = [[*sizes, knots[0], per_unit], parameters, bucket.searchsorted(np.arange(count + 1)), knots]
+        return np.concatenate([*parts, rows.ravel()])
 
     def c_source(self, name: str) -> str:
         """`static void name(const double *table, real s, real *f, real *slope)`, R entries of f and of slope or NULL.
