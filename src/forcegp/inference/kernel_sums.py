@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -69,6 +70,7 @@ class KernelSum:
     kernels: tuple[int, ...]
     prior: Graph
     variances: tuple[int, ...]
+    roots: Float[Tensor, "G N R"] | None = None
 
     @classmethod
     def of(
@@ -155,6 +157,12 @@ class KernelSum:
         rows = [np.broadcast_to(x, padded) for x in evaluated(self.pair, self._rows, inputs)]
         weights = np.pad(self.weights.numpy(), ((0, 0), (0, padded - valid)))
         return np.concatenate([[padded, valid, *[0.0] * 6], *rows, *weights])
+
+    def root_table(self) -> np.ndarray:
+        """The roots of the compressed covariance, of as many centres as there are in the table."""
+        assert self.roots is not None, "asked for with a compressed covariance only"
+        filled = -len(self.centers) % PADDING
+        return torch.nn.functional.pad(self.roots, (0, 0, 0, filled)).numpy().ravel()
 
     def c_source(self, lanes: int, slopes: bool) -> str:
         """The C function `NAME(table, live, z, f)`, or NAME_slopes, whose derivatives follow the values."""

@@ -63,12 +63,7 @@ def integrate(
     `progress(step, steps)` is called after every step. Differentiable in q0, v0, u and what `feedback` adds.
     Raises InvalidInput where `dt` is no positive number or a start is faster than the limit.
     """
-    check_time_step(dt)
-    if bool((v0.abs() > SPEED_LIMIT).any()):
-        raise InvalidInput(
-            f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
-            "m/s counts as diverged, check its units."
-        )
+    check_start(v0, dt)
     q, v = integrator.start(q0, v0)
     steps, n = u.shape[:2]
     rows_q, rows_v, rows_a = [q], [v], []  # stacked in the end, which keeps the graph where there is one
@@ -98,6 +93,16 @@ def integrate(
             progress(k + 1, steps)
     _warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
     return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at)
+
+
+def check_start(v0: Tensor, dt: float) -> None:
+    """Raise InvalidInput where `dt` is no positive number or a start is faster than the limit."""
+    check_time_step(dt)
+    if bool((v0.abs() > SPEED_LIMIT).any()):
+        raise InvalidInput(
+            f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
+            "m/s counts as diverged, check its units."
+        )
 
 
 def _under(acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], forces: Tensor) -> Acceleration:

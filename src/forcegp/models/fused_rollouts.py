@@ -8,13 +8,15 @@ Newton's method fails, or because it leaves the range of a table, is left to `in
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.integration.trajectory import SPEED_LIMIT
+from forcegp.integration.integrators import Integrator
+from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate
 
 STEPS = {
     "symplectic-euler": """
@@ -144,6 +146,31 @@ def loop_source(method: str, function: str, nv: int) -> str:
     for name, value in (("JOINTS", nv), ("OUTPUTS", outputs), ("LIMIT", repr(SPEED_LIMIT))):
         text = text.replace(name, str(value))
     return text
+
+
+def fused(
+    loop: FusedLoop | None,
+    method: Integrator,
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor],
+    q: Float[Tensor, "n nv"],
+    v: Float[Tensor, "n nv"],
+    u: Float[Tensor, "steps n nv"],
+    dt: float,
+    threads: int,
+    what: str = "motions",
+) -> Trajectory:
+    """`integrate`, by the compiled loop where there is one; motions that it could not finish are integrated again."""
+    check_start(v, dt)
+    if loop is None:
+        return integrate(method, acceleration, q, v, u, dt, what=what)
+    Q, V, A, ended = loop(q, v, u.movedim(0, 1), dt, threads)
+    left = torch.nonzero(ended >= 0)[:, 0]
+    if len(left):
+        again = integrate(method, acceleration, q[left], v[left], u[:, left], dt, what=f"of {len(q)} {what}")
+        for rows, found in ((Q, again.q), (V, again.v), (A, again.a)):
+            rows[left] = found.movedim(0, 1)
+        ended[left] = again.diverged_at
+    return Trajectory(*(rows.movedim(1, 0) for rows in (Q, V, A)), ended)
 
 
 class FusedLoop:

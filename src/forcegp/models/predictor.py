@@ -22,12 +22,15 @@ from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
 from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_code import PredictorCode, TermsFunction
+from forcegp.models.rollout import checked_start
 from forcegp.models.structured.components import Components
 from forcegp.models.structured.inverse_dynamics import inverse_dynamics
-from forcegp.robots.real_numbers import real_tensor, require_finite
+from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
 from forcegp.summary import Summary
 
 INSTEAD_OF_TRANSFORMS = (
@@ -45,6 +48,18 @@ class Linearization(NamedTuple):
     da_dq: Tensor
     da_dv: Tensor
     da_du: Tensor
+
+
+class Motions(NamedTuple):
+    """q, v (..., T+1, nv) in rad and rad/s (m and m/s), a (..., T, nv) in rad/s^2 (m/s^2), as in a `Rollout`.
+
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    """
+
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    diverged_at: Tensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,9 +92,10 @@ class Predictor(Summary):
     prepare_seconds: float
     posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
     _functions: dict[str, RowFunction] = field(default_factory=dict)
+    _loops: dict[str, FusedLoop] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_functions": {}}  # loaded code means nothing in another process
+        return self.__dict__ | {"_functions": {}, "_loops": {}}  # loaded code means nothing in another process
 
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
@@ -165,6 +181,36 @@ class Predictor(Summary):
         states, single = self._states(q, v, u)
         linear = linearized_step(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
         return StepLinearization(*(part[0] for part in linear)) if single else linear
+
+    def rollouts(
+        self,
+        q0: Any,
+        v0: Any,
+        u: Any,
+        dt: float,
+        *,
+        integrator: str = "symplectic-euler",
+        threads: int | None = None,
+    ) -> Motions:
+        """Motions under the mean from q0, v0 (..., nv) and forces u (..., T, nv), with batches that broadcast.
+
+        As `posterior.rollout` with the predictor's own system: rad, rad/s, Nm and s (m, m/s, N); what diverges is NaN
+        from the row `diverged_at` on. A compiled predictor steps many motions at once, without Python in between, on
+        `threads` threads (None: as many as torch has). Without a graph. Raises InvalidInput for arguments that do not
+        fit.
+        """
+        most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
+        start, v, forces, batch = checked_start(
+            self.nv, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
+        )
+        method = integrator_named(integrator, self.posterior.system)
+        check_time_step(dt)
+        loop = None
+        if self.code is not None and integrator in STEPS:
+            loop = self._loops.get(integrator) or self._loops.setdefault(integrator, self.code.loop(integrator))
+        motion = fused(loop, method, self.mean, start, v, forces, dt, most)
+        shaped = (x.movedim(0, 1).reshape(*batch, len(x), self.nv) for x in (motion.q, motion.v, motion.a))
+        return Motions(*shaped, motion.diverged_at.reshape(batch))
 
     def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
         """Unknown force, multipliers, contact force and every component of the prior, with exact covariances."""

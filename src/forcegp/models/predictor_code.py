@@ -7,11 +7,11 @@ first asked for.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +24,9 @@ from forcegp.codegen.row_function import RowFunction, aligned
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.inference.compressed_covariance import CompressedCovariance
-from forcegp.inference.kernel_sums import PADDING, KernelSum
+from forcegp.inference.kernel_sums import PADDING
+from forcegp.inference.one_input_calls import LatentCall
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 """States (n, nv) -> [offset (n, nv), W (n, nv, C), features of every process (n, d)], where a = offset + W f."""
@@ -59,7 +61,7 @@ class PredictorCode:
     """What is traced once of a posterior, and the programs made of it; see `of`."""
 
     nv: int
-    sums: tuple[KernelSum, ...]
+    sums: tuple[LatentCall, ...]
     physics: Graph
     a: list[int]
     W: list[list[int]]
@@ -72,7 +74,7 @@ class PredictorCode:
         cls,
         traced: Callable[..., list[Tensor]],
         example: Sequence[Tensor],
-        sums: tuple[KernelSum, ...],
+        sums: tuple[LatentCall, ...],
         compressed: CompressedCovariance | None,
         widening: float,
     ) -> PredictorCode:
@@ -111,15 +113,18 @@ class PredictorCode:
                 outputs = {"a": a, "jacobian": [node for row in jacobian(graph, a, graph.inputs) for node in row]}
             case _:
                 given = copied([row[c] for row in self.W for c in self._latents])
-                for take in (KernelSum.variance, KernelSum.given):
-                    given += [
-                        node for part, z in zip(self.sums, features, strict=True) for node in take(part, graph, z)
-                    ]
+                for part, z in zip(self.sums, features, strict=True):
+                    given += part.variance(graph, z)
+                for part, z in zip(self.sums, features, strict=True):
+                    given += part.given(graph, z)
                 outputs = {"a": a, "covariance": given}
         return Program(graph, dict.fromkeys("qvu", self.nv), outputs)
 
     def c_source(self, kind: str, lanes: int) -> str:
-        """The C text of a program with the function `evaluate`."""
+        """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`."""
+        integrator, loop = kind, kind in STEPS
+        if loop:
+            kind = "linearize" if integrator == "implicit-midpoint" else "mean"
         program, slopes = self.program(kind), kind == "linearize"
         names = [part.name + ("_slopes" if slopes else "") for part in self.sums]
         text = [head(lanes), *(part.c_source(lanes, slopes) for part in self.sums)]
@@ -127,10 +132,10 @@ class PredictorCode:
         if kind == "covariance":
             text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self._covariance_source()]
             finish = {"covariance": ("covariance", self.nv**2)}
-        text += [
-            write_function("program", program.graph, program.nodes, lanes, names),
-            write_entry(program, "program", finish),
-        ]
+        text.append(write_function("program", program.graph, program.nodes, lanes, names))
+        text.append(
+            write_entry(program, "program", finish) if loop is None else loop_source(integrator, "program", self.nv)
+        )
         return "\n".join(text)
 
     def _covariance_source(self) -> str:
@@ -156,14 +161,18 @@ class PredictorCode:
         """What the C functions of the sums take, then the roots of the covariance."""
         found = [part.table() for part in self.sums]
         if self.compressed is not None:
-            for factors in self.compressed.factors:
-                _, N, R = factors.shape
-                found.append(np.pad(factors.numpy(), ((0, 0), (0, -N % PADDING), (0, self.rank - R))).ravel())
+            found += [part.root_table() for part in self.sums]
         return [aligned(table) for table in found]
 
     def function(self, kind: str) -> RowFunction:
         """A program, compiled or found. Raises CompilerError where that cannot be."""
-        text = self.c_source(kind, VectorUnit.of_this_processor().lanes)
-        library, _ = load_library(f"predictor-{kind}", text, lambda _: text, default_folder(), PURPOSE)
         sizes = {"mean": [], "linearize": [3 * self.nv**2], "covariance": [self.nv**2]}[kind]
-        return RowFunction(library, [self.nv] * 3, [self.nv, *sizes], self.tables)
+        return RowFunction(self._library(kind), [self.nv] * 3, [self.nv, *sizes], self.tables)
+
+    def loop(self, integrator: str) -> FusedLoop:
+        """A loop over the mean. Raises CompilerError where it cannot be compiled."""
+        return FusedLoop(self._library(integrator), self.tables)
+
+    def _library(self, kind: str) -> ctypes.CDLL:
+        text = self.c_source(kind, VectorUnit.of_this_processor().lanes)
+        return load_library(f"predictor-{kind}", text, lambda _: text, default_folder(), PURPOSE)[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -11,12 +12,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, require_type
+from forcegp.errors import CompilerError, InvalidInput, NumericalWarning, require_type
 from forcegp.integration import ConstraintManifold, Feedback, integrate, integrator_named
 from forcegp.mechanics import Baumgarte, MechanicalSystem
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
 from forcegp.models.search import blas_threads
 from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
 
+STEPS_TO_COMPILE = 2000
+"""Steps of some milliseconds each; fewer are done before a program is compiled."""
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
@@ -39,6 +43,8 @@ class AccelerationModel:
     baumgarte: Baumgarte | None
     mean: Callable[[], AccelerationFunction]
     sampled: Callable[[int, int], AccelerationFunction]
+    compiled: Callable[[str], FusedLoop] | None = None
+    """The loop of an integrator over the mean as machine code; None for models that have none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +124,8 @@ def roll_out(
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model.system)
     require_type("grad", grad, bool)
-    q, v, forces, batch = _checked_start(model, q0, v0, u, grad)
+    robot = model.system.robot
+    q, v, forces, batch = checked_start(robot.nv, robot.device, q0, v0, u, None if grad else "give grad=True")
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
 
@@ -128,8 +135,15 @@ def roll_out(
         shape, count = (*copies, *batch), math.prod(copies)
         start = q.repeat(count, 1), v.repeat(count, 1)
         control = None if feedback is None else _flat_feedback(feedback, shape)
-        how = {"feedback": control, "what": what, "progress": None if counted is None else counted(before)}
-        motion = integrate(method, function, *start, forces.repeat(1, count, 1), dt, **how)
+        report = None if counted is None else counted(before)
+        given = (method, function, *start, forces.repeat(1, count, 1), dt)
+        loop = None if copies or feedback is not None or grad else _loop(model, integrator, steps)
+        if loop is None:
+            motion = integrate(*given, feedback=control, what=what, progress=report)
+        else:
+            motion = fused(loop, *given, torch.get_num_threads(), what)
+            if report is not None:
+                report(steps, steps)
         q_rows, v_rows, a_rows = (
             x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
         )
@@ -148,6 +162,19 @@ def roll_out(
             sampled = _by_sample(model.sampled(samples, seed), samples)
             mean = replace(mean, samples=run(sampled, (samples,), "sampled rollouts", steps))
         return mean
+
+
+def _loop(model: AccelerationModel, integrator: str, steps: int) -> FusedLoop | None:
+    """The compiled loop, where motions are long enough to be worth compiling it."""
+    if model.compiled is None or integrator not in STEPS or steps < STEPS_TO_COMPILE:
+        return None
+    try:
+        return model.compiled(integrator)
+    except CompilerError as error:
+        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=4)
+    except InvalidInput:  # an operation that no program holds, another device
+        pass
+    return None
 
 
 def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
@@ -173,24 +200,23 @@ def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunc
     return flat
 
 
-def _checked_start(
-    model: AccelerationModel, q0: Any, v0: Any, u: Any, grad: bool
+def checked_start(
+    nv: int, device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
 ) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions."""
-    robot = model.system.robot
-    given = {
-        name: real_tensor(name, values, robot.device).to(robot.device)
-        for name, values in (("q0", q0), ("v0", v0), ("u", u))
-    }
+    """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions.
+
+    Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
+    """
+    given = {name: real_tensor(name, values, device).to(device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
     for name, values in given.items():
-        if values.requires_grad and torch.is_grad_enabled() and not grad:
+        if values.requires_grad and torch.is_grad_enabled() and remedy is not None:
             raise InvalidInput(
-                f"{name} requires a gradient, which a rollout drops unless asked to keep it; give grad=True, or "
+                f"{name} requires a gradient, which a rollout drops unless asked to keep it; {remedy}, or "
                 f"{name}.detach()."
             )
         least = 2 if name == "u" else 1
-        if values.dim() < least or values.shape[-1] != robot.nv:
-            wanted = f"(..., T, {robot.nv})" if name == "u" else f"(..., {robot.nv})"
+        if values.dim() < least or values.shape[-1] != nv:
+            wanted = f"(..., T, {nv})" if name == "u" else f"(..., {nv})"
             raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
         require_finite(name, values)
     q, v, forces = given.values()
@@ -204,6 +230,6 @@ def _checked_start(
         raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q0 and v0 per motion.") from None
     if not batch.numel():
         raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
-    q, v = (x.expand(*batch, -1).reshape(-1, robot.nv) for x in (q, v))
-    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, robot.nv).movedim(1, 0).contiguous()
+    q, v = (x.expand(*batch, -1).reshape(-1, nv) for x in (q, v))
+    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, nv).movedim(1, 0).contiguous()
     return q, v, forces, batch

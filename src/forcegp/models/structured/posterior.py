@@ -26,13 +26,16 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
+from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
+from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.predictor import Predictor
+from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
@@ -179,11 +182,7 @@ class StructuredPosterior(Posterior):
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
-        analytical = self.model.mean == "analytical"
-        physics = PredictorPhysics(
-            self.system, self.model.prior, analytical, inertials, self.likelihood.standardization
-        )
+        physics = self._physics(self.system)
         return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
 
     @override
@@ -335,7 +334,22 @@ class StructuredPosterior(Posterior):
                 return mean()
             return through(draw_functions(self.latent, samples, seed, self.widening))
 
-        return AccelerationModel(system, baumgarte, mean, sampled)
+        noise = self.model.noise
+        if noise is not None and noise.measured_torque:  # whose accelerations are shrunk
+            return AccelerationModel(system, baumgarte, mean, sampled)
+        return AccelerationModel(system, baumgarte, mean, sampled, lambda name: self._code(system).loop(name))
+
+    def _code(self, system: MechanicalSystem) -> PredictorCode:
+        """Programs of the mean in a system."""
+        prepared = PreparedKernels.of(self.latent)
+        example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
+        calls = latent_calls(self.latent, prepared, None)
+        return PredictorCode.of(self._physics(system).traced, example, calls, None, self.widening)
+
+    def _physics(self, system: MechanicalSystem) -> PredictorPhysics:
+        inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
+        model, standardization = self.model, self.likelihood.standardization
+        return PredictorPhysics(system, model.prior, model.mean == "analytical", inertials, standardization)
 
     def at_iteration(self, iteration: int) -> StructuredPosterior:
         """The posterior as it was after that iteration of the search (0: the start), its system included.

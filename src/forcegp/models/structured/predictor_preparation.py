@@ -14,6 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference.compressed_covariance import CompressedCovariance, Sample, compress
+from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
@@ -93,7 +94,9 @@ def prepared_predictor(
     code = None
     if compile:
         example = [x[:1] for x in (training.q, training.v, training.u)]
-        code = PredictorCode.of(physics.traced, example, prepared.sums(), compressed, widening)
+        code = PredictorCode.of(
+            physics.traced, example, latent_calls(latent, prepared, compressed), compressed, widening
+        )
         code.function("mean" if compressed is None else "covariance")
     seconds = time.perf_counter() - begin
     return Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, seconds)
