@@ -49,7 +49,7 @@ class Program:
 
     graph: Graph
     inputs: dict[str, int]
-    outputs: dict[str, Sequence[int]]
+    outputs: Mapping[str, Sequence[int]]
     positive: Sequence[int] = ()
     sums: tuple[str, ...] = ()
 

@@ -78,6 +78,7 @@ class OneInputCall:
 
     def roots_source(self, lanes: int, rank: int) -> str:
         """`NAME_roots(t, F, z, P)`: P (rank) from the table F, for one state."""
+        assert self.roots is not None, "asked for with a compressed covariance only"
         pieces, called = _once(self.roots, "roots", lanes)
         head = f"static void {self.name}_roots(const double *t, const double *F, const double *z, double *P)"
         return f"{pieces}{head} {{ (void)t; {called}(F, z[0], P, 0); }}"

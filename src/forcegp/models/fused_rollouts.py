@@ -170,7 +170,7 @@ def fused(
         for rows, found in ((Q, again.q), (V, again.v), (A, again.a)):
             rows[left] = found.movedim(0, 1)
         ended[left] = again.diverged_at
-    return Trajectory(*(rows.movedim(1, 0) for rows in (Q, V, A)), ended)
+    return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended)
 
 
 class FusedLoop:

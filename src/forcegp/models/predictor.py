@@ -209,8 +209,8 @@ class Predictor(Summary):
         if self.code is not None and integrator in STEPS:
             loop = self._loops.get(integrator) or self._loops.setdefault(integrator, self.code.loop(integrator))
         motion = fused(loop, method, self.mean, start, v, forces, dt, most)
-        shaped = (x.movedim(0, 1).reshape(*batch, len(x), self.nv) for x in (motion.q, motion.v, motion.a))
-        return Motions(*shaped, motion.diverged_at.reshape(batch))
+        q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), self.nv) for x in (motion.q, motion.v, motion.a))
+        return Motions(q, v, a, motion.diverged_at.reshape(batch))
 
     def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
         """Unknown force, multipliers, contact force and every component of the prior, with exact covariances."""

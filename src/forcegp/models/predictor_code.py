@@ -133,9 +133,7 @@ class PredictorCode:
             text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self._covariance_source()]
             finish = {"covariance": ("covariance", self.nv**2)}
         text.append(write_function("program", program.graph, program.nodes, lanes, names))
-        text.append(
-            write_entry(program, "program", finish) if loop is None else loop_source(integrator, "program", self.nv)
-        )
+        text.append(loop_source(integrator, "program", self.nv) if loop else write_entry(program, "program", finish))
         return "\n".join(text)
 
     def _covariance_source(self) -> str:
