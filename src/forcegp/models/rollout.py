@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
-from forcegp.integration import ConstraintManifold, Feedback, Trajectory, integrate, integrator_named
+from forcegp.errors import InvalidInput, require_type
+from forcegp.integration import ConstraintManifold, Feedback, integrate, integrator_named
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.search import blas_threads
 from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
@@ -110,79 +111,43 @@ def roll_out(
     feedback: Feedback | None = None,
     samples: int = 0,
     seed: int = 0,
+    grad: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rollout:
     """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model.system)
-    q, v, forces, batch = _checked_start(model, q0, v0, u)
-    runs = _Runs(model, integrator, dt)
+    require_type("grad", grad, bool)
+    q, v, forces, batch = _checked_start(model, q0, v0, u, grad)
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
-    with torch.no_grad(), blas_threads(0):
-        report = None if progress is None else lambda done, _: progress(done, total)
-        control = None if feedback is None else _flat_feedback(feedback, batch)
-        mean = integrate(method, model.mean(), q, v, forces, dt, feedback=control, what="rollouts", progress=report)
-        drawn = None
-        if samples:
-            later = None if progress is None else lambda done, _: progress(steps + done, total)
-            function = _by_sample(model.sampled(samples, seed), samples)
-            many = q.repeat(samples, 1), v.repeat(samples, 1)
-            repeated = forces.repeat(1, samples, 1)
-            control = None if feedback is None else _flat_feedback(feedback, (samples, *batch))
-            sampled = integrate(
-                method,
-                function,
-                *many,
-                repeated,
-                dt,
-                feedback=control,
-                what="sampled rollouts",
-                progress=later,
-            )
-            drawn = runs.rollout(sampled, many[0], many[1], (samples, *batch), None)
-        return runs.rollout(mean, q, v, batch, drawn)
 
+    counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
 
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """What the mean and the sampled motions of one rollout have in common."""
-
-    model: AccelerationModel
-    integrator: str
-    dt: float
-
-    def rollout(
-        self, motion: Trajectory, q0: Tensor, v0: Tensor, batch: Sequence[int], samples: Rollout | None
-    ) -> Rollout:
-        """The value with the caller's batch dimensions in front of time."""
-
-        def shaped(rows: Tensor) -> Tensor:
-            return rows.movedim(0, 1).reshape(*batch, rows.shape[0], rows.shape[-1])
-
-        q, v = shaped(motion.q), shaped(motion.v)
-        c, rate = self._violation(q, v)
-        change = [(after[0] - before).abs().amax(-1) for after, before in ((motion.q, q0), (motion.v, v0))]
-        return Rollout(
-            time=self.dt * torch.arange(motion.q.shape[0], dtype=q.dtype, device=q.device),
-            q=q,
-            v=v,
-            a=shaped(motion.a),
-            constraint=c,
-            velocity_constraint=rate,
-            initial_correction=torch.stack(change, dim=-1).reshape(*batch, 2),
-            diverged_at=motion.diverged_at.reshape(tuple(batch)),
-            integrator=self.integrator,
-            baumgarte=self.model.baumgarte,
-            samples=samples,
+    def run(function: AccelerationFunction, copies: tuple[int, ...], what: str, before: int) -> Rollout:
+        shape, count = (*copies, *batch), math.prod(copies)
+        start = q.repeat(count, 1), v.repeat(count, 1)
+        control = None if feedback is None else _flat_feedback(feedback, shape)
+        how = {"feedback": control, "what": what, "progress": None if counted is None else counted(before)}
+        motion = integrate(method, function, *start, forces.repeat(1, count, 1), dt, **how)
+        q_rows, v_rows, a_rows = (
+            x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
         )
+        blocks = zip(*(x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q_rows, v_rows)), strict=True)
+        parts = zip(*(ConstraintManifold(model.system).violation(*block) for block in blocks), strict=True)
+        c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
+        change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
+        correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
+        time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
+        moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
+        return Rollout(time, *moved, integrator, model.baumgarte)
 
-    def _violation(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        manifold = ConstraintManifold(self.model.system)
-        flat = [x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q, v)]
-        parts = [manifold.violation(*block) for block in zip(*flat, strict=True)]
-        c, rate = (torch.cat(part).reshape(*q.shape[:-1], -1) for part in zip(*parts, strict=True))
-        return c, rate
+    with torch.set_grad_enabled(grad), blas_threads(0):
+        mean = run(model.mean(), (), "rollouts", 0)
+        if samples:
+            sampled = _by_sample(model.sampled(samples, seed), samples)
+            mean = replace(mean, samples=run(sampled, (samples,), "sampled rollouts", steps))
+        return mean
 
 
 def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
@@ -208,14 +173,21 @@ def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunc
     return flat
 
 
-def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
+def _checked_start(
+    model: AccelerationModel, q0: Any, v0: Any, u: Any, grad: bool
+) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
     """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions."""
     robot = model.system.robot
     given = {
-        name: real_tensor(name, values, robot.device).detach().to(robot.device)
+        name: real_tensor(name, values, robot.device).to(robot.device)
         for name, values in (("q0", q0), ("v0", v0), ("u", u))
     }
     for name, values in given.items():
+        if values.requires_grad and torch.is_grad_enabled() and not grad:
+            raise InvalidInput(
+                f"{name} requires a gradient, which a rollout drops unless asked to keep it; give grad=True, or "
+                f"{name}.detach()."
+            )
         least = 2 if name == "u" else 1
         if values.dim() < least or values.shape[-1] != robot.nv:
             wanted = f"(..., T, {robot.nv})" if name == "u" else f"(..., {robot.nv})"

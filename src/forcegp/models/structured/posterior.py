@@ -27,14 +27,12 @@ from forcegp.inference import (
 )
 from forcegp.inference.cholesky_update import rows_to_keep
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
-from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.predictor import Predictor
-from forcegp.models.predictor_terms import TermsFunction
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
@@ -42,7 +40,7 @@ from forcegp.models.structured.components import Components, Curve, Latents, com
 from forcegp.models.structured.definition import StructuredModel
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.measured_torque import plus, second_moments, shrunk, without_force_noise
-from forcegp.models.structured.predictor_preparation import prepared_predictor
+from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
@@ -118,7 +116,7 @@ class StructuredPosterior(Posterior):
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
-        latents = self._latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
 
         def through(affine: AffineMap) -> Gaussian:
             return latents.through(affine.matrix @ B, affine.offset)
@@ -143,7 +141,7 @@ class StructuredPosterior(Posterior):
             return affine, None
         return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
-    def _latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
         """All processes at a batch of states."""
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.model.prior.features(dynamics))
@@ -181,24 +179,12 @@ class StructuredPosterior(Posterior):
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        return prepared_predictor(self.latent, self.widening, self.training, self._terms_function, **how)
-
-    def _terms_function(self, prepared: PreparedKernels, features: bool) -> TermsFunction:
-        """The terms of a predictor as a function of the state, differentiable, by the same code as `predict`.
-
-        Without `features` that list of them stays empty.
-        """
-        system, prior, known = self.system, self.model.prior, self.model.mean == "analytical"
         inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
-        standardize = self.likelihood.standardization
-
-        def terms(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-            dynamics = system.dynamics(q, v, u, inertials)
-            affine, given = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
-            joined = [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(given)]
-            return [*joined, *given] if features else joined
-
-        return terms
+        analytical = self.model.mean == "analytical"
+        physics = PredictorPhysics(
+            self.system, self.model.prior, analytical, inertials, self.likelihood.standardization
+        )
+        return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
 
     @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
@@ -210,7 +196,7 @@ class StructuredPosterior(Posterior):
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
-        latents = self._latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
     @override
