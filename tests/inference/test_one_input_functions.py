@@ -263,7 +263,7 @@ extern void many(long n, const double *table, const double *s, double *f, double
 }
 """
     try:
-        compiler = native_code.C.compiler("the test", "skip it")
+        compiler = native_code.Purpose("the test", "", "skip it").compiler()
     except CompilerError as error:
         pytest.skip(str(error))
     source, library = folder / "latent.c", folder / "latent.so"
