@@ -48,7 +48,7 @@ def states() -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_step_is_that_of_a_rollout(posterior, states, integrator):
-    predictor = posterior.predictor(covariance="none")
+    predictor = posterior.predictor(covariance="none", compile=False)
     q, v = predictor.step(*states, DT, integrator)
     rollout = posterior.rollout(
         *states[:2], states[2][:, None], DT, integrator=integrator, baumgarte=posterior.system.baumgarte
