@@ -234,6 +234,15 @@ def test_drawn_functions_of_rough_kernels_are_exact(expression):
     assert (form.values(s) - one_input_form(latent, 0, nothing).values(s)).abs().max() > 0.1
 
 
+def test_only_a_matern_is_drawn_on_a_grid():
+    """A rational quadratic of alpha 1/2 has a factor of the same shape."""
+    latent = posterior("rational-quadratic")
+    latent.kernels[0].base_kernel.alpha = torch.tensor(0.5, dtype=torch.float64)
+    (term,) = draw_functions(latent, 2, seed=1).terms[0]
+    assert term.grid is None
+    assert len(term.frequencies) == 1
+
+
 def test_the_mean_of_a_posterior():
     latent = posterior("friction")
     z = normal(9, 1, seed=20)

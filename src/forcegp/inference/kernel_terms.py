@@ -128,7 +128,7 @@ class DrawnTerm:
     """S functions of one term; `weights` are those of its columns, or those of cosines and of sines for each column.
 
     A Matern 1/2 has frequencies without bound. Of one input it is drawn at the points of an even `grid` instead, which
-    reaches 3 length scales beyond the centres, and `weights` are its values there; it is what is expected in between.
+    reaches 3 length scales beyond the centres; `weights` are its values there, and elsewhere it is their expectation.
     """
 
     term: KernelTerm
@@ -146,7 +146,7 @@ class DrawnTerm:
         options = {"generator": generator, "dtype": torch.float64, "device": generator.device}
         if not embedded:
             return cls(term, (), (torch.randn(samples, columns, **options),))
-        if len(embedded) == 1 and embedded[0].shape[-1] == 1 and term.factors[0].shape == 0.5:
+        if [(factor.shape, factor.power) for factor in term.factors] == [(0.5, -0.5)] and embedded[0].shape[-1] == 1:
             from scipy.signal import lfilter  # half a second, which only drawing should cost
 
             low, high = float(embedded[0].min()) - 3.0, float(embedded[0].max()) + 3.0

@@ -83,7 +83,7 @@ def markov_functions(
 ) -> OneInputFunctions | None:
     """sum_j k(s, s_j) c_jr exactly; None where the kernel is not made of `CURVES` and Materns of them.
 
-    To it come functions drawn from its terms without cosines, `widening` times.
+    Where `drawn` has functions of its terms, without cosines, `widening` times these are added.
     """
     try:
         terms = kernel_terms(kernel)
