@@ -221,6 +221,28 @@ def test_drawn_functions_have_tables(expression, tolerance):
     close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, tolerance)
 
 
+@pytest.mark.parametrize("expression", ["friction", "linear * matern-1/2 + friction", "matern-1/2 + constant"])
+def test_drawn_functions_of_rough_kernels_are_exact(expression):
+    """The cosines of a Matern 1/2 have any frequency, and no table could hold them."""
+    latent = posterior(expression)
+    drawn = draw_functions(latent, 3, seed=5, widening=1.5)
+    form = drawn_form(drawn, latent, 0)
+    assert form.error == 0.0
+    s = torch.cat([latent.features[0][:, 0], torch.linspace(-90, 90, 2001, dtype=torch.float64)])
+    close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, 1e-11)
+    nothing = torch.zeros(12, 3, dtype=torch.float64)
+    assert (form.values(s) - one_input_form(latent, 0, nothing).values(s)).abs().max() > 0.1
+
+
+def test_only_a_matern_is_drawn_on_a_grid():
+    """A rational quadratic of alpha 1/2 has a factor of the same shape."""
+    latent = posterior("rational-quadratic")
+    latent.kernels[0].base_kernel.alpha = torch.tensor(0.5, dtype=torch.float64)
+    (term,) = draw_functions(latent, 2, seed=1).terms[0]
+    assert term.grid is None
+    assert len(term.frequencies) == 1
+
+
 def test_the_mean_of_a_posterior():
     latent = posterior("friction")
     z = normal(9, 1, seed=20)
@@ -250,7 +272,7 @@ extern void many(long n, const double *table, const double *s, double *f, double
 }
 """
     try:
-        compiler = native_code.C.compiler("the test", "skip it")
+        compiler = native_code.Purpose("the test", "", "skip it").compiler()
     except CompilerError as error:
         pytest.skip(str(error))
     source, library = folder / "latent.c", folder / "latent.so"

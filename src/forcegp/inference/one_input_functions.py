@@ -9,6 +9,7 @@ friction kernel and Materns have an exact form, which two passes over the sorted
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import PointMap
-from forcegp.inference.kernel_terms import kernel_terms
+from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
 from forcegp.inference.pathwise import ComposedSamples, FunctionSamples
 from forcegp.inference.piecewise_tables import CURVES, OneInputFunctions, cubic_table, value_and_slope
 from forcegp.inference.posterior import LatentPosterior
@@ -58,33 +59,48 @@ def one_input_form(
 def drawn_form(
     drawn: FunctionSamples | ComposedSamples, latent: LatentPosterior, index: int, tolerance: float = TOLERANCE
 ) -> OneInputFunctions | None:
-    """S functions of one latent, drawn from its posterior, as a cubic table; None as in `one_input_form`.
+    """S functions of one latent, drawn from its posterior: exact where they have no cosines, otherwise a cubic table.
 
-    Those of a Matern of smoothness 1/2 have cosines of any frequency and need a larger `tolerance`.
+    None as in `one_input_form`.
     """
     centers = latent.features[index].detach()
     if centers.shape[-1] != 1:
         return None
+    if isinstance(drawn, ComposedSamples) and not any(term.frequencies for term in drawn.terms[index]):
+        beta, terms = drawn.beta[index].mT, drawn.terms[index]
+        exact = markov_functions(latent.kernels[index], centers[:, 0], beta, terms, drawn.widening)
+        if exact is not None:
+            return exact
     return cubic_table(lambda s: drawn.one(index, s[:, None]).mT, centers[:, 0], MARGIN, tolerance)
 
 
 def markov_functions(
-    kernel: Kernel, centers: Float[Tensor, " N"], coefficients: Float[Tensor, "N R"]
+    kernel: Kernel,
+    centers: Float[Tensor, " N"],
+    coefficients: Float[Tensor, "N R"],
+    drawn: Sequence[DrawnTerm] = (),
+    widening: float = 1.0,
 ) -> OneInputFunctions | None:
-    """sum_j k(s, s_j) c_jr exactly; None where the kernel is not made of `CURVES` and Materns of them."""
+    """sum_j k(s, s_j) c_jr exactly; None where the kernel is not made of `CURVES` and Materns of them.
+
+    Where `drawn` has functions of its terms, without cosines, `widening` times these are added.
+    """
     try:
         terms = kernel_terms(kernel)
     except InvalidInput:
         return None
+    grids = [_places(each, centers) for each in drawn]
+    coefficients = torch.cat([coefficients, coefficients.new_zeros(sum(map(len, grids)), coefficients.shape[1])])
+    first, centers = len(centers), torch.cat([centers, *grids])
     knots, place = torch.unique(centers, return_inverse=True)
     curves: dict[tuple[str, float], int] = {}
     constants: dict[tuple[int, ...], Tensor] = {}
     sides, rates, starts, polynomials = [], [], [], [np.zeros((len(knots) + 1, coefficients.shape[1], 0))]
-    for term in terms:
-        weights, envelope = coefficients * float(term.scale), []
+    for number, term in enumerate(terms):
+        weights, envelope, root = coefficients * float(term.scale), [], widening * math.sqrt(float(term.scale))
         for feature in term.features:
             amplitude, curve = _curve(feature, centers)
-            weights = weights * amplitude**2
+            weights, root = weights * amplitude**2, root * amplitude
             if curve:
                 envelope.append(curves.setdefault(curve, len(curves)))
                 weights = weights * CURVES[curve[0]][0](curve[1] * centers)[:, None]
@@ -93,12 +109,15 @@ def markov_functions(
         key = tuple(sorted(envelope))
         constant = constants.setdefault(key, torch.zeros_like(weights[0]))
         if not term.factors:
-            constants[key] = constant + weights.sum(0)
+            constants[key] = constant + weights.sum(0) + (root * drawn[number].weights[0][:, 0] if drawn else 0.0)
             continue
         factor, *others = term.factors
         amplitude, curve = _curve(factor.embedding, centers)
         if others or not curve or factor.power >= 0.0 or factor.shape not in MATERN:
             return None
+        if drawn:
+            own = slice(first, first := first + len(grids[number]))
+            weights[own] += root * _news(drawn[number]).mT
         polynomial, rate = MATERN[factor.shape], math.sqrt(2.0 * factor.shape) * abs(amplitude)
         side = list(constants).index(key), curves.setdefault(curve, len(curves)), len(polynomial), True
         y = CURVES[curve[0]][0](curve[1] * knots)
@@ -119,6 +138,22 @@ def markov_functions(
         tuple(constants),
         tuple(sides),
     )
+
+
+def _news(drawn: DrawnTerm) -> Float[Tensor, "S P"]:
+    """Weights of the kernel functions about the points of a grid, which give the values there."""
+    assert drawn.grid is not None
+    h, values = drawn.grid[1] - drawn.grid[0], drawn.weights[0][:, 0]
+    news = torch.cat([values[:, :1], (values[:, 1:] - (-h).exp() * values[:, :-1]) / -torch.expm1(-2.0 * h)], dim=1)
+    return news - (-h).exp() * torch.cat([news[:, 1:], torch.zeros_like(news[:, :1])], dim=1)
+
+
+def _places(drawn: DrawnTerm, centers: Float[Tensor, " N"]) -> Float[Tensor, " P"]:
+    """The inputs at which a drawn term has its grid; none where it has none."""
+    amplitude, curve = _curve(drawn.term.factors[0].embedding, centers) if drawn.grid is not None else (0.0, None)
+    if drawn.grid is None or not curve:
+        return centers[:0]
+    return (torch.sinh if curve[0] == "asinh" else torch.clone)(drawn.grid / amplitude) / curve[1]
 
 
 def _one_side(weights: np.ndarray, h: np.ndarray, polynomial: tuple[float, ...]) -> Float[np.ndarray, "K R n"]:

@@ -9,7 +9,8 @@ centres z_j of the posterior, whose weights `LatentPosterior.function_weights` f
 with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
 many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
 approximate, and the better the more cosines there are. Where all kernels are squared exponentials, all latents are one
-batched operation (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`).
+batched operation (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`). A
+Matern 1/2 of one input has too high frequencies for cosines and is drawn on a grid (`kernel_terms.DrawnTerm`).
 """
 
 from __future__ import annotations
@@ -173,10 +174,7 @@ class ComposedSamples:
         with torch.no_grad():
             generator = torch.Generator(device=latent.features[0].device).manual_seed(seed)
             terms = tuple(
-                tuple(
-                    DrawnTerm.draw(term, z.new_zeros(1, z.shape[-1]), samples, frequencies, generator)
-                    for term in kernel_terms(kernel)
-                )
+                tuple(DrawnTerm.draw(term, z, samples, frequencies, generator) for term in kernel_terms(kernel))
                 for kernel, z in zip(latent.kernels, latent.features, strict=True)
             )
             prior = [

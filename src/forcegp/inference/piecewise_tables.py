@@ -189,10 +189,9 @@ def _hermite(x: Float[Tensor, " K"], f: Float[Tensor, "K R"], d: Float[Tensor, "
     h, left, right = x.diff()[:, None], d[:-1], d[1:]
     step = (f[1:] - f[:-1]) / h
     w = torch.stack([f[:-1], left, (3.0 * step - 2.0 * left - right) / h, (left + right - 2.0 * step) / h**2], dim=-1)
-    starts, polynomials = (torch.cat([part[:1], part, part[-1:]]) for part in (x[:-1, None], w))  # known at its ends
-    sides, low, high = ((0, 0, 4, False),), float(x[0]), float(x[-1])
-    nothing = 0.0 * f[0, :, None]
-    return OneInputFunctions(x, starts, polynomials, x.new_ones(2), nothing, ("identity",), ((),), sides, low, high)
+    starts, w = (torch.cat([part[:1], part, part[-1:]]) for part in (x[:-1, None], w))  # at its ends it is still known
+    curves, sides, none = ("identity",), ((0, 0, 4, False),), 0.0 * f[0, :, None]
+    return OneInputFunctions(x, starts, w, x.new_ones(2), none, curves, ((),), sides, float(x[0]), float(x[-1]))
 
 
 def _horner(coefficients: list[str], u: str) -> str:
