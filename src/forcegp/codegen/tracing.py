@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -54,11 +55,10 @@ def trace(
     Inputs are flattened in order; with `graph` they are its `inputs`. Raises InvalidInput, naming the operation, where
     the function does what a graph cannot hold.
     """
-    from torch._decomp import core_aten_decompositions  # these two take a while to import
-    from torch.fx.experimental.proxy_tensor import make_fx
+    from torch.fx.experimental.proxy_tensor import make_fx  # takes a while to import
 
+    table = _decompositions()
     with torch.no_grad(), StraightLineAlgebra():
-        table = dict(core_aten_decompositions().items())
         traced = make_fx(lambda *x: function(*x), decomposition_table=table)(*examples).graph  # type: ignore[arg-type]  # its keys are operations
     graph = Graph(sum(x.numel() for x in examples)) if graph is None else graph
     nodes = torch.tensor([x.node for x in inputs] or graph.inputs).split([x.numel() for x in examples])
@@ -78,6 +78,14 @@ def trace(
                 args, kwargs = map_arg((node.args, node.kwargs), found.__getitem__)
                 found[node] = _apply(graph, node.target, args, kwargs)
     raise AssertionError("a traced function has an output")
+
+
+@cache
+def _decompositions() -> dict[Any, Callable[..., Any]]:
+    """What makes few operations of the many that torch has."""
+    from torch._decomp import core_aten_decompositions  # takes a while to import
+
+    return dict(core_aten_decompositions().items())
 
 
 class _Numbers:

@@ -13,6 +13,7 @@ there is only one, several centres.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -70,6 +71,7 @@ class KernelSum:
     kernels: tuple[int, ...]
     prior: Graph
     variances: tuple[int, ...]
+    level: tuple[float, ...]
     roots: Float[Tensor, "G N R"] | None = None
 
     @classmethod
@@ -81,19 +83,26 @@ class KernelSum:
         weights: Float[Tensor, "G N"],
         function: PairFunction,
         diagonal: Callable[[Tensor], Tensor],
+        level: tuple[float, ...],
     ) -> KernelSum:
-        """Traced from the kernels. Raises InvalidInput, naming the operation, for those that no graph holds."""
+        """Traced from the kernels less a constant `level` of each.
+
+        Raises InvalidInput, naming the operation, for those that no graph holds.
+        """
         example = centers[:1]
         pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
         prior, (variances,) = trace(lambda z: [diagonal(z)], [example])
         nodes = (tuple(found.flatten().tolist()) for found in (kernels, variances))
-        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes))
+        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes), level)
 
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
         """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
         operands = self.given(graph, z)
         name = self.name + ("_slopes" if slopes else "")
-        return graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        totals = (math.fsum(weights.tolist()) for weights in self.weights)
+        constants = (graph.constant(level * total) for level, total in zip(self.level, totals, strict=True))
+        return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
 
     def _dependence(self) -> list[int]:
         """Of every node of the pair: 1 if it depends on z, 2 on the centre, 3 on both, 0 on none."""
@@ -224,7 +233,8 @@ class KernelSum:
             if dependence[node] == 3:
                 text.append(f"    const real x{node} = {c_value(graph, node, operand, as_real, lanes)};")
         if keep:
-            text += [f"    STORE(k + {g} * {BLOCK} + j - first, {as_real(node)});" for g, node in enumerate(made)]
+            for g, (node, level) in enumerate(zip(made, self.level, strict=True)):
+                text.append(f"    STORE(k + {g} * {BLOCK} + j - first, {as_real(node)} + {level.hex()});")
         else:
             text += [f"    const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
             text += [f"    s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made)]
