@@ -36,7 +36,7 @@ BLOCK = 64
 """Centres whose kernels are held at once."""
 
 ROOTS = """
-static APART void NAME_roots(const double *t, const double *F, const double *z, double *P) {
+static APART void NAME_roots(const double *t, const double *F, const double *z, double *restrict P) {
   const long n = (long)t[0]; double k[LATENTS * BLOCK];
   for (long first = 0; first < n; first += BLOCK) {
     const long count = n - first < BLOCK ? n - first : BLOCK;
