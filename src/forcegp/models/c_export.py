@@ -11,7 +11,7 @@ import importlib.metadata
 import re
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,7 +30,6 @@ from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.inference.one_input_calls import OneInputCall, latent_calls
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models import exported_text as text
 from forcegp.models.fused_rollouts import STEPS
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -45,6 +44,7 @@ MEAN_TOLERANCE, TABLE_TOLERANCE = (5e-12, 1e-11), 1e-7
 """Largest difference relative to the largest value: of sums over up to 100 and more points, and of tables."""
 LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3}
 """How many times as much as the mean these may differ: more cancels in them."""
+ALIKE = ("CMakeLists.txt", "example.c", "self_test.c", "README.txt")
 SUFFIXES = {"covariance": "mean_covariance"}
 PURPOSE = Purpose(
     "the check of an exported model", "the environment variable TMPDIR", "export without it, `unchecked=True`"
@@ -254,38 +254,27 @@ class _Writer:
     def write(self, folder: Path, source: str | None, said: str) -> None:
         """All files; `said` is how good the program is."""
         start = [", ".join(map(repr, x.tolist())) for x in np.split(self.checks[0].states[0], 3)]
-        words = {"NAME": self.name, "NV": self.code.nv, "DT": repr(self.dt), "TITLE": self._title, "CHECKED": said}
+        program, stepped = _sections("model.c"), STEPS[self.integrator].replace("PROGRAM", self._stepped)
+        words: dict[str, object] = {"NAME": self.name, "NV": self.code.nv, "DT": self.dt, "TITLE": self._title}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(), strict=True))
-        words |= {"STEP": STEPS[self.integrator].replace("PROGRAM", self._stepped).replace("R(0.0)", "0.0")}
-        words |= {"SLOPES": text.STEP_SLOPES[self.integrator], "COMMENT": self._comment(source, said)}
-        words |= {"GIVEN": len(self.code.program("covariance").nodes) if "covariance" in self._kinds else 0}
-        functions = "".join(text.filled(text.FUNCTIONS[kind], words) for kind in self._kinds)
-        words["PROTOTYPES"] = "\n".join(
-            f"{found};" for found in re.findall(r"^((?:/\*[^{}]*?\*/\n)?int [^{]*?) {", functions, re.M)
-        )
-        external = [text.filled(text.EXTERNAL, words)]
-        for kind in self._kinds:
-            if kind in text.EXTERNALS:
-                parts = dict(zip(("FUNCTION", "INPUTS", "OUTPUTS", "BODY"), text.EXTERNALS[kind], strict=True))
-                words |= {word: text.filled(part, words) for word, part in parts.items()}
-                external.append(text.filled(text.EXTERNAL_FUNCTION, words))
-        files = {
-            f"{self.name}.h": text.filled(text.HEADER, words),
-            f"{self.name}.c": "\n".join(
-                [text.filled(text.HEAD, words), *self._program(), text.filled(text.CALLS, words), functions]
-            ),
-            f"{self.name}_external.c": "".join(external),
-            "CMakeLists.txt": text.filled(text.CMAKE, words),
-            "example.c": text.filled(text.EXAMPLE, words),
-            "self_test.c": text.filled(text.SELF_TEST, words),
-            "README.txt": text.filled(text.README, words),
-        }
-        if self.dt is not None:
-            acados = text.ACADOS + (text.ACADOS_JACOBIAN if self.jacobian else "")
-            files[f"{self.name}_acados.c"] = text.filled(acados, words)
+        words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
+        words |= {"COMMENT": self._comment(source, said), "GIVEN": 0}
+        if "covariance" in self._kinds:
+            words["GIVEN"] = len(self.code.program("covariance").nodes)
+        words = {word: _filled(str(value), words) for word, value in words.items()}
+        functions = _filled("".join(program[kind] for kind in self._kinds), words)
+        prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
+        words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
+        parts = [_filled(program["head"], words), *self._program(), _filled(program["calls"], words), functions]
+        files = {f"{self.name}.c": "\n".join(parts), f"{self.name}.h": _filled(_template("model.h"), words)}
+        for form in ("external", "acados") if self.dt is not None else ("external",):
+            found = _sections(f"{form}.c")
+            chosen = "".join(found[kind] for kind in ("head", *self._kinds) if kind in found)
+            files[f"{self.name}_{form}.c"] = _filled(chosen, words)
+        files |= {file: _filled(_template(file), words) for file in ALIKE}
         for file, content in files.items():
-            (folder / file).write_text(content, encoding="ascii", errors="replace")
+            (folder / file).write_text(content, encoding="ascii")
 
     def compared(self, folder: Path) -> dict[str, float]:
         """The largest difference by function. Nothing without a compiler; a warning says so."""
@@ -391,6 +380,20 @@ def _difference(function: Any, check: _Check) -> float:
         apart = max(float(np.abs(x - wanted[row]).max()) / scale for x, wanted, scale in pairs)
         worst = apart if bits == 0 and not apart <= worst else np.inf if bits else worst
     return worst
+
+
+def _template(file: str) -> str:
+    return (Path(__file__).parent / "exported_c" / file).read_text(encoding="ascii")
+
+
+def _sections(file: str) -> dict[str, str]:
+    """The parts of a template, by the names above them."""
+    return dict(re.findall(r"^//// (\S+)\n(.*?)(?=^////|\Z)", _template(file), re.MULTILINE | re.DOTALL))
+
+
+def _filled(text: str, words: Mapping[str, object]) -> str:
+    """The text with what stands for every `@WORD@`."""
+    return re.sub("@([A-Z_]+)@", lambda found: str(words[found[1]]), text)
 
 
 def _numbers(values: Sequence[float]) -> str:

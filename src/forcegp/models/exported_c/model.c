@@ -1,0 +1,148 @@
+//// head
+#include "@NAME@.h"
+#include <string.h>
+#ifdef __FAST_MATH__
+#error "compile @NAME@.c without -ffast-math: it has to notice numbers that are not finite"
+#endif
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize ("no-tree-slp-vectorize") /* takes most of the time of the compiler and gains nothing here */
+#endif
+
+//// calls
+static int stored(const double *from, double *to, int count) {
+  int good = 1;
+  for (int k = 0; k < count; k++) { to[k] = from[k]; good &= from[k] - from[k] == 0.0; }
+  return good ? @NAME@_OK : @NAME@_RESULT_NOT_FINITE;
+}
+/* x = [q, v, u]; what is not finite is refused here, and the `count` results become NaN */
+static int refused(const double *q, const double *v, const double *u, double *x, double *result, int count) {
+  int found = stored(q, x, @NV@) | stored(v, x + @NV@, @NV@) | stored(u, x + 2 * @NV@, @NV@);
+  for (int k = 0; found && k < count; k++) result[k] = NAN;
+  return found ? @NAME@_INPUT_NOT_FINITE : @NAME@_OK;
+}
+
+//// mean
+/* mean of the acceleration at (q, v) under u */
+int @NAME@_mean(const double q[@NV@], const double v[@NV@], const double u[@NV@], double a[@NV@]) {
+  double x[3 * @NV@], y[@NV@];
+  if (refused(q, v, u, x, a, @NV@)) return @NAME@_INPUT_NOT_FINITE;
+  mean(tables, 1, x, y);
+  return stored(y, a, @NV@);
+}
+
+//// covariance
+/* the same and its covariance, without measurement noise */
+int @NAME@_mean_covariance(const double q[@NV@], const double v[@NV@], const double u[@NV@], double a[@NV@],
+                         double covariance[@NV@ * @NV@]) {
+  double x[3 * @NV@], y[@GIVEN@], c[@NV@ * @NV@];
+  if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, covariance, @NV@ * @NV@)) return @NAME@_INPUT_NOT_FINITE;
+  mean_and_terms(tables, 1, x, y);
+  covariance_of(tables, y + @NV@, c);
+  return stored(y, a, @NV@) | stored(c, covariance, @NV@ * @NV@);
+}
+
+//// linearize
+/* the same and its derivatives: jacobian[3 NV i + k] = d a_i / d [q, v, u]_k */
+int @NAME@_linearize(const double q[@NV@], const double v[@NV@], const double u[@NV@], double a[@NV@],
+                   double jacobian[3 * @NV@ * @NV@]) {
+  double x[3 * @NV@], y[@NV@ + 3 * @NV@ * @NV@];
+  if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, jacobian, 3 * @NV@ * @NV@)) return @NAME@_INPUT_NOT_FINITE;
+  slopes(tables, 1, x, y);
+  return stored(y, a, @NV@) | stored(y + @NV@, jacobian, 3 * @NV@ * @NV@);
+}
+
+//// step
+/* the state one step later */
+int @NAME@_step(const double q[@NV@], const double v[@NV@], const double u[@NV@], double q_next[@NV@],
+              double v_next[@NV@]) {
+  enum {N = @NV@, ROUNDS = 60};
+  const double *const *t = tables;
+  const double dt = @DT@;
+  const long live = 1;
+  double x[3 * N], y[N + 3 * N * N], q1[N], v1[N], a[N], q0[N], v0[N], m[N], d[N];
+  (void)ROUNDS; (void)a; (void)q0; (void)v0; (void)m; (void)d;
+  if (refused(q, v, u, x, q_next, N) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
+  { @STEP@ }
+  return stored(q1, q_next, N) | stored(v1, v_next, N);
+}
+
+//// step_jacobian
+/* K = da along the directions S of (q, v), of which those of u follow; y = [a, da / d(q, v, u)] */
+static void along(const double *y, double S[2 * @NV@][3 * @NV@], double K[@NV@][3 * @NV@]) {
+  for (int i = 0; i < @NV@; i++) for (int c = 0; c < 3 * @NV@; c++) {
+    const double *row = y + @NV@ + 3 * @NV@ * i;
+    K[i][c] = c < 2 * @NV@ ? 0.0 : row[c];
+    for (int j = 0; j < 2 * @NV@; j++) K[i][c] += row[j] * S[j][c];
+  }
+}
+
+/* the same and its derivatives in [q, v], A[2 NV i + k], and in u, B[NV i + k] */
+int @NAME@_step_jacobian(const double q[@NV@], const double v[@NV@], const double u[@NV@], double q_next[@NV@],
+                       double v_next[@NV@], double A[4 * @NV@ * @NV@], double B[2 * @NV@ * @NV@]) {
+  enum {N = @NV@};
+  const double dt = @DT@;
+  double x[3 * N], y[N + 3 * N * N], S[2 * N][3 * N], K[N][3 * N];
+  int found = @NAME@_step(q, v, u, q_next, v_next);
+  if (refused(q, v, u, x, A, 4 * N * N) | refused(q, v, u, x, B, 2 * N * N)) return @NAME@_INPUT_NOT_FINITE;
+  for (int i = 0; i < 2 * N; i++) for (int c = 0; c < 3 * N; c++) S[i][c] = i == c;
+  { @SLOPES@ }
+  for (int i = 0; i < 2 * N; i++) found |= stored(S[i], A + 2 * N * i, 2 * N) | stored(S[i] + 2 * N, B + N * i, N);
+  return found;
+}
+
+//// symplectic-euler
+    slopes(tables, 1, x, y);
+    along(y, S, K);
+    for (int i = 0; i < N; i++) for (int c = 0; c < 3 * N; c++) {
+      S[N + i][c] += dt * K[i][c]; S[i][c] += dt * S[N + i][c];
+    }
+
+//// rk4
+    const double b[4] = {dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0}, h[4] = {0.0, 0.5 * dt, 0.5 * dt, dt};
+    double X[2 * N][3 * N];
+    memset(X, 0, sizeof X); memset(K, 0, sizeof K); memset(y, 0, sizeof y);
+    for (int s = 0; s < 4; s++) {
+      for (int i = 0; i < N; i++) {
+        x[i] = q[i] + h[s] * x[N + i]; x[N + i] = v[i] + h[s] * y[i];
+        for (int c = 0; c < 3 * N; c++) {
+          X[i][c] = (i == c) + h[s] * X[N + i][c]; X[N + i][c] = (N + i == c) + h[s] * K[i][c];
+        }
+      }
+      slopes(tables, 1, x, y);
+      along(y, X, K);
+      for (int i = 0; i < N; i++) for (int c = 0; c < 3 * N; c++) {
+        S[i][c] += b[s] * X[N + i][c]; S[N + i][c] += b[s] * K[i][c];
+      }
+    }
+
+//// implicit-midpoint
+    const double h = 0.5 * dt; /* m = v + h a(q + h m, m, u), solved for dm */
+    double J[N][N], X[2 * N][3 * N];
+    memset(X, 0, sizeof X);
+    for (int i = 0; i < N; i++) {
+      x[N + i] = 0.5 * (v[i] + v_next[i]); x[i] = q[i] + h * x[N + i];
+      X[i][i] = 1.0;
+    }
+    slopes(tables, 1, x, y);
+    along(y, X, K);
+    for (int i = 0; i < N; i++) {
+      for (int c = 0; c < 3 * N; c++) K[i][c] = h * K[i][c] + (c == N + i);
+      for (int j = 0; j < N; j++)
+        J[i][j] = (i == j) - h * (y[N + 3 * N * i + N + j] + h * y[N + 3 * N * i + j]);
+    }
+    for (int p = 0; p < N; p++) {
+      int best = p;
+      for (int i = p + 1; i < N; i++) if (fabs(J[i][p]) > fabs(J[best][p])) best = i;
+      for (int j = 0; j < N; j++) { const double z = J[p][j]; J[p][j] = J[best][j]; J[best][j] = z; }
+      for (int c = 0; c < 3 * N; c++) { const double z = K[p][c]; K[p][c] = K[best][c]; K[best][c] = z; }
+      for (int i = 0; i < N; i++) if (i != p) {
+        const double w = J[i][p] / J[p][p];
+        for (int j = p; j < N; j++) J[i][j] -= w * J[p][j];
+        for (int c = 0; c < 3 * N; c++) K[i][c] -= w * K[p][c];
+      }
+    }
+    for (int i = 0; i < N; i++) for (int c = 0; c < 3 * N; c++) {
+      const double dm = K[i][c] / J[i][i];
+      S[i][c] += dt * dm; S[N + i][c] = 2.0 * dm - S[N + i][c];
+    }
+

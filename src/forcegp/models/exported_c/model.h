@@ -1,0 +1,25 @@
+/*
+@COMMENT@
+
+   Arrays are in the order of the joints, matrices row by row. All functions are re-entrant and return
+   @NAME@_OK or bits of what was wrong; results are NaN where they are not known. No result may be an argument, too.
+*/
+#ifndef @NAME@_H
+#define @NAME@_H
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+enum {
+  @NAME@_NV = @NV@,
+  @NAME@_OK = 0,
+  @NAME@_INPUT_NOT_FINITE = 1,
+  @NAME@_RESULT_NOT_FINITE = 4 /* singular there, outside the range of a table, or an implicit step not found */
+};
+
+@PROTOTYPES@
+
+#ifdef __cplusplus
+}
+#endif
+#endif
