@@ -254,8 +254,20 @@ class Predictor(Summary):
         states = [x.detach().contiguous() for x in states]
         outputs = [torch.empty(count, size, dtype=torch.float64) for size in function.outputs]
         if function.rows(count, states, outputs):
-            raise NumericalError(NO_RESULT)
+            self._repair(kind, states, outputs)
         return outputs
+
+    def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
+        """Rows that a program leaves NaN, because they lie outside of a table, by torch, to which no place is too far."""
+        bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
+        given = [x[bad] for x in states]
+        if kind == "linearize":
+            found = self._linearize(given)
+        else:
+            mean, W, *latents = self._mean(*given)
+            found = (mean,) if kind == "mean" else (mean, W @ self._covariance(W, *latents) @ W.mT)
+        for output, rows in zip(outputs, found, strict=True):
+            output[bad] = _finished([rows], False).reshape(len(bad), -1)
 
     def _at_one(self, kind: str, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
         """The same at one state that needs no conversion, whose numbers are checked on the way."""
@@ -264,7 +276,7 @@ class Predictor(Summary):
         if bits & NOT_FINITE:
             raise InvalidInput("q, v or u has values that are not finite; drop or repair those rows.")
         if bits:
-            raise NumericalError(NO_RESULT)
+            self._repair(kind, [q[None], v[None], u[None]], [x[None] for x in outputs])
         return outputs
 
     def _function(self, kind: str) -> RowFunction:
