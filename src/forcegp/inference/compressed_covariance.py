@@ -87,7 +87,13 @@ def _leading(D: Float[Tensor, "n m"], count: int) -> Float[Tensor, "n count"]:
     if len(D) <= D.shape[1]:
         return torch.linalg.eigh(D @ D.mT)[1].flip(-1)[:, :count]
     columns = D @ torch.linalg.eigh(D.mT @ D)[1].flip(-1)[:, :count]
-    return torch.linalg.qr(columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300))[0]
+    for _ in range(2):  # Cholesky's QR: nearly orthogonal the first time, orthogonal to rounding the second
+        columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300)
+        lower, failed = torch.linalg.cholesky_ex(columns.mT @ columns)
+        if int(failed):
+            return torch.linalg.qr(columns)[0]
+        columns = torch.linalg.solve_triangular(lower.mT, columns, upper=True, left=False)
+    return columns
 
 
 def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "n _"], Float[Tensor, " _"]]:

@@ -30,6 +30,7 @@ from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
+from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
@@ -337,7 +338,11 @@ class StructuredPosterior(Posterior):
         noise = self.model.noise
         if noise is not None and noise.measured_torque:  # whose accelerations are shrunk
             return AccelerationModel(system, baumgarte, mean, sampled)
-        return AccelerationModel(system, baumgarte, mean, sampled, lambda name: self._code(system).loop(name))
+
+        def compiled(integrator: str, samples: int, seed: int) -> list[FusedLoop] | None:
+            return self._code(system).loops(integrator, self.latent, samples, seed)
+
+        return AccelerationModel(system, baumgarte, mean, sampled, compiled)
 
     def _code(self, system: MechanicalSystem) -> PredictorCode:
         """Programs of the mean in a system."""
