@@ -15,6 +15,7 @@ from forcegp.cli.command import Command
 from forcegp.cli.compare import Compare
 from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
+from forcegp.cli.export import Export
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
 from forcegp.cli.import_log import Import
@@ -50,6 +51,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
+    "export": (Export, "write a fitted model as a C program"),
     "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
 }
 """A new command is a file with a subclass of Command, and an entry here."""

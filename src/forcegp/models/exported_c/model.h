@@ -1,5 +1,7 @@
 /*
 @COMMENT@
+   model: @SOURCE@
+   written by forcegp @VERSION@, do not edit
 
    Arrays are in the order of the joints, matrices row by row. All functions are re-entrant and return
    @NAME@_OK or bits of what was wrong; results are NaN where they are not known. No result may be an argument, too.

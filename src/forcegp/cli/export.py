@@ -1,0 +1,88 @@
+"""`forcegp export`: write a fitted model as a program for other tools."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+import forcegp
+from forcegp.cli.command import MODEL, Command, Debug, Json
+from forcegp.cli.output_folders import output_folder, require_free_folder
+from forcegp.cli.tables import columns
+from forcegp.cli.terminal import Terminal
+from forcegp.errors import InvalidInput
+
+KIND = "forcegp export"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Write a fitted model as a program that needs no Python.
+
+    c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
+    for CasADi's external and acados' generic functions. It is compiled and compared with the model before it is there.
+
+    For instance:
+      forcegp export run --to c --out deployed --covariance
+      forcegp export run --to c --out mpc --jacobian --steps 0.02 --integrator implicit-midpoint
+    """
+
+    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
+    """The folder that `forcegp fit --out` wrote."""
+    to: Literal["c"]
+    """What to write."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """The folder to write."""
+    covariance: bool = False
+    """With the covariance of the acceleration, which makes the program some 2 MB larger."""
+    jacobian: bool = False
+    """With derivatives in q, v and u. Compilers take some ten seconds for them."""
+    steps: Annotated[float | None, arg(metavar="DT")] = None
+    """With x+ = f(x, u), a step of DT seconds."""
+    integrator: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: symplectic-euler)")] = None
+    """Of that step: symplectic-euler, rk4 or implicit-midpoint (stiff friction)."""
+    unchecked: bool = False
+    """Do not compile the program and compare it with the model."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Write and show."""
+        if self.integrator is not None and self.steps is None:
+            raise InvalidInput("--integrator was given without --steps, which says how long a step lasts.")
+        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        posterior = forcegp.load_posterior(self.run_folder)
+        names = ("to", "covariance", "jacobian", "steps", "integrator")
+        content = {"run": str(self.run_folder), **{name: getattr(self, name) for name in names}}
+        with output_folder(self.out, KIND, content, overwrite=self.overwrite) as folder:
+            found = TARGETS[self.to](self, terminal, posterior, folder)
+        return {"out": str(self.out), **content, **found}
+
+
+def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
+    made = forcegp.export_c(
+        posterior,
+        folder,
+        covariance=options.covariance,
+        jacobian=options.jacobian,
+        steps=options.steps,
+        integrator=options.integrator or "symplectic-euler",
+        source=str(options.run_folder),
+        unchecked=options.unchecked,
+    )
+    terminal.show(
+        columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
+    )
+    for function, apart in made.differences.items():
+        terminal.show(f"{function}: at most {apart:.1e} of the largest value from forcegp's own")
+    return {"name": made.name, "files": made.files, "differences": made.differences, "inflation": made.inflation}
+
+
+TARGETS: dict[str, Callable[[Export, Terminal, Any, Path], dict[str, Any]]] = {"c": _c}
+"""What writes each target to a folder; a new one is a function here and a name in `Export.to`."""
