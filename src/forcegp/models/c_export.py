@@ -213,7 +213,10 @@ class _Writer:
         training, made = self.posterior.training, self.reference
         sampled = torch.cat(sample_states(training, STATES, 0), dim=-1)
         finite = self.posterior.predict(*sampled.chunk(3, dim=-1), covariance=False).mean.isfinite().all(-1)
-        between = sampled[STATES // 3 : 2 * STATES // 3][finite[STATES // 3 : 2 * STATES // 3]][::3]
+        rows = min(STATES // 3, len(training.q))  # of the data themselves; then as many moved ones
+        away = torch.randn(len(sampled), 1, generator=torch.Generator().manual_seed(0)).double()
+        moved = sampled + 1e-3 * sampled.std(0).clamp_min(1e-3) * away  # as some of these are by nothing
+        between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
         tolerance = TABLE_TOLERANCE if self._table_error else MEAN_TOLERANCE[len(training.q) > 100]
         found = []
         for kind in self._kinds:
@@ -231,9 +234,9 @@ class _Writer:
                     wanted = list(made.step(q, v, u, self.dt or 0.0, self.integrator))
                 case _:
                     wanted = list(made.linearize_step(q, v, u, self.dt or 0.0, self.integrator)[:4])
-            rows = [x.detach().flatten(1).numpy() for x in wanted]
+            values = [x.detach().flatten(1).numpy() for x in wanted]
             function = f"{self.name}_{SUFFIXES.get(kind, kind)}"
-            found.append(_Check(function, states.numpy(), rows, tolerance * LOOSER.get(kind, 1.0)))
+            found.append(_Check(function, states.numpy(), values, tolerance * LOOSER.get(kind, 1.0)))
         return found
 
     def write(self, folder: Path, source: str | None, said: str) -> None:
