@@ -258,7 +258,7 @@ class Predictor(Summary):
         return outputs
 
     def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
-        """Rows that a program leaves NaN, because they lie outside of a table, by torch, to which no place is too far."""
+        """By torch what a program leaves NaN: states outside of a table."""
         bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
         given = [x[bad] for x in states]
         if kind == "linearize":
