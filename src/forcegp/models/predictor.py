@@ -73,7 +73,7 @@ class Predictor(Summary):
     any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
     `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
-    compressed; `prepare_seconds` is what preparing took, the C++ compiler included, which runs once per process.
+    compressed; `prepare_seconds` is what preparing took, the C compiler included where its work is not kept yet.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
     NumericalError where the result is not finite.
