@@ -26,7 +26,7 @@ SECONDS = 60.0
 POINTS = 100
 COULOMB = {"joint_friction": "coulomb"}
 LOAD = {**COULOMB, "friction": "coulomb"}
-FRICTION = {"tool-friction": {}, "joint-friction": COULOMB, "joint-friction+load-friction": LOAD}
+FRICTION = {"tool-friction": {}, "joint-friction": COULOMB, "joint-friction+load-friction:expected=0.3": LOAD}
 
 
 def model_of(name: str, data: Dataset) -> Callable[..., object]:
@@ -45,7 +45,7 @@ def measured() -> dict[tuple[str, int], tuple[int, float]]:
             data = farthest_rows(recording(seed, SECONDS, **FRICTION.get(name, {})), POINTS)
             search = model_of(name, data)(data).result  # type: ignore[attr-defined]  # every posterior of these has one
             found[name, seed] = search.evaluations, search.value
-            print(f"{name:30} {seed} {search.evaluations:6d} {search.value:12.3f}  {search.status}", flush=True)
+            print(f"{name:42} {seed} {search.evaluations:6d} {search.value:12.3f}  {search.status}", flush=True)
     return found
 
 
@@ -55,7 +55,7 @@ def run() -> dict[str, float]:
     medians = {}
     for name in (*GAUSSIAN_PROCESSES, *FRICTION):
         medians[name] = statistics.median(found[name, seed][0] for seed in SEEDS)
-        print(f"{name:30} median {medians[name]:6.0f} evaluations")
+        print(f"{name:42} median {medians[name]:6.0f} evaluations")
     return {"search_evaluations_n100": max(value for name, value in medians.items() if name != "gp")}
 
 

@@ -7,7 +7,7 @@ from tests.models.arm import arm_data
 
 from forcegp.inference import OptimizerOptions, minimize_objective
 from forcegp.models import IndependentGP, StructuredGP
-from forcegp.models.search import AT_ONCE, SMALL, best_value, default_options, run_restarts
+from forcegp.models.search import AT_ONCE, best_value, default_options, run_restarts
 from forcegp.parallel import Joblib, Serial
 
 UNTIL_CONVERGED = OptimizerOptions(memory=20)
@@ -25,7 +25,7 @@ def valley(parameters):
     return 10.0 * x + 5.0 * (x * (x - 4.0)) ** 2 + 50.0 * (y - x**2) ** 2
 
 
-def from_place(index, before=(), progress=None, *, options=SMALL, places=(0.5, 4.5, 5.0, -0.5, 5.5)):
+def from_place(index, before=(), progress=None, *, options, places=(0.5, 4.5, 5.0, -0.5, 5.5)):
     start = {"x": torch.tensor([places[index], 2.0], dtype=torch.float64)}
     return minimize_objective(valley, start, options, rival=best_value(before))
 
@@ -42,7 +42,7 @@ def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
 
 def test_starts_behind_those_before_are_dropped_and_say_so():
     options = OptimizerOptions(patience=5)
-    found = run_restarts(lambda *how: from_place(*how, options=options), 5, options, Serial(), None)
+    found = run_restarts(lambda index, **how: from_place(index, **how, options=options), 5, 5, Serial(), None)
     assert [each.status.startswith("dropped: 5 iterations") for each in found] == [False, False, True, False, True]
     alone = from_place(2, options=options)
     assert alone.converged
@@ -66,17 +66,16 @@ def test_who_is_compared_with_whom_does_not_depend_on_the_backend_or_the_number_
     def seen(index, before, progress):
         return index, list(before)
 
-    serial = run_restarts(seen, 5, SMALL, Serial(), None)
+    serial = run_restarts(seen, 5, 100, Serial(), None)
     assert [len(before) for _, before in serial] == [0, 0, 2, 2, 4]
-    assert serial == run_restarts(seen, 5, SMALL, Joblib(2), None)
-    assert serial[:3] == run_restarts(seen, 3, SMALL, Serial(), None)
-    assert all(before == [] for _, before in run_restarts(seen, 5, OptimizerOptions(), Serial(), None))
+    assert serial == run_restarts(seen, 5, 100, Joblib(2), None)
+    assert serial[:3] == run_restarts(seen, 3, 100, Serial(), None)
+    assert all(before == [] for _, before in run_restarts(seen, 5, 0, Serial(), None))
 
 
-@pytest.mark.parametrize("model", [StructuredGP, IndependentGP])
-def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train, model):
+def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
     how = {"points": 15, "restarts": 4, "seed": 3, "options": OptimizerOptions(iterations=25, patience=2)}
-    one, two = (model(train.system).fit(train, jobs=jobs, **how) for jobs in (1, 2))
+    one, two = (StructuredGP(train.system).fit(train, jobs=jobs, **how) for jobs in (1, 2))
     assert one.settings["restart_status"] == two.settings["restart_status"]
     assert "dropped" in str(one.settings["restart_status"])
     np.testing.assert_allclose(one.settings["restart_objective"], two.settings["restart_objective"], rtol=1e-9)

@@ -27,9 +27,6 @@ HALTED = 99
 SLOW_ITERATIONS = 5
 """Iterations over which the progress of a search is judged."""
 
-DROPPED = "dropped"
-"""How the status of a search begins that ended behind earlier starts."""
-
 SOME_FAILURES = 10
 """A line search that strays now and then meets this many points without a value at most; more of them are a wall."""
 
@@ -192,14 +189,12 @@ def minimize_objective(
 
     def after_iteration(intermediate_result: OptimizeResult) -> None:
         record(float(intermediate_result.fun), intermediate_result.x)
-        if len(history) > SLOW_ITERATIONS and (pace() < options.slow or hopeless()):
+        hopeless = options.patience and SLOW_ITERATIONS * (history[-1] - rival) > options.patience * pace()
+        if len(history) > SLOW_ITERATIONS and (pace() < options.slow or hopeless):
             raise StopIteration  # ends the search at this point
 
     def pace() -> float:
-        return history[-1 - SLOW_ITERATIONS] - history[-1]
-
-    def hopeless() -> bool:
-        return options.patience > 0 and history[-1] - rival > options.patience / SLOW_ITERATIONS * pace()
+        return history[-1 - SLOW_ITERATIONS :][0] - history[-1]
 
     if options.adam_steps:
         _adam(search, options, record)
@@ -231,7 +226,7 @@ def minimize_objective(
         status = _sentence(int(result.status), str(result.message), options)
         if result.status == HALTED and pace() >= options.slow:
             converged = False
-            status = f"{DROPPED}: {options.patience} iterations at its pace would not reach the best of earlier starts"
+            status = f"dropped: {options.patience} iterations at its pace would not reach the best of earlier starts"
         steep = bool(np.abs(search.best_slope).max() > options.gradient_tolerance)
         if result.status == LINE_SEARCH_FAILED and search.failures > failures_before:
             status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
@@ -287,6 +282,6 @@ def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float, n
 def best_of(results: list[OptimizationResult]) -> OptimizationResult:
     """The result with the lowest final value; its status holds how many searches it was chosen from."""
     chosen = min(results, key=lambda result: result.value)
-    dropped = sum(result.status.startswith(DROPPED) for result in results)
+    dropped = sum(result.status.startswith("dropped") for result in results)
     note = f"best of {len(results)} starts" + (f", {dropped} of them dropped" if dropped else "")
     return replace(chosen, status=f"{chosen.status} ({note})") if len(results) > 1 else chosen

@@ -50,8 +50,8 @@ Outcome = TypeVar("Outcome")
 
 
 AT_ONCE = 2
-"""Starts between which no start is dropped: later ones are compared with the best of those before. With one, a poor
-optimum of the first dropped all that would have ended 22 nats lower (docs/performance.md).
+"""Starts that run at once where later ones are dropped that fall behind. Behind a single poor one, others were dropped
+that end 22 nats lower (docs/performance.md).
 """
 
 SMALL = OptimizerOptions(slow=0.02, patience=100)
@@ -97,23 +97,19 @@ def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
 
 
 def run_restarts(
-    search: Callable[[int, Sequence[Outcome], FitProgress | None], Outcome],
-    restarts: int,
-    options: OptimizerOptions,
-    backend: Backend,
-    progress: FitProgress | None,
+    search: Callable[..., Outcome], restarts: int, patience: int, backend: Backend, progress: FitProgress | None
 ) -> Sequence[Outcome]:
-    """`search(0, [], progress)`, `search(1, [], progress)`, ... on a backend, on which the outcomes do not depend.
+    """`search(index, before=outcomes, progress=progress)` from 0 on, on a backend, on which outcomes do not depend.
 
-    With `options.patience` so many at once as `AT_ONCE`, each of which gets the outcomes of those before.
-    Only this process can report progress. A single search needs no other process of this machine.
+    Those before are given with `patience` only, and then `AT_ONCE` run at once. Only this process can report progress.
+    A single search needs no other process of this machine.
     """
     outcomes: list[Outcome] = []
     while len(outcomes) < restarts:
-        last = min(restarts, len(outcomes) + AT_ONCE) if options.patience else restarts
+        last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
         indices, before = range(len(outcomes), last), tuple(outcomes)
         if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
-            outcomes += [search(index, before, progress) for index in indices]
+            outcomes += [search(index, before=before, progress=progress) for index in indices]
         else:
             outcomes += backend.map(partial(search, before=before, progress=None), indices)
     return outcomes

@@ -116,7 +116,7 @@ class IndependentGP(Model):
         )
         search = _JointSearches(objectives, moments, first_start(moments, start or {}, fixed), seed, options)
         with blas_threads(len(rows)):
-            outcomes = run_restarts(search, restarts, options, workers, progress)
+            outcomes = run_restarts(search, restarts, options.patience, workers, progress)
         result = self._chosen(outcomes)
         settings = {
             **described_rows(rows, dataset),
@@ -213,7 +213,7 @@ class _JointSearches:
     seed: int
     options: OptimizerOptions
 
-    def __call__(self, index: int, before: Sequence[Outcomes] = (), progress: FitProgress | None = None) -> Outcomes:
+    def __call__(self, index: int, before: Sequence[Outcomes], progress: FitProgress | None) -> Outcomes:
         first = perturbed(self.moments, self.seed, index) if index else self.first
         outcomes: Outcomes = []
         steps = self.options.iterations + self.options.adam_steps

@@ -74,7 +74,7 @@ class Search:
         kept = replace(options, keep_iterates=True) if keep_iterates else options
         one = _OneStart(objective, moments, first, self.seed, kept)
         with blas_threads(objective.likelihood.training.q.numel()):
-            results = run_restarts(one, restarts, kept, self.backend, self.progress)
+            results = run_restarts(one, restarts, options.patience, self.backend, self.progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
@@ -110,7 +110,7 @@ class _OneStart:
     options: OptimizerOptions
 
     def __call__(
-        self, index: int, before: Sequence[OptimizationResult | FitError] = (), progress: FitProgress | None = None
+        self, index: int, before: Sequence[OptimizationResult | FitError], progress: FitProgress | None
     ) -> OptimizationResult | FitError:
         """Where it ended, or why it could not begin."""
         first = perturbed(self.moments, self.seed, index) if index else self.first
