@@ -51,7 +51,7 @@ Outcome = TypeVar("Outcome")
 
 AT_ONCE = 2
 """Starts that run at once where later ones are dropped that fall behind. Behind a single poor one, others were dropped
-that end 22 nats lower (docs/performance.md).
+that end 22 nats lower (docs/solvers.md).
 """
 
 SMALL = OptimizerOptions(slow=0.02, patience=100)
