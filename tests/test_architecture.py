@@ -21,7 +21,7 @@ PACKAGES = {
     "summary": set(),
     "atomic_files": {"errors"},
     "file_digests": {"errors"},
-    "codegen": {"errors"},
+    "codegen": {"errors", "atomic_files"},
     "parallel": {"errors"},
     "jobs": {"errors", "atomic_files", "parallel"},
     "robots": {"errors", "summary", "atomic_files", "codegen"},

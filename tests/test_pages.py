@@ -59,13 +59,13 @@ def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_pa
 
 def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    states, more, diverged, free, held = printed.splitlines()[-5:]
+    printed = run_example("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), tmp_path)
+    states, more, diverged, free, held, gradient = printed.splitlines()[-6:]
     assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
     assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
     assert diverged == "tensor([-1, -1])"
     assert float(held.split()[0]) < 0.5 * float(free.split()[0])
+    assert gradient == "torch.Size([20, 7])"
 
 
 def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):

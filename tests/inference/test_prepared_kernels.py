@@ -5,6 +5,11 @@ import torch
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from tests.inference.problems import normal, problem
 
+from forcegp.codegen.c_writer import Program, head, write_entry, write_function
+from forcegp.codegen.derivatives import jacobian
+from forcegp.codegen.graph import Graph
+from forcegp.codegen.native_code import Purpose, compile_library
+from forcegp.codegen.row_function import RowFunction, aligned
 from forcegp.inference import ExactPosterior, LatentKernels
 from forcegp.inference.prepared_kernels import PreparedKernels, SharedCenters
 
@@ -24,9 +29,9 @@ def latent() -> ExactPosterior:
     return ExactPosterior.condition(built, features, *given.data)
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["torch", "compiled"])
-def prepared(request, latent) -> PreparedKernels:
-    return PreparedKernels.of(latent, request.param)
+@pytest.fixture(scope="module")
+def prepared(latent) -> PreparedKernels:
+    return PreparedKernels.of(latent)
 
 
 def points(latent: ExactPosterior, count: int = 6) -> list[torch.Tensor]:
@@ -45,7 +50,7 @@ def test_latents_are_grouped_by_their_centers(prepared):
 
 def test_means_and_kernel_functions(latent, prepared):
     z = points(latent)
-    mean, cross = prepared.mean(prepared.inputs(z), keep=True)
+    mean, cross = prepared.mean(prepared.inputs(z))
     close(mean, latent.mean(z))
     for group, found in zip(prepared.groups, cross, strict=True):
         for place, c in enumerate(group.latents):
@@ -56,18 +61,38 @@ def test_means_and_kernel_functions(latent, prepared):
     )
 
 
-def test_slopes_are_derivatives_of_the_mean(latent, prepared):
-    """In two numbers x of which all features are affine functions."""
-    directions = [normal(3, 2, seed=90) if c in SHARED else normal(3, 2, seed=91 + c) for c in range(5)]
-    base = points(latent)
-
-    def inputs(x):
-        return prepared.inputs([z + x @ D.mT for z, D in zip(base, directions, strict=True)])
-
-    x = 0.3 * normal(6, 2, seed=99)
-    jacobians = torch.autograd.functional.jacobian(lambda y: tuple(inputs(y)), x)  # rows do not meet
-    slopes = [torch.einsum("nane->nae", part) for part in jacobians]
-    mean, found = prepared.mean_and_slopes(inputs(x), slopes)
-    close(mean, latent.mean([z + x @ D.mT for z, D in zip(base, directions, strict=True)]))
-    expected = torch.autograd.functional.jacobian(lambda y: prepared.mean(inputs(y))[0], x)
-    close(found, torch.einsum("ncne->nce", expected))
+@pytest.mark.parametrize("lanes", [1, 8])
+def test_the_sums_as_c_have_values_slopes_and_roots(latent, prepared, lanes, tmp_path):
+    """Every group in a program of its own, whose inputs are the features."""
+    purpose = Purpose("a test", "MOVE", "give up")
+    for group, part in zip(prepared.groups, prepared.sums(), strict=True):
+        graph = Graph(part.features)
+        values = part.call(graph, graph.inputs, True)
+        slopes = [node for row in jacobian(graph, values, graph.inputs) for node in row]
+        program = Program(
+            graph, {"z": part.features}, {"f": values, "J": slopes, "k": part.variance(graph, graph.inputs)}
+        )
+        text = [
+            head(lanes),
+            part.c_source(lanes, True),
+            write_function("program", graph, program.nodes, lanes, [f"{part.name}_slopes"]),
+        ]
+        options = ("-std=gnu11", "-O1", "-fno-math-errno", "-fPIC", "-shared")
+        source = "\n".join([*text, write_entry(program, "program")])
+        library = compile_library(source, options, tmp_path / f"{part.name}-{lanes}.so", "evaluate", purpose)
+        sizes = [len(x) for x in program.outputs.values()]
+        function = RowFunction(library, [part.features], sizes, [aligned(part.table())])
+        z = points(latent, 11)
+        given = z[group.latents[0]]
+        outputs = [torch.empty(11, size, dtype=torch.float64) for size in sizes]
+        assert function.rows(11, [given], outputs) == 0
+        leaf = [x.clone().requires_grad_() for x in z]
+        expected = latent.mean(leaf)[:, list(group.latents)]
+        close(outputs[0], expected)
+        close(function.single(given[3])[1][0], expected[3])
+        for place in range(len(group.latents)):
+            theirs = torch.autograd.grad(expected[:, place].sum(), leaf, retain_graph=True, allow_unused=True)
+            mine = theirs[group.latents[place]]
+            close(outputs[1].view(11, len(group.latents), -1)[:, place], mine)
+            close(function.single(given[3])[1][1].view(len(group.latents), -1)[place], mine[3])
+        close(outputs[2], torch.stack([latent.kernels.dense[c].diagonal(given) for c in group.latents], -1))

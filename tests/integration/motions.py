@@ -4,7 +4,17 @@ import torch
 from tests.models.arm import arm_system, unknown_force
 
 from forcegp.integration import ConstraintManifold
-from forcegp.mechanics import Contact, Cylinder, MechanicalSystem, Plane, Sphere
+from forcegp.mechanics import (
+    Actuation,
+    Contact,
+    Cylinder,
+    MechanicalSystem,
+    Plane,
+    RigidBodyBias,
+    Sphere,
+    StribeckJointFriction,
+)
+from forcegp.robots import Robot
 
 TOOL = (0.0, 0.0, 0.2)
 PLANE = Contact("hand", TOOL, Plane((0.2, 0.0, 1.0), 0.4))
@@ -36,3 +46,22 @@ def physics(system: MechanicalSystem):
         return dynamics.acceleration(0.03 * unknown_force(v) + system.robot.gravity_forces(q))
 
     return acceleration
+
+
+LIGHT_LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="0.1"/>
+<inertia ixx="0.003" iyy="0.003" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+LIGHT_JOINT = """<joint name="{name}" type="revolute"><origin xyz="{x} 0 0"/><parent link="{parent}"/>
+<child link="{child}"/><axis xyz="0 0 1"/><limit lower="-9" upper="9" effort="9" velocity="9"/></joint>"""
+
+
+def light_arm() -> MechanicalSystem:
+    """Two links of inertia .003 kg m^2 with dry friction that rises and falls within .1 rad/s: a stiff system."""
+    urdf = [
+        LIGHT_LINK.format(name="upper"),
+        LIGHT_LINK.format(name="fore"),
+        LIGHT_JOINT.format(name="shoulder", x=0, parent="base", child="upper"),
+        LIGHT_JOINT.format(name="elbow", x=0.2, parent="upper", child="fore"),
+    ]
+    robot = Robot.from_urdf_text('<robot name="light"><link name="base"/>' + "".join(urdf) + "</robot>")
+    stribeck = StribeckJointFriction(coulomb=0.3, static=0.4, stribeck_velocity=0.1, velocity_scale=0.1)
+    return MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), stribeck))

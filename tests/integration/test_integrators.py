@@ -4,12 +4,13 @@ import math
 
 import pytest
 import torch
-from tests.integration.motions import CONTACTS, free_system, physics, start
+from tests.integration.motions import CONTACTS, free_system, light_arm, physics, start
 from tests.models.arm import arm_system
 
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.integration import (
     ConstraintManifold,
+    ImplicitMidpoint,
     Projected,
     RungeKutta4,
     SymplecticEuler,
@@ -36,9 +37,10 @@ def observed_order(errors: list[float]) -> float:
     [
         (SymplecticEuler(), 1),
         (RungeKutta4(), 4),
+        (ImplicitMidpoint(), 2),
         (Projected(ConstraintManifold(MechanicalSystem(Robot.from_urdf_text(POINT)))), 2),
     ],
-    ids=["symplectic-euler", "rk4", "projected without contacts"],
+    ids=["symplectic-euler", "rk4", "implicit-midpoint", "projected without contacts"],
 )
 def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
     damping, q0, v0, end = 0.4, 0.7, -0.3, 2.0
@@ -53,6 +55,48 @@ def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
         motion = integrate(integrator, lambda q, v, u: -q - damping * v + u, *begin, force, end / steps)
         errors.append(abs(float(motion.q[-1]) - exact))
     assert observed_order(errors) == pytest.approx(order, abs=0.15)
+
+
+def test_implicit_midpoint_is_cayleys_transform_of_a_linear_system():
+    generator = torch.Generator().manual_seed(0)
+    K, D = (torch.randn(2, 3, 3, dtype=torch.float64, generator=generator)).unbind()
+    q, v = torch.randn(2, 4, 3, dtype=torch.float64, generator=generator).unbind()
+    step = ImplicitMidpoint().step(lambda q, v: -q @ K.mT - v @ D.mT, q, v, 0.3)
+    F = torch.cat([torch.cat([0.0 * K, torch.eye(3).double()], 1), torch.cat([-K, -D], 1)])
+    identity = torch.eye(6, dtype=torch.float64)
+    dense = torch.linalg.solve(identity - 0.15 * F, (identity + 0.15 * F) @ torch.cat([q, v], -1).mT).mT
+    assert step.found.all()
+    torch.testing.assert_close(torch.cat([step.q, step.v], -1), dense, rtol=1e-12, atol=1e-12)
+
+
+def test_implicit_midpoint_follows_stiff_friction_where_explicit_steps_fail():
+    system, n = light_arm(), 4
+    q0 = torch.linspace(-0.3, 0.3, n, dtype=torch.float64)[:, None] + torch.tensor([1.4, 0.2], dtype=torch.float64)
+    time = 0.04 * torch.arange(25, dtype=torch.float64)[:, None, None]
+    phase = torch.linspace(0.0, 2.0, n, dtype=torch.float64)[:, None] + torch.tensor([0.0, 1.0], dtype=torch.float64)
+    u = torch.tensor([0.5, 0.4], dtype=torch.float64) * torch.sin(2.0 * math.pi * time + phase)
+
+    def ends(name, finer):
+        method = integrator_named(name, system)
+        forces = u.repeat_interleave(finer, 0)
+        motion = integrate(
+            method,
+            lambda q, v, u: system.dynamics(q, v, u).acceleration_map().offset,
+            q0,
+            0.0 * q0,
+            forces,
+            0.04 / finer,
+        )
+        assert (motion.diverged_at == -1).all()
+        return motion.q[-1]
+
+    true = ends("rk4", 20)
+    error = {
+        name: float((ends(name, 1) - true).abs().max()) for name in ("symplectic-euler", "rk4", "implicit-midpoint")
+    }
+    assert error["symplectic-euler"] > 1.0  # rad, after 1 s of which the arm moved about as much
+    assert error["rk4"] > 0.4
+    assert error["implicit-midpoint"] < 0.1
 
 
 @pytest.mark.parametrize("contacts", ["plane twice", "sphere", "cylinder"])
@@ -139,5 +183,5 @@ def test_a_start_out_of_reach_is_refused_with_a_remedy():
 
 
 def test_unknown_integrators_are_named_with_those_that_exist():
-    with pytest.raises(InvalidInput, match=r"'rk5' .*'rk4'\? .* projected, rk4, symplectic-euler"):
+    with pytest.raises(InvalidInput, match=r"'rk5' .*'rk4'\? .* implicit-midpoint, projected, rk4, symplectic-euler"):
         integrator_named("rk5", arm_system())

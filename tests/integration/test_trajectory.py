@@ -7,7 +7,15 @@ import torch
 from tests.integration.motions import free_system, physics, start
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.integration import SPEED_LIMIT, ConstraintManifold, Projected, RungeKutta4, SymplecticEuler, integrate
+from forcegp.integration import (
+    SPEED_LIMIT,
+    ConstraintManifold,
+    ImplicitMidpoint,
+    Projected,
+    RungeKutta4,
+    SymplecticEuler,
+    integrate,
+)
 
 
 def column(*values: float) -> torch.Tensor:
@@ -56,6 +64,17 @@ def test_a_motion_that_leaves_its_constraint_ends_alone():
     assert motion.diverged_at.tolist() == [1, -1]
     alone = integrate(method, calm, q0[1:], v0[1:], force[:, 1:], 1 / 240)
     torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=0, atol=1e-12)
+
+
+def test_a_motion_whose_implicit_step_has_no_solution_ends_with_that_reason():
+    """Dry friction that jumps at rest has none where the motion stops."""
+    q0, v0, force = column(0.0, 0.0), column(0.05, 5.0), torch.zeros(3, 2, 1, dtype=torch.float64)
+    with pytest.warns(
+        NumericalWarning, match=r"1 of 2 .* Newton's method found no solution of the implicit step\. They"
+    ):
+        motion = integrate(ImplicitMidpoint(), lambda q, v, u: -10.0 * v.sign(), q0, v0, force, 0.04)
+    assert motion.diverged_at.tolist() == [1, -1]
+    torch.testing.assert_close(motion.v[:, 1, 0], 5.0 - 0.4 * torch.arange(4, dtype=torch.float64))
 
 
 def test_all_motions_diverging_still_give_a_trajectory():

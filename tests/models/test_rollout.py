@@ -253,3 +253,41 @@ def test_feedback_of_another_shape_is_refused(posterior, start):
     q, v, u = start
     with pytest.raises(InvalidInput, match=r"feedback .*\(3,\) at step 0.*\(2, 3\)"):
         posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: torch.zeros(3).double())
+
+
+@pytest.mark.parametrize("samples", [0, 2])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint", "projected"])
+def test_gradients_in_initial_states_and_forces_are_those_of_finite_differences(posterior, start, integrator, samples):
+    q, v, u = start
+    x = [part.clone().requires_grad_() for part in (q[:1], v[:1], u[:1, :2])]
+
+    def motion(*x):
+        rollout = posterior.rollout(*x, 0.02, integrator=integrator, samples=samples, grad=True)
+        drawn = [rollout.samples.q[..., 1:, :]] if samples else []
+        return rollout.q[:, 1:], rollout.v[:, 1:], rollout.a, rollout.constraint[:, 1:], *drawn
+
+    plain = posterior.rollout(*(part.detach() for part in x), 0.02, integrator=integrator, samples=samples)
+    torch.testing.assert_close(motion(*x)[0].detach(), plain.q[:, 1:], rtol=0, atol=1e-10)
+    assert torch.autograd.gradcheck(motion, x, fast_mode=True)
+
+
+def test_gradients_flow_through_feedback(posterior, start):
+    q, v, u = start
+    gain = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+
+    def end(gain):
+        return posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: -gain * v, grad=True).q[:, -1]
+
+    assert torch.autograd.gradcheck(end, gain, fast_mode=True)
+
+
+def test_a_gradient_is_never_dropped_in_silence(posterior, start):
+    arguments = dict(zip(("q0", "v0", "u"), start, strict=True))
+    for name in arguments:
+        changed = {**arguments, name: arguments[name].clone().requires_grad_()}
+        with pytest.raises(InvalidInput, match=rf"{name} requires a gradient.* give grad=True, or {name}\.detach\(\)"):
+            posterior.rollout(**changed, dt=DT)
+        with torch.no_grad():  # asked for without a graph on purpose
+            assert not posterior.rollout(**changed, dt=DT).q.requires_grad
+    with pytest.raises(InvalidInput, match="grad is a str; give a bool"):
+        posterior.rollout(**arguments, dt=DT, grad="yes")

@@ -51,7 +51,7 @@ class Rollout(Command):
     system: SystemChoice = "model"
     """Robot and contacts to roll out: model, those that it was trained with; data, those of the recording."""
     integrator: Annotated[str, arg(metavar="NAME")] = "symplectic-euler"
-    """symplectic-euler (as in PyBullet), rk4, or projected (contacts hold exactly)."""
+    """symplectic-euler (as in PyBullet), rk4, implicit-midpoint (stiff friction), projected (contacts hold exactly)."""
     baumgarte: Annotated[str, arg(metavar="OMEGA[,ZETA]|none")] = "none"
     """Stabilisation of the contacts in the rollout, rad/s and damping ratio (default 1)."""
     samples: Annotated[int, arg(metavar="N")] = 0

@@ -74,7 +74,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     starts: Annotated[int, arg(metavar="N")] = 5
     """Motions from every held-out stretch of time."""
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
-    """Of these motions: rk4, symplectic-euler or projected."""
+    """Of these motions: rk4, symplectic-euler, implicit-midpoint or projected."""
     restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
     """Starts of every search for hyper-parameters; the best is kept."""
     iterations: Annotated[int | None, arg(metavar="N", constructor=int, help_behavior_hint="(default: 200)")] = None

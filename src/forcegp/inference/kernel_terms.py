@@ -119,27 +119,48 @@ def _scaled(kernel: Kernel, z: Tensor) -> Tensor:
     return z / cast(Tensor, kernel.lengthscale).reshape(-1)
 
 
+GRID = 4096
+"""Points at which a Matern 1/2 is drawn. Between them, h length scales apart, its variance is tanh(h / 2) too small."""
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnTerm:
-    """S functions of one term; `weights` are those of its columns, or those of cosines and of sines for each column."""
+    """S functions of one term; `weights` are those of its columns, or those of cosines and of sines for each column.
+
+    A Matern 1/2 has frequencies without bound. Of one input it is drawn at the points of an even `grid` instead, which
+    reaches 3 length scales beyond the centres; `weights` are its values there, and elsewhere it is their expectation.
+    """
 
     term: KernelTerm
     frequencies: tuple[Float[Tensor, "S _ P"], ...]
-    weights: tuple[Float[Tensor, "S p"]] | tuple[Float[Tensor, "S p P"], Float[Tensor, "S p P"]]
+    weights: tuple[Float[Tensor, "S p"]] | tuple[Float[Tensor, "S p P"]] | tuple[Tensor, Tensor]
+    grid: Float[Tensor, " P"] | None = None
 
     @classmethod
     def draw(
-        cls, term: KernelTerm, point: Float[Tensor, "1 d"], samples: int, count: int, generator: torch.Generator
+        cls, term: KernelTerm, centers: Float[Tensor, "N d"], samples: int, count: int, generator: torch.Generator
     ) -> DrawnTerm:
-        """`count` frequencies for each function; `point` is any one, for its number of features."""
-        columns = term.columns(point).shape[-1]
-        frequencies = tuple(
-            factor.frequencies((samples, factor.embedding(point).shape[-1], count), generator)
-            for factor in term.factors
-        )
+        """`count` frequencies for each function."""
+        columns = term.columns(centers[:1]).shape[-1]
+        embedded = [factor.embedding(centers) for factor in term.factors]
         options = {"generator": generator, "dtype": torch.float64, "device": generator.device}
-        if not frequencies:
+        if not embedded:
             return cls(term, (), (torch.randn(samples, columns, **options),))
+        if [(factor.shape, factor.power) for factor in term.factors] == [(0.5, -0.5)] and embedded[0].shape[-1] == 1:
+            from scipy.signal import lfilter  # half a second, which only drawing should cost
+
+            low, high = float(embedded[0].min()) - 3.0, float(embedded[0].max()) + 3.0
+            grid = torch.linspace(low, high, GRID, dtype=torch.float64, device=generator.device)
+            # an Ornstein-Uhlenbeck process: each value is the last one, less what decays, plus news
+            decay, news = math.exp(-(high - low) / (GRID - 1)), math.sqrt(-math.expm1(-2.0 * (high - low) / (GRID - 1)))
+            numbers = torch.randn(samples, columns, GRID, **options)
+            numbers[..., 0] /= news
+            values = lfilter([news], [1.0, -decay], numbers.cpu().numpy())
+            return cls(term, (), (torch.as_tensor(values, device=generator.device),), grid)
+        frequencies = tuple(
+            factor.frequencies((samples, e.shape[-1], count), generator)
+            for factor, e in zip(term.factors, embedded, strict=True)
+        )
         cosines, sines = torch.randn(2, samples, columns, count, **options) / math.sqrt(count)
         return cls(term, frequencies, (cosines, sines))
 
@@ -148,6 +169,14 @@ class DrawnTerm:
         weights = [given[samples] for given in self.weights]
         count = len(weights[0])
         columns = self.term.columns(z).unflatten(0, (count, -1))  # S m p
+        if self.grid is not None:
+            e, h = self.term.factors[0].embedding(z).unflatten(0, (count, -1)).mT, self.grid[1] - self.grid[0]
+            left = ((e - self.grid[0]) / h).clamp(0, len(self.grid) - 2).long()
+            at = (e - self.grid[left]).clamp(torch.zeros_like(h), h)
+            ends = [weights[0].gather(2, (left + k).expand(-1, weights[0].shape[1], -1)) for k in (0, 1)]
+            between = ((h - at).sinh() * ends[0] + at.sinh() * ends[1]) / h.sinh()
+            beyond = (-(e - self.grid[left] - at).abs()).exp()
+            return (columns.mT * beyond * between).sum(1)
         if not self.frequencies:
             return (columns @ weights[0][..., None])[..., 0]
         phase = sum(

@@ -9,7 +9,8 @@ centres z_j of the posterior, whose weights `LatentPosterior.function_weights` f
 with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
 many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
 approximate, and the better the more cosines there are. Where all kernels are squared exponentials, all latents are one
-batched operation (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`).
+batched operation (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`). A
+Matern 1/2 of one input has too high frequencies for cosines and is drawn on a grid (`kernel_terms.DrawnTerm`).
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class StackedKernels:
         """k_c(z, z_j) for points from `scaled`."""
         squares = scaled.square().sum(-1)[..., :, None] + self.training.square().sum(-1)[..., None, :]
         distance = torch.baddbmm(squares, scaled, self.training.mT, alpha=-2.0).clamp_min_(0.0)
-        return distance.mul_(-0.5).exp_().mul_(self.variances[:, None, None])
+        return distance.mul_(-0.5).exp_() * self.variances[:, None, None]  # not in place: exp needs its result
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +143,15 @@ class FunctionSamples:
         prior = _cosines(points, self.frequencies, self.amplitudes)
         return prior.movedim(1, -1) + update.permute(1, 2, 0)
 
+    def one(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "S n"]:
+        """All functions of one latent at the same points."""
+        kernels, own, d = self.kernels, slice(index, index + 1), z.shape[-1]
+        kernels = StackedKernels(
+            kernels.lengthscales[own], kernels.variances[own], kernels.centers[own, :, :d], kernels.training[own, :, :d]
+        )
+        alone = FunctionSamples(kernels, self.frequencies[:, own, :d], self.amplitudes[:, :, own], self.beta[:, own])
+        return alone([z.expand(len(self.beta), -1, -1)])[..., 0]
+
 
 @dataclass(frozen=True, eq=False)
 class ComposedSamples:
@@ -164,10 +174,7 @@ class ComposedSamples:
         with torch.no_grad():
             generator = torch.Generator(device=latent.features[0].device).manual_seed(seed)
             terms = tuple(
-                tuple(
-                    DrawnTerm.draw(term, z.new_zeros(1, z.shape[-1]), samples, frequencies, generator)
-                    for term in kernel_terms(kernel)
-                )
+                tuple(DrawnTerm.draw(term, z, samples, frequencies, generator) for term in kernel_terms(kernel))
                 for kernel, z in zip(latent.kernels, latent.features, strict=True)
             )
             prior = [
@@ -178,15 +185,17 @@ class ComposedSamples:
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
         """Every function at points of its own: f_s,c(z_s,i)."""
-        columns = []
-        for c, (kernel, z, training) in enumerate(
-            zip(self.latent.kernels.dense, features, self.latent.features, strict=True)
-        ):
-            flat = z.flatten(0, 1)
-            cross = kernel.cross(flat, training).unflatten(0, z.shape[:2])
-            update = (cross @ self.beta[c][..., None])[..., 0]
-            columns.append(self.widening * _sum(self.terms[c], flat, slice(None)) + update)
-        return torch.stack(columns, dim=-1)
+        return torch.stack([self._at(index, z) for index, z in enumerate(features)], dim=-1)
+
+    def one(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "S n"]:
+        """All functions of one latent at the same points."""
+        return self._at(index, z.expand(len(self.beta[index]), -1, -1))
+
+    def _at(self, index: int, z: Float[Tensor, "S n d"]) -> Float[Tensor, "S n"]:
+        flat = z.flatten(0, 1)
+        cross = self.latent.kernels.dense[index].cross(flat, self.latent.features[index]).unflatten(0, z.shape[:2])
+        update = (cross @ self.beta[index][..., None])[..., 0]
+        return self.widening * _sum(self.terms[index], flat, slice(None)) + update
 
 
 def draw_functions(

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.inference.compiled_kernels import CompiledSums
 from forcegp.inference.dense_kernels import DenseKernel
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
+from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.posterior import LatentPosterior
 
 
@@ -32,6 +32,7 @@ class SharedCenters:
     precisions: Float[Tensor, "G d"]  # 1 / l^2
     variances: Float[Tensor, " G"]
     own: Float[Tensor, "G N"]  # log s - 1/2 |z_j / l|^2
+    own_centers: Float[Tensor, "N d"]  # as they are in the posterior
 
     @classmethod
     def of(
@@ -40,7 +41,7 @@ class SharedCenters:
         """`scales` are the length scales and the variance of every latent."""
         precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])
         variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])
-        shift = centers.mean(0)
+        given, shift = centers, centers.mean(0)
         centers = centers - shift  # or what cancels would be large
         return cls(
             latents,
@@ -49,6 +50,7 @@ class SharedCenters:
             precisions,
             variances,
             variances.log()[:, None] - 0.5 * precisions @ centers.square().mT,
+            given,
         )
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n _"]:
@@ -66,6 +68,22 @@ class SharedCenters:
     def diagonal(self, inputs: Float[Tensor, "n _"]) -> Float[Tensor, "n G"]:
         """k_c(z_i, z_i)."""
         return self.variances.expand(len(inputs), -1)
+
+    def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, "1 G"]:
+        """k_c(z, z_j) - s_c from the features themselves: with long length scales k is nearly s, and sums cancel."""
+        z, center = z - self.shift, center - self.shift
+        scaled = z * self.precisions
+        own = -0.5 * (self.precisions * center.square()).sum(-1)
+        return self.variances * (((scaled * center).sum(-1) + own) - 0.5 * (scaled * z).sum(-1)).expm1()
+
+    @property
+    def level(self) -> tuple[float, ...]:
+        """What `pair` leaves out."""
+        return tuple(self.variances.tolist())
+
+    def variances_at(self, z: Float[Tensor, "1 d"]) -> Float[Tensor, "1 G"]:
+        """k_c(z, z)."""
+        return self.variances[None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +106,24 @@ class AnyKernel:
         """k(z_i, z_i)."""
         return self.kernel.diagonal(inputs)[:, None]
 
+    def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, "1 1"]:
+        """k(z, z_j)."""
+        return self.kernel.cross(z, center)
+
+    @property
+    def own_centers(self) -> Float[Tensor, "N d"]:
+        """As they are in the posterior."""
+        return self.centers
+
+    @property
+    def level(self) -> tuple[float, ...]:
+        """What `pair` leaves out."""
+        return (0.0,)
+
+    def variances_at(self, z: Float[Tensor, "1 d"]) -> Float[Tensor, " 1"]:
+        """k(z, z)."""
+        return self.kernel.diagonal(z)
+
 
 KernelGroup = SharedCenters | AnyKernel
 
@@ -99,63 +135,32 @@ class PreparedKernels:
     groups: tuple[KernelGroup, ...]
     weights: tuple[Float[Tensor, "_ _"], ...]
     order: Tensor | None
-    compiled: tuple[CompiledSums | None, ...]
 
     @classmethod
-    def of(cls, latent: LatentPosterior, compile: bool) -> PreparedKernels:
-        """Prepared once for a posterior. With `compile`, raises CompilerError without a C++ compiler."""
+    def of(cls, latent: LatentPosterior) -> PreparedKernels:
+        """Prepared once for a posterior."""
         groups = kernel_groups(latent)
         weights = tuple(torch.stack([latent.weights[c].detach() for c in group.latents]) for group in groups)
         order = [c for group in groups for c in group.latents]
         back = None if order == sorted(order) else torch.tensor(order).argsort().to(weights[0].device)
-        compiled = tuple(
-            CompiledSums(group.centers, group.own, w) if compile and isinstance(group, SharedCenters) else None
-            for group, w in zip(groups, weights, strict=True)
-        )
-        return cls(groups, weights, back, compiled)
+        return cls(groups, weights, back)
+
+    def sums(self) -> tuple[KernelSum, ...]:
+        """The groups as C functions. Raises InvalidInput for a kernel that cannot be traced."""
+        found = []
+        for k, (group, weights) in enumerate(zip(self.groups, self.weights, strict=True)):
+            given = (group.own_centers, weights, group.pair, group.variances_at, group.level)
+            found.append(KernelSum.of(f"latents{k}", group.latents, *given))
+        return tuple(found)
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "n _"]]:
         """What the kernels need of the features of all latents, group by group."""
         return [group.inputs(features) for group in self.groups]
 
-    def mean(
-        self, inputs: Sequence[Float[Tensor, "n _"]], keep: bool = False
-    ) -> tuple[Float[Tensor, "n C"], list[Float[Tensor, "n _ _"]]]:
-        """E f_c, and with `keep` the kernel functions of every group about its centres."""
-        found = [self._group_mean(number, x, keep) for number, x in enumerate(inputs)]
-        return self.ordered([f for f, _ in found]), [cross for _, cross in found if cross is not None]
-
-    def _group_mean(self, number: int, inputs: Tensor, keep: bool) -> tuple[Tensor, Tensor | None]:
-        compiled = self.compiled[number]
-        if compiled is not None and not (torch.is_grad_enabled() and inputs.requires_grad):
-            return compiled(inputs, keep)
-        cross = self.groups[number].cross(inputs)
-        return (cross * self.weights[number]).sum(-1), cross
-
-    def mean_and_slopes(
-        self, inputs: Sequence[Float[Tensor, "n _"]], slopes: Sequence[Float[Tensor, "n _ x"]]
-    ) -> tuple[Float[Tensor, "n C"], Float[Tensor, "n C x"]]:
-        """E f_c and its derivatives in whatever the inputs have the derivatives `slopes` in."""
-        means, parts = [], []
-        for number, (x, slope) in enumerate(zip(inputs, slopes, strict=True)):
-            f, gradient = self._group_gradient(number, x)
-            means.append(f)
-            parts.append((gradient[..., None, :] @ slope.view(*gradient.shape, slope.shape[-1]))[..., 0, :])
-        return self.ordered(means), self.ordered(parts)
-
-    def _group_gradient(self, number: int, inputs: Tensor) -> tuple[Float[Tensor, "n G"], Float[Tensor, "n G _"]]:
-        """E f_c of a group and its derivatives in the inputs that belong to it."""
-        group, weights = self.groups[number], self.weights[number]
-        if isinstance(group, SharedCenters):
-            f, cross = self._group_mean(number, inputs.detach(), True)
-            assert cross is not None, "it was to be kept"
-            # the exponent is linear in the inputs, with z_j and 1 as slopes
-            return f, torch.cat([(cross * weights) @ group.centers, f[..., None]], dim=-1)
-        with torch.enable_grad():
-            leaf = inputs.detach().requires_grad_()
-            f, _ = self._group_mean(number, leaf, False)
-            (gradient,) = torch.autograd.grad(f.sum() + 0.0 * leaf.sum(), leaf)  # a constant kernel does not use it
-        return f.detach(), gradient[:, None]
+    def mean(self, inputs: Sequence[Float[Tensor, "n _"]]) -> tuple[Float[Tensor, "n C"], list[Float[Tensor, "n _ _"]]]:
+        """E f_c, and the kernel functions of every group about its centres."""
+        cross = [group.cross(x) for group, x in zip(self.groups, inputs, strict=True)]
+        return self.ordered([(k * w).sum(-1) for k, w in zip(cross, self.weights, strict=True)]), cross
 
     def diagonal(self, inputs: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
         """Prior variances."""

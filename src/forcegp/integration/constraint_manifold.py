@@ -58,14 +58,17 @@ class ConstraintManifold:
         q = torch.where(given_finite[:, None], q, 0.0)
         kinematics = self.system.robot.kinematics(q)
         inverse_lower = self._inverse_lower(kinematics)
-        iteration = 0
+        iteration, differentiable = 0, torch.is_grad_enabled() and q.requires_grad
         while True:
             c, A, slope = self._constraint(kinematics)
             on_surface = (c.abs() <= POSITION_TOLERANCE * slope).all(-1)
             finite = torch.isfinite(A).all(-1).all(-1) & torch.isfinite(c).all(-1) & given_finite
             moving = ~on_surface & finite
             if iteration == MOST_ITERATIONS or not bool(moving.any()):
-                return ProjectedPosition(q, A, inverse_lower, on_surface & finite, iteration)
+                if not differentiable:
+                    return ProjectedPosition(q, A, inverse_lower, on_surface & finite, iteration)
+                # one step more, of rounding's size: without one, a q on the surface would have the derivative 1
+                moving, differentiable = on_surface & finite, False
             A_white = torch.where(finite[:, None, None], A @ inverse_lower.mT, 0.0)
             white = _pseudo_inverse(A_white) @ torch.where(finite[:, None], c, 0.0)[..., None]
             q = torch.where(moving[:, None], q - (inverse_lower.mT @ white)[..., 0], q)

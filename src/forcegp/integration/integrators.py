@@ -1,4 +1,4 @@
-"""One step of time: symplectic Euler, classical Runge-Kutta, and a projected scheme that stays on the constraint.
+"""One step of time: symplectic Euler, Runge-Kutta, implicit midpoint, and a scheme that stays on the constraint.
 
 An integrator asks for accelerations a(q, v) wherever they come from; actuator forces are constant
 over the step. All states are batched, (n, nv).
@@ -6,9 +6,11 @@ over the step. All states are batched, (n, nv).
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +19,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.integration.constraint_manifold import ConstraintManifold
+from forcegp.integration.newton import find_roots
 from forcegp.mechanics import MechanicalSystem
 
 Acceleration = Callable[[Tensor, Tensor], Tensor]
@@ -25,16 +28,19 @@ Acceleration = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The state after one step, the acceleration at its beginning, and whether the constraint could be met."""
+    """The state after one step, the acceleration at its beginning, and whether there is such a state (`failure`)."""
 
     q: Float[Tensor, "n nv"]
     v: Float[Tensor, "n nv"]
     a: Float[Tensor, "n nv"]
-    on_constraint: Bool[Tensor, " n"]
+    found: Bool[Tensor, " n"]
 
 
 class Integrator(ABC):
     """A one-step method for q'' = a(q, q')."""
+
+    failure: ClassVar[str] = ""
+    """Why a step can have no end, for a warning."""
 
     def start(
         self, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"]
@@ -76,6 +82,23 @@ class RungeKutta4(Integrator):
 
 
 @dataclass(frozen=True, eq=False)
+class ImplicitMidpoint(Integrator):
+    """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
+
+    Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method, for
+    which torch has to be able to differentiate the acceleration.
+    """
+
+    failure = "Newton's method found no solution of the implicit step"
+
+    @override
+    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
+        half = 0.5 * dt
+        middle, found = find_roots(lambda at: at - v - half * acceleration(q + half * at, at), v)
+        return Step(q + dt * middle, 2.0 * middle - v, acceleration(q, v), found)
+
+
+@dataclass(frozen=True, eq=False)
 class Projected(Integrator):
     """A RATTLE-like scheme of second order: after every step c(q) = 0 to 1e-12 m and A v = 0 to rounding.
 
@@ -86,6 +109,7 @@ class Projected(Integrator):
     """
 
     manifold: ConstraintManifold
+    failure = "no position on the surfaces of the contacts near the predicted one"
 
     @override
     def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,6 +131,7 @@ class Projected(Integrator):
 INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
     "symplectic-euler": lambda system: SymplecticEuler(),
     "rk4": lambda system: RungeKutta4(),
+    "implicit-midpoint": lambda system: ImplicitMidpoint(),
     "projected": lambda system: Projected(ConstraintManifold(system)),
 }
 """Integrators by the name that rollouts and the command line use."""
@@ -117,6 +142,12 @@ def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
     if not isinstance(name, str) or name not in INTEGRATORS:
         raise InvalidInput(unknown_name_message("integrator", str(name), "forcegp", INTEGRATORS, cutoff=0.4))
     return INTEGRATORS[name](system)
+
+
+def check_time_step(dt: Any) -> None:
+    """Raise InvalidInput for what is no positive number."""
+    if isinstance(dt, bool) or not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
+        raise InvalidInput(f"dt is {dt!r}; give the time step as a positive number of seconds.")
 
 
 def _all(q: Tensor) -> Tensor:

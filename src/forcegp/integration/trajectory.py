@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.integration.integrators import Acceleration, Integrator
+from forcegp.integration.integrators import Acceleration, Integrator, check_time_step
 
 SPEED_LIMIT = 100.0
 """A motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast."""
@@ -31,13 +31,14 @@ class Trajectory:
     """n motions of T steps: q, v (T+1, n, nv) and a (T, n, nv), the acceleration at the beginning of each step.
 
     `diverged_at` (n,) is the first row of q and v that does not exist (NaN from there on), -1 for a motion that lasted
-    to the end.
+    to the end; `not_found` marks those that the integrator could not carry on.
     """
 
     q: Float[Tensor, "rows n nv"]
     v: Float[Tensor, "rows n nv"]
     a: Float[Tensor, "steps n nv"]
     diverged_at: Int[Tensor, " n"]
+    not_found: Bool[Tensor, " n"]
 
 
 def integrate(
@@ -57,50 +58,52 @@ def integrate(
     Like u, what the feedback adds is constant over a step (a zero-order hold), whatever states the integrator visits
     on the way: so it is asked once per step, of finite states only.
 
-    A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that cannot be kept on its
-    constraint, ends there: the rest of it is NaN, `diverged_at` holds the row, and a NumericalWarning is given. The
-    others go on. `acceleration` is called with finite states only. `what` names the motions in the warning,
-    `progress(step, steps)` is called after every step.
+    A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that the integrator cannot carry on
+    (`Integrator.failure`), ends there: the rest of it is NaN, `diverged_at` holds the row, and a NumericalWarning is
+    given. The others go on. `acceleration` is called with finite states only. `what` names the motions in the warning,
+    `progress(step, steps)` is called after every step. Differentiable in q0, v0, u and what `feedback` adds.
     Raises InvalidInput where `dt` is no positive number or a start is faster than the limit.
     """
-    if not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
-        raise InvalidInput(f"dt is {dt!r}; give the time step as a positive number of seconds.")
+    check_start(v0, dt)
+    q, v = integrator.start(q0, v0)
+    steps, n = u.shape[:2]
+    rows_q, rows_v, rows_a = [q], [v], []  # stacked in the end, which keeps the graph where there is one
+    diverged_at = torch.full((n,), -1, dtype=torch.int64, device=q.device)
+    not_found = torch.zeros(n, dtype=torch.bool, device=q.device)
+    alive = torch.ones(n, dtype=torch.bool, device=q.device)
+    for k in range(steps):
+        forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
+        step = integrator.step(_at_finite_states(_under(acceleration, forces), q, v), q, v, dt)
+        rows_a.append(torch.where(alive[:, None], step.a, math.nan))
+        bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
+        good = alive & bounded & step.found
+        if not bool(good.all()):
+            ended = alive & ~good
+            diverged_at[ended] = k + 1
+            not_found |= ended & ~step.found
+            alive = good
+        # A motion that has ended stays where it last was: there its acceleration can be computed.
+        q, v = torch.where(good[:, None], step.q, q), torch.where(good[:, None], step.v, v)
+        for rows, x in ((rows_q, q), (rows_v, v)):
+            rows.append(torch.where(good[:, None], x, math.nan))
+        if not bool(alive.any()):
+            for rows in (rows_q, rows_v, rows_a):
+                rows += [torch.full_like(q, math.nan)] * (steps - k - 1)
+            break
+        if progress is not None:
+            progress(k + 1, steps)
+    warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
+    return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at, not_found)
+
+
+def check_start(v0: Tensor, dt: float) -> None:
+    """Raise InvalidInput where `dt` is no positive number or a start is faster than the limit."""
+    check_time_step(dt)
     if bool((v0.abs() > SPEED_LIMIT).any()):
         raise InvalidInput(
             f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
             "m/s counts as diverged, check its units."
         )
-    q, v = integrator.start(q0, v0)
-    steps, n = u.shape[:2]
-    rows_q, rows_v = (x.new_full((steps + 1, *x.shape), math.nan) for x in (q, v))
-    rows_a = torch.full_like(u, math.nan)
-    rows_q[0], rows_v[0] = q, v
-    diverged_at = torch.full((n,), -1, dtype=torch.int64, device=q.device)
-    off_constraint = torch.zeros(n, dtype=torch.bool, device=q.device)
-    alive = torch.ones(n, dtype=torch.bool, device=q.device)
-    for k in range(steps):
-        forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
-        step = integrator.step(_at_finite_states(_under(acceleration, forces), q, v), q, v, dt)
-        rows_a[k] = torch.where(alive[:, None], step.a, math.nan)
-        bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
-        good = alive & bounded & step.on_constraint
-        if not bool(good.all()):
-            ended = alive & ~good
-            diverged_at[ended] = k + 1
-            off_constraint |= ended & ~step.on_constraint
-            alive = good
-            # A motion that has ended stays where it last was: there its acceleration can be computed.
-            q, v = torch.where(good[:, None], step.q, q), torch.where(good[:, None], step.v, v)
-            rows_q[k + 1, good], rows_v[k + 1, good] = q[good], v[good]
-            if not bool(alive.any()):
-                break
-        else:
-            q, v = step.q, step.v
-            rows_q[k + 1], rows_v[k + 1] = q, v
-        if progress is not None:
-            progress(k + 1, steps)
-    _warn_of_divergence(diverged_at, off_constraint, dt, what)
-    return Trajectory(rows_q, rows_v, rows_a, diverged_at)
 
 
 def _under(acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], forces: Tensor) -> Acceleration:
@@ -120,17 +123,16 @@ def _at_finite_states(acceleration: Acceleration, q0: Tensor, v0: Tensor) -> Acc
     return guarded
 
 
-def _warn_of_divergence(diverged_at: Tensor, off_constraint: Tensor, dt: float, what: str) -> None:
+def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, failure: str, dt: float, what: str) -> None:
+    """A NumericalWarning of those that ended."""
     ended = diverged_at >= 0
     if not bool(ended.any()):
         return
     first = int(diverged_at[ended].min())
-    lost = int(off_constraint.sum())
+    lost = int(not_found.sum())
     cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
     if lost:
-        cause = "no position on the surfaces of the contacts near the predicted one" + (
-            f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else ""
-        )
+        cause = failure + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")
     warnings.warn(
         f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
         f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model with more physics "

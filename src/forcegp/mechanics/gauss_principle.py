@@ -127,6 +127,13 @@ class ConstrainedDynamics:
         """a = M^-1 Q_b + H (Q_K + Q_U) in rad/s^2 or m/s^2."""
         return self.acceleration_map()(Q_U)
 
+    def acceleration_under(self, Q: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch nv"]:
+        """a = M^-1 Q_b + H Q for all joint forces Q, without H: a few products of a matrix and a vector."""
+        white = self.inverse_lower @ Q[..., None]
+        rows = self.A @ self.inverse_lower.mT
+        change = self.pseudo_inverse @ (self.b[..., None] - rows @ white)
+        return (self.inverse_lower.mT @ (white + change))[..., 0]
+
     def multiplier(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch m"]:
         """lambda = (A M^-1 A^T)^+ (b - A M^-1 (Q_K + Q_U)); the constraint force is A^T lambda."""
         return self.multiplier_map()(Q_U)

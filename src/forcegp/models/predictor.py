@@ -1,28 +1,37 @@
 """`Predictor`: a posterior prepared for control rates, where a prediction is due every millisecond.
 
-Rigid-body terms, constraints, prior and features become one tape (`codegen.tape_tracing`), kernel functions are
-evaluated for all processes at once, weights are kept, and the covariance uses few combinations of the data
-(`inference.compressed_covariance`). `structured.predictor_preparation` makes one.
+Rigid-body terms, constraints, prior, features and processes become one C program (`predictor_code`), and the covariance
+uses few combinations of the data (`inference.compressed_covariance`). `structured.predictor_preparation` makes one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.codegen.native_code import require_plain
+from forcegp.codegen.row_function import NOT_FINITE, RowFunction
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.models.predictor_terms import EagerTerms, PredictorTerms, TapedTerms
-from forcegp.robots.real_numbers import real_tensor, require_finite
+from forcegp.integration import integrate
+from forcegp.integration.integrators import check_time_step, integrator_named
+from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
+from forcegp.models.prediction import Gaussian
+from forcegp.models.predictor_code import PredictorCode, TermsFunction
+from forcegp.models.rollout import by_sample, checked_start
+from forcegp.models.structured.components import Components
+from forcegp.models.structured.inverse_dynamics import inverse_dynamics
+from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
 from forcegp.summary import Summary
 
 INSTEAD_OF_TRANSFORMS = (
@@ -30,7 +39,7 @@ INSTEAD_OF_TRANSFORMS = (
     "compile=False"
 )
 BLOCK_NUMBERS = 2**18
-"""Kernel values that are worked on at once: 2 MiB, so that they stay in the processor's cache."""
+"""Kernel values that torch works on at once: 2 MiB, so that they stay in the processor's cache."""
 
 
 class Linearization(NamedTuple):
@@ -40,6 +49,18 @@ class Linearization(NamedTuple):
     da_dq: Tensor
     da_dv: Tensor
     da_du: Tensor
+
+
+class Motions(NamedTuple):
+    """q, v (..., T+1, nv) in rad and rad/s (m and m/s), a (..., T, nv) in rad/s^2 (m/s^2), as in a `Rollout`.
+
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    """
+
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    diverged_at: Tensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,11 +85,18 @@ class Predictor(Summary):
     device: torch.device
     latent: LatentPosterior
     prepared: PreparedKernels
-    tape: TapedTerms | EagerTerms
+    terms: TermsFunction
+    code: PredictorCode | None
     kind: str
     compressed: CompressedCovariance | None
     widening: float
     prepare_seconds: float
+    posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
+    _functions: dict[str, RowFunction] = field(default_factory=dict)
+    _loops: dict[tuple[str, int, int], list[FusedLoop] | None] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_functions": {}, "_loops": {}}  # loaded code means nothing in another process
 
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
@@ -87,8 +115,14 @@ class Predictor(Summary):
 
     def mean(self, q: Any, v: Any, u: Any) -> Tensor:
         """The mean acceleration (nv,) or (n, nv) in rad/s^2 or m/s^2."""
-        x, single = self._rows(q, v, u)
-        return _finished([self._mean(self.tape(part))[0] for part in self._blocks(x)], single)
+        if self.code is not None and all(_is_plain(x, self.nv) for x in (q, v, u)):
+            return self._at_one("mean", q, v, u)[0]
+        states, single = self._states(q, v, u)
+        if self.code is None:
+            return _finished([self._mean(*part)[0] for part in self._blocks(states)], single)
+        if torch.is_grad_enabled() and any(x.requires_grad for x in states):
+            return _finished([_Mean.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
+        return _single(self.run("mean", states)[0], single)
 
     def __call__(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor]:
         """Mean (nv,) and covariance (nv, nv) of the acceleration, or (n, nv) and (n, nv, nv); without noise.
@@ -97,76 +131,261 @@ class Predictor(Summary):
         """
         if self.kind == "none":
             raise InvalidInput("this predictor has no covariance; make it with covariance='compressed' or 'exact'.")
-        x, single = self._rows(q, v, u)
+        nv, compiled = self.nv, self.code is not None and self.kind == "compressed" and bool(self.code.sums)
+        if compiled and all(_is_plain(x, nv) for x in (q, v, u)):
+            a, covariance = self._at_one("covariance", q, v, u)
+            return a, covariance.view(nv, nv)
+        states, single = self._states(q, v, u)
+        if compiled and not (torch.is_grad_enabled() and any(x.requires_grad for x in states)):
+            a, covariance = self.run("covariance", states)
+            return _single(a, single), _single(covariance.view(-1, nv, nv), single)
         means, covariances = [], []
-        for part in self._blocks(x):
-            terms = self.tape(part)
-            mean, cross = self._mean(terms, keep=self.kind == "compressed")
+        for part in self._blocks(states):
+            mean, W, inputs, features, cross = self._mean(*part)
             means.append(mean)
-            covariances.append(terms.W @ self._covariance(terms, cross) @ terms.W.mT)
+            covariances.append(W @ self._covariance(W, inputs, features, cross) @ W.mT)
         return _finished(means, single), _finished(covariances, single)
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
         """The mean acceleration and its Jacobians in q, v and u, without a graph."""
-        x, single = self._rows(q, v, u)
-        require_plain([x], "linearize", "take derivatives of `mean` instead, of a predictor with compile=False")
-        parts = [self._linearize(part.detach()) for part in self._blocks(x)]
+        nv = self.nv
+        if self.code is not None and all(_is_plain(x, nv) for x in (q, v, u)):
+            a, jacobian = self._at_one("linearize", q, v, u)
+            return Linearization(a, *jacobian.view(nv, 3 * nv).split(nv, dim=-1))
+        states, single = self._states(q, v, u)
+        require_plain(states, "linearize", "take derivatives of `mean` instead, of a predictor with compile=False")
+        states = [x.detach() for x in states]
+        if self.code is not None:
+            a, jacobian = self.run("linearize", states)
+            jacobian = _single(jacobian.view(-1, nv, 3 * nv), single)
+            return Linearization(_single(a, single), *jacobian.split(nv, dim=-1))
+        parts = [self._linearize(part) for part in self._blocks(states)]
         a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
-        return Linearization(a, *jacobian.split(self.nv, dim=-1))
+        return Linearization(a, *jacobian.split(nv, dim=-1))
 
-    def _mean(self, terms: PredictorTerms, keep: bool = False) -> tuple[Tensor, list[Tensor]]:
-        if not terms.W.shape[-1]:
-            return terms.offset, []
-        f, cross = self.prepared.mean(terms.inputs, keep)
-        return terms.offset + (terms.W @ f[..., None])[..., 0], cross
+    def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
+        """The state (q, v) `dt` seconds later under constant u, each (nv,) or (n, nv); differentiable as `mean`.
 
-    def _covariance(self, terms: PredictorTerms, cross: list[Tensor]) -> Tensor:
+        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/rollouts.md), which is differentiable
+        once. Raises InvalidInput for "projected", other names and a dt that is no positive number, NumericalError where
+        an implicit step is not found.
+        """
+        states, single = self._states(q, v, u)
+        state = stepped(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
+        q, v = (state[0] if single else state).split(self.nv, dim=-1)
+        return q, v
+
+    def linearize_step(
+        self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
+    ) -> StepLinearization:
+        """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph."""
+        states, single = self._states(q, v, u)
+        linear = linearized_step(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
+        return StepLinearization(*(part[0] for part in linear)) if single else linear
+
+    def rollouts(
+        self,
+        q0: Any,
+        v0: Any,
+        u: Any,
+        dt: float,
+        *,
+        integrator: str = "symplectic-euler",
+        functions: int = 0,
+        seed: int = 0,
+        threads: int | None = None,
+    ) -> Motions:
+        """Motions from q0, v0 (..., nv) under forces u (..., T, nv), with batches that broadcast.
+
+        As `posterior.rollout` with the predictor's own system: rad, rad/s, Nm and s (m, m/s, N); what diverges is NaN
+        from the row `diverged_at` on. Under the mean, or with `functions` once under each of so many functions drawn
+        from the posterior, which then are the first dimension. A compiled predictor steps many motions at once, without
+        Python in between, on `threads` threads (None: as many as torch has). Without a graph.
+        Raises InvalidInput for arguments that do not fit.
+        """
+        most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
+        functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
+        start, v, forces, batch = checked_start(
+            self.nv, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
+        )
+        method = integrator_named(integrator, self.posterior.system)
+        check_time_step(dt)
+        how = integrator, functions, seed
+        loops, acceleration = self._loops.get(how), self.mean
+        if loops is None and self.code is not None and integrator in STEPS:
+            loops = self._loops[how] = self.code.loops(integrator, self.latent, functions, seed)
+        if functions:
+            model = self.posterior.accelerations(self.posterior.system.baumgarte)
+
+            def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
+                return by_sample(model.sampled(functions, seed), functions)(q, v, u)
+
+            start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
+            batch = (functions, *batch)
+        with torch.no_grad():
+            if loops is None:
+                motion = integrate(method, acceleration, start, v, forces, dt)
+            else:
+                motion = fused(loops, method, acceleration, start, v, forces, dt, most)
+        q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), self.nv) for x in (motion.q, motion.v, motion.a))
+        return Motions(q, v, a, motion.diverged_at.reshape(batch))
+
+    def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
+        """Unknown force, multipliers, contact force and every component of the prior, with exact covariances."""
+        self._states(q, v, u)
+        return self.posterior.components(q, v, u, covariance=covariance)
+
+    def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
+        """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
+
+        u = M a + h - A^T lambda - Q_U with the known forces -h: friction under load is that of this lambda, which
+        `normal_force` (m,) or (n, m) gives in N, positive where the surface pushes the robot off, as in
+        `predict(...).multiplier`; None is 0. The covariance is that of Q_U at u, to first order, and None for a
+        predictor without one. `a` has to obey A a = b, else the contacts change it. Results have no graph.
+        Raises InvalidInput for models without analytical mean or actuation, NumericalError where no u is found.
+        """
+        states, single = self._states(q, v, a, "qva")
+        found = inverse_dynamics(self.posterior, torch.cat(states, dim=-1), normal_force, self.kind != "none")
+        return found[0] if single else found
+
+    def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
+        """The outputs (n, size) of a compiled program at states (n, nv) that were checked."""
+        function, count = self._function(kind), len(states[0])
+        states = [x.detach().contiguous() for x in states]
+        outputs = [torch.empty(count, size, dtype=torch.float64) for size in function.outputs]
+        if function.rows(count, states, outputs):
+            self._repair(kind, states, outputs)
+        return outputs
+
+    def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
+        """Rows that a program leaves NaN, because they lie outside of a table, by torch, to which no place is too far."""
+        bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
+        given = [x[bad] for x in states]
+        if kind == "linearize":
+            found = self._linearize(given)
+        else:
+            mean, W, *latents = self._mean(*given)
+            found = (mean,) if kind == "mean" else (mean, W @ self._covariance(W, *latents) @ W.mT)
+        for output, rows in zip(outputs, found, strict=True):
+            output[bad] = _finished([rows], False).reshape(len(bad), -1)
+
+    def _at_one(self, kind: str, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+        """The same at one state that needs no conversion, whose numbers are checked on the way."""
+        require_plain((q, v, u), "a compiled predictor", INSTEAD_OF_TRANSFORMS)
+        bits, outputs = self._function(kind).single(q, v, u)
+        if bits & NOT_FINITE:
+            raise InvalidInput("q, v or u has values that are not finite; drop or repair those rows.")
+        if bits:
+            self._repair(kind, [q[None], v[None], u[None]], [x[None] for x in outputs])
+        return outputs
+
+    def _function(self, kind: str) -> RowFunction:
+        found = self._functions.get(kind)
+        if found is None:
+            assert self.code is not None, "asked for by callers that have checked it"
+            found = self._functions[kind] = self.code.function(kind)
+        return found
+
+    def _mean(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], list[Tensor]]:
+        """By torch: the mean, W, what the kernels need, the features, and the kernel functions."""
+        offset, W, *features = self.terms(q, v, u)
+        if not W.shape[-1]:
+            return offset, W, [], features, []
+        inputs = self.prepared.inputs(features)
+        f, cross = self.prepared.mean(inputs)
+        return offset + (W @ f[..., None])[..., 0], W, inputs, features, cross
+
+    def _covariance(self, W: Tensor, inputs: list[Tensor], features: list[Tensor], cross: list[Tensor]) -> Tensor:
         """Of the latents, (n, C, C)."""
-        if not terms.W.shape[-1]:
-            return terms.W.new_zeros(len(terms.W), 0, 0)
+        if not W.shape[-1]:
+            return W.new_zeros(len(W), 0, 0)
         if self.compressed is None:
-            return self.widening**2 * self.latent.covariance(terms.features)
+            return self.widening**2 * self.latent.covariance(features)
         P = self.prepared.ordered(self.compressed.roots(cross))
-        return self.widening**2 * (torch.diag_embed(self.prepared.diagonal(terms.inputs)) - P @ P.mT)
+        return self.widening**2 * (torch.diag_embed(self.prepared.diagonal(inputs)) - P @ P.mT)
 
-    def _linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        terms, slopes = self.tape.with_jacobians(x)
-        if not terms.W.shape[-1]:
-            return terms.offset, slopes.offset
-        f, df = self.prepared.mean_and_slopes(terms.inputs, slopes.inputs)
-        a = terms.offset + (terms.W @ f[..., None])[..., 0]
-        return a, slopes.offset + (f[:, None, None] @ slopes.W)[:, :, 0] + terms.W @ df
+    def _linearize(self, states: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        with torch.enable_grad():
+            leaves = [x.clone().requires_grad_() for x in states]
+            a = self._mean(*leaves)[0]
+            rows = [
+                torch.autograd.grad(a[:, i].sum(), leaves, retain_graph=True, materialize_grads=True)
+                for i in range(self.nv)
+            ]
+        return a.detach(), torch.stack([torch.cat(row, dim=-1) for row in rows], dim=1)
 
-    def _rows(self, q: Any, v: Any, u: Any) -> tuple[Tensor, bool]:
-        """One row [q, v, u] per state, and whether it was a single state."""
-        states = [real_tensor(name, x, self.device) for name, x in zip("qvu", (q, v, u), strict=True)]
-        shape = states[0].shape
+    def _states(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[list[Tensor], bool]:
+        """q, v and u as rows (n, nv), and whether it was a single state."""
+        states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
+        shape, named = states[0].shape, f"q, v or {names[2]}"
         if shape[-1:] != (self.nv,) or len(shape) > 2 or any(x.shape != shape for x in states):
-            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", states, strict=True))
+            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
             raise InvalidInput(
                 f"a predictor was given {shapes}; give all three ({self.nv},) for one state or (n, {self.nv})."
             )
         if any(x.device.type != self.device.type for x in states):
-            raise InvalidInput(f"q, v or u is on another device than the predictor; move all three to {self.device}.")
-        x = torch.cat(states, dim=-1)
-        if isinstance(self.tape, TapedTerms):
-            require_plain([x], "a compiled predictor", INSTEAD_OF_TRANSFORMS)
-        require_finite("q, v or u", x)
-        return (x[None], True) if len(shape) == 1 else (x, False)
+            raise InvalidInput(f"{named} is on another device than the predictor; move all three to {self.device}.")
+        if self.code is not None:
+            require_plain(states, "a compiled predictor", INSTEAD_OF_TRANSFORMS)
+        for x in states:
+            require_finite(named, x)
+        single = len(shape) == 1
+        return [x[None] if single else x for x in states], single
 
-    def _blocks(self, x: Tensor) -> Sequence[Tensor]:
-        return (x,) if len(x) <= self._block_rows else x.split(self._block_rows)
+    def _blocks(self, states: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
+        return list(zip(*(x.split(self._block_rows) if len(x) else (x,) for x in states), strict=True))
 
     @cached_property
     def _block_rows(self) -> int:
         return max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
 
 
+NO_RESULT = (
+    "the predicted acceleration is not finite: the mass matrix is singular there, or a surface has no normal; "
+    "MechanicalSystem.check_states names the row and the contact."
+)
+
+
+class _Mean(torch.autograd.Function):
+    """The mean of a compiled predictor, whose backward pass takes the Jacobians of its linearisation."""
+
+    @staticmethod
+    @override
+    def forward(ctx: Any, predictor: Predictor, *states: Tensor) -> Tensor:
+        ctx.predictor = predictor
+        ctx.save_for_backward(*states)
+        return predictor.run("mean", states)[0]
+
+    @staticmethod
+    @override
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
+            raise InvalidInput(
+                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
+            )
+        nv = ctx.predictor.nv
+        jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 3 * nv)
+        return None, *(grad_outputs[0][:, None] @ jacobian)[:, 0].split(nv, dim=-1)
+
+
+def _is_plain(x: object, nv: int) -> bool:
+    """Whether x is one state that needs neither conversion nor a graph."""
+    return (
+        type(x) is Tensor
+        and x.shape == (nv,)
+        and x.dtype is torch.float64
+        and not x.requires_grad
+        and x.is_cpu
+        and x.is_contiguous()
+    )
+
+
+def _single(values: Tensor, single: bool) -> Tensor:
+    return values[0] if single else values
+
+
 def _finished(blocks: list[Tensor], single: bool) -> Tensor:
     values = blocks[0] if len(blocks) == 1 else torch.cat(blocks)
     if not math.isfinite(float(values.detach().sum())):
-        raise NumericalError(
-            "the predicted acceleration is not finite: the mass matrix is singular there, or a surface has no normal; "
-            "MechanicalSystem.check_states names the row and the contact."
-        )
-    return values[0] if single else values
+        raise NumericalError(NO_RESULT)
+    return _single(values, single)

@@ -227,6 +227,7 @@ class Posterior(Summary, ABC):
         feedback: Feedback | None = None,
         samples: int = 0,
         seed: int = 0,
+        grad: bool = False,
         progress: Callable[[int, int], None] | None = None,
     ) -> Rollout:
         """Where the robot goes from (q0, v0) under the forces u: the integrated mean acceleration.
@@ -236,8 +237,9 @@ class Posterior(Summary, ABC):
         q0, v0: initial states (..., nv) in rad and rad/s (m and m/s), any batch.
         u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast.
         dt: time step in s.
-        integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order) or "projected"
-            (second order; contacts hold exactly after every step, also in the first state, which is moved onto them).
+        integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order),
+            "implicit-midpoint" (second order, for stiff friction) or "projected" (second order; contacts hold exactly
+            after every step, also in the first state, which is moved onto them).
         baumgarte: stabilisation in this rollout, instead of the one in `system`; None for none.
         feedback: a controller that adds to u: feedback(k, q, v) -> (..., nv) in Nm or N, asked once at the beginning of
             step k and constant until k + 1, with the batch dimensions of the motions (those of q0, for sampled motions
@@ -245,14 +247,16 @@ class Posterior(Summary, ABC):
             robot lets them.
         samples: also integrate this many functions drawn from the posterior, by pathwise conditioning; `seed` draws
             them.
+        grad: keep the graph, so that the result can be differentiated once in q0, v0, u and what `feedback` adds.
+            Memory grows with the number of steps.
         progress: called as progress(step, steps).
 
         A motion that diverges is NaN from then on, `Rollout.diverged_at` holds the row, and a NumericalWarning is
-        given. Raises InvalidInput for arguments that do not fit, NumericalError where the initial state cannot be
-        projected.
+        given. Raises InvalidInput for arguments that do not fit, among them tensors that require a gradient without
+        `grad`, NumericalError where the initial state cannot be projected.
         """
         model = self.accelerations(baumgarte)
-        how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed}
+        how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed, "grad": grad}
         return roll_out(model, q0, v0, u, dt, **how, progress=progress)
 
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:

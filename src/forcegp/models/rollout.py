@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
-from forcegp.integration import ConstraintManifold, Feedback, Trajectory, integrate, integrator_named
+from forcegp.errors import CompilerError, InvalidInput, NumericalWarning, require_type
+from forcegp.integration import ConstraintManifold, Feedback, integrate, integrator_named
 from forcegp.mechanics import Baumgarte, MechanicalSystem
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
 from forcegp.models.search import blas_threads
 from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
 
+STEPS_TO_COMPILE = 2000
+"""Steps of some milliseconds each; fewer are done before a program is compiled."""
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
@@ -38,6 +43,9 @@ class AccelerationModel:
     baumgarte: Baumgarte | None
     mean: Callable[[], AccelerationFunction]
     sampled: Callable[[int, int], AccelerationFunction]
+    compiled: Callable[[str, int, int], list[FusedLoop] | None] | None = None
+    """(integrator, samples, seed) -> loops over the functions that `sampled` draws, or with 0 samples over the mean, as
+    machine code; None where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,79 +118,66 @@ def roll_out(
     feedback: Feedback | None = None,
     samples: int = 0,
     seed: int = 0,
+    grad: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rollout:
     """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model.system)
-    q, v, forces, batch = _checked_start(model, q0, v0, u)
-    runs = _Runs(model, integrator, dt)
+    require_type("grad", grad, bool)
+    robot = model.system.robot
+    q, v, forces, batch = checked_start(robot.nv, robot.device, q0, v0, u, None if grad else "give grad=True")
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
-    with torch.no_grad(), blas_threads(0):
-        report = None if progress is None else lambda done, _: progress(done, total)
-        control = None if feedback is None else _flat_feedback(feedback, batch)
-        mean = integrate(method, model.mean(), q, v, forces, dt, feedback=control, what="rollouts", progress=report)
-        drawn = None
-        if samples:
-            later = None if progress is None else lambda done, _: progress(steps + done, total)
-            function = _by_sample(model.sampled(samples, seed), samples)
-            many = q.repeat(samples, 1), v.repeat(samples, 1)
-            repeated = forces.repeat(1, samples, 1)
-            control = None if feedback is None else _flat_feedback(feedback, (samples, *batch))
-            sampled = integrate(
-                method,
-                function,
-                *many,
-                repeated,
-                dt,
-                feedback=control,
-                what="sampled rollouts",
-                progress=later,
-            )
-            drawn = runs.rollout(sampled, many[0], many[1], (samples, *batch), None)
-        return runs.rollout(mean, q, v, batch, drawn)
 
+    counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
 
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """What the mean and the sampled motions of one rollout have in common."""
-
-    model: AccelerationModel
-    integrator: str
-    dt: float
-
-    def rollout(
-        self, motion: Trajectory, q0: Tensor, v0: Tensor, batch: Sequence[int], samples: Rollout | None
-    ) -> Rollout:
-        """The value with the caller's batch dimensions in front of time."""
-
-        def shaped(rows: Tensor) -> Tensor:
-            return rows.movedim(0, 1).reshape(*batch, rows.shape[0], rows.shape[-1])
-
-        q, v = shaped(motion.q), shaped(motion.v)
-        c, rate = self._violation(q, v)
-        change = [(after[0] - before).abs().amax(-1) for after, before in ((motion.q, q0), (motion.v, v0))]
-        return Rollout(
-            time=self.dt * torch.arange(motion.q.shape[0], dtype=q.dtype, device=q.device),
-            q=q,
-            v=v,
-            a=shaped(motion.a),
-            constraint=c,
-            velocity_constraint=rate,
-            initial_correction=torch.stack(change, dim=-1).reshape(*batch, 2),
-            diverged_at=motion.diverged_at.reshape(tuple(batch)),
-            integrator=self.integrator,
-            baumgarte=self.model.baumgarte,
-            samples=samples,
+    def run(function: AccelerationFunction, copies: tuple[int, ...], what: str, before: int) -> Rollout:
+        shape, count = (*copies, *batch), math.prod(copies)
+        start = q.repeat(count, 1), v.repeat(count, 1)
+        control = None if feedback is None else _flat_feedback(feedback, shape)
+        report = None if counted is None else counted(before)
+        given = (method, function, *start, forces.repeat(1, count, 1), dt)
+        loops = None
+        if feedback is None and not grad:
+            loops = _loops(model, integrator, steps, math.prod(copies) if copies else 0, seed)
+        if loops is None:
+            motion = integrate(*given, feedback=control, what=what, progress=report)
+        else:
+            motion = fused(loops, *given, torch.get_num_threads(), what)
+            if report is not None:
+                report(steps, steps)
+        q_rows, v_rows, a_rows = (
+            x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
         )
+        blocks = zip(*(x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q_rows, v_rows)), strict=True)
+        parts = zip(*(ConstraintManifold(model.system).violation(*block) for block in blocks), strict=True)
+        c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
+        change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
+        correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
+        time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
+        moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
+        return Rollout(time, *moved, integrator, model.baumgarte)
 
-    def _violation(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        manifold = ConstraintManifold(self.model.system)
-        flat = [x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q, v)]
-        parts = [manifold.violation(*block) for block in zip(*flat, strict=True)]
-        c, rate = (torch.cat(part).reshape(*q.shape[:-1], -1) for part in zip(*parts, strict=True))
-        return c, rate
+    with torch.set_grad_enabled(grad), blas_threads(0):
+        mean = run(model.mean(), (), "rollouts", 0)
+        if samples:
+            sampled = by_sample(model.sampled(samples, seed), samples)
+            mean = replace(mean, samples=run(sampled, (samples,), "sampled rollouts", steps))
+        return mean
+
+
+def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, seed: int) -> list[FusedLoop] | None:
+    """Compiled loops, where motions are long enough to be worth compiling them."""
+    if model.compiled is None or integrator not in STEPS or steps * max(1, samples) < STEPS_TO_COMPILE:
+        return None
+    try:
+        return model.compiled(integrator, samples, seed)
+    except CompilerError as error:
+        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=5)
+    except InvalidInput:  # an operation that no program holds, another device
+        pass
+    return None
 
 
 def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
@@ -199,7 +194,7 @@ def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
     return flat
 
 
-def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
+def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
     """A function of (samples, n, nv) as one of (samples * n, nv)."""
 
     def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
@@ -208,17 +203,23 @@ def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunc
     return flat
 
 
-def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions."""
-    robot = model.system.robot
-    given = {
-        name: real_tensor(name, values, robot.device).detach().to(robot.device)
-        for name, values in (("q0", q0), ("v0", v0), ("u", u))
-    }
+def checked_start(
+    nv: int, device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
+) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
+    """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions.
+
+    Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
+    """
+    given = {name: real_tensor(name, values, device).to(device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
     for name, values in given.items():
+        if values.requires_grad and torch.is_grad_enabled() and remedy is not None:
+            raise InvalidInput(
+                f"{name} requires a gradient, which a rollout drops unless asked to keep it; {remedy}, or "
+                f"{name}.detach()."
+            )
         least = 2 if name == "u" else 1
-        if values.dim() < least or values.shape[-1] != robot.nv:
-            wanted = f"(..., T, {robot.nv})" if name == "u" else f"(..., {robot.nv})"
+        if values.dim() < least or values.shape[-1] != nv:
+            wanted = f"(..., T, {nv})" if name == "u" else f"(..., {nv})"
             raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
         require_finite(name, values)
     q, v, forces = given.values()
@@ -232,6 +233,6 @@ def _checked_start(model: AccelerationModel, q0: Any, v0: Any, u: Any) -> tuple[
         raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q0 and v0 per motion.") from None
     if not batch.numel():
         raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
-    q, v = (x.expand(*batch, -1).reshape(-1, robot.nv) for x in (q, v))
-    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, robot.nv).movedim(1, 0).contiguous()
+    q, v = (x.expand(*batch, -1).reshape(-1, nv) for x in (q, v))
+    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, nv).movedim(1, 0).contiguous()
     return q, v, forces, batch

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +11,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.codegen.library import default_folder
 from forcegp.codegen.native_code import require_plain
+from forcegp.codegen.row_function import NOT_POSITIVE, RowFunction
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
-from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch
-from forcegp.robots.compiled_programs import CompiledProgram, compiled_program, default_folder
-from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, INERTIA_ENTRIES, Request
+from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, check_mapping
+from forcegp.robots.compiled_programs import compiled_program
+from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, MERGED, Request
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
 
 INSTEAD_OF_TRANSFORMS = (
     "use batch dimensions and backward passes, or the robot itself (compiled.robot), whose results are the same"
 )
-ROWS, COLUMNS = (list(entries) for entries in zip(*INERTIA_ENTRIES, strict=True))
 
 
 class CompiledRobot:
@@ -33,7 +36,7 @@ class CompiledRobot:
     forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
 
     A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
-    ``folder`` (``~/.cache/forcegp/dynamics`` by default) holds them already; :meth:`prepare` does so ahead. Code from
+    ``folder`` (``~/.cache/forcegp/compiled`` by default) holds them already; :meth:`prepare` does so ahead. Code from
     that folder runs with the rights of the process. Several states are computed at once, and large batches by as many
     threads as torch has.
 
@@ -49,7 +52,7 @@ class CompiledRobot:
         self.robot = robot
         self.folder = default_folder() if folder is None else Path(folder).expanduser()
         self._unrolled = UnrolledRobot(robot)
-        self._programs: dict[Request, CompiledProgram] = {}
+        self._programs: dict[Request, RowFunction] = {}
 
     def __reduce__(self) -> tuple[type[CompiledRobot], tuple[RobotStructure, Path]]:
         return CompiledRobot, (self.robot, self.folder)
@@ -111,7 +114,7 @@ class CompiledRobot:
 
     # ------------------------------------------------------------------ inside
 
-    def program(self, request: Request) -> CompiledProgram:
+    def program(self, request: Request) -> RowFunction:
         """The machine code of a request."""
         found = self._programs.get(request)
         if found is None:
@@ -119,14 +122,19 @@ class CompiledRobot:
         return found
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
+        nv, given = self.robot.nv, tuple(arguments.values())
+        if not inertials and all(_is_single(x, nv) for x in given):
+            require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
+            bits, found = self.program(Request(function)).single(*given)
+            if bits & NOT_POSITIVE:
+                raise NumericalError(NOT_POSITIVE_DEFINITE)
+            return _shaped(found, (), function, nv)
         arguments = {name: self.robot.checked_input(name, value) for name, value in arguments.items()}
         shapes = {name: value.shape[:-1] for name, value in arguments.items()}
         tensors = list(arguments.values())
         if inertials:
-            bodies = self.robot.body_inertias(inertials)  # (nv, 4, 4, *own)
-            own = bodies.shape[3:]
-            tensors.append(bodies[:, ROWS, COLUMNS].flatten(0, 1).movedim(0, -1))
-            shapes["inertials"] = own
+            tensors.append(self._merged(inertials))
+            shapes["inertials"] = tensors[-1].shape[:-1]
         require_plain(tensors, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
         batch = broadcast_batch(shapes)
         flat = [
@@ -135,56 +143,83 @@ class CompiledRobot:
             else value.expand(*batch, -1).reshape(batch.numel(), value.shape[-1]).contiguous()
             for position, value in enumerate(tensors)
         ]
-        request = Request(function, bool(inertials))
+        results = self._run(Request(function, bool(inertials)), batch.numel(), flat)
+        return _shaped(results, batch, function, self.robot.nv)
+
+    def _merged(self, inertials: Inertials) -> Tensor:
+        """The inertias of the bodies (..., 10 nv) from the parameters of links."""
+        check_mapping(inertials)
+        for name in inertials:
+            self.robot.layout.require_moving(name, self.robot.name)
+        given = [self.robot.checked_parameters(name, values) for name, values in inertials.items()]
+        require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
+        named = zip(inertials, given, strict=True)
+        own = broadcast_batch({f"inertials[{name!r}]": values.shape[:-1] for name, values in named})
+        joined = torch.cat([values.expand(*own, 10) for values in given], dim=-1).reshape(own.numel(), -1)
+        (found,) = self._run(Request(MERGED, links=tuple(inertials)), own.numel(), [joined])
+        return found.reshape(*own, -1)
+
+    def _run(self, request: Request, count: int, flat: list[Tensor]) -> tuple[Tensor, ...]:
         if torch.is_grad_enabled() and any(value.requires_grad for value in flat):
-            results = _Value.apply(self, request, *flat)
-        else:
-            results = run(self, request, batch.numel(), flat)
-        nv = self.robot.nv
-        dimensions = DIMENSIONS.get(function, (1,))
-        return tuple(x.reshape(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True))
+            return _Value.apply(self, request, count, *flat)  # type: ignore[return-value]  # torch does not type `apply`
+        return run(self, request, count, flat)
+
+
+def _is_single(x: object, nv: int) -> bool:
+    """Whether x is one state that needs neither checks nor a graph."""
+    return (
+        type(x) is Tensor
+        and x.shape == (nv,)
+        and x.dtype is torch.float64
+        and not x.requires_grad
+        and x.is_cpu
+        and x.is_contiguous()
+    )
+
+
+def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:
+    dimensions = DIMENSIONS.get(function, (1,))
+    return tuple(x.reshape(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True))
 
 
 def run(owner: CompiledRobot, request: Request, count: int, tensors: list[Tensor]) -> tuple[Tensor, ...]:
     """Results of a request, (count, size) each, from its inputs in order."""
-    nv = owner.robot.nv
-    q = tensors[0]
-    inputs = dict(zip(request.inputs, tensors, strict=True)) | {"sin q": q.sin(), "cos q": q.cos()}
+    program = owner.program(request)
     if request.is_value:
-        sizes = zip(request.results, (nv**d for d in DIMENSIONS.get(request.function, (1,))), strict=True)
-        outputs = {name: q.new_empty(count, size) for name, size in sizes}
+        outputs = tuple(torch.empty(count, size, dtype=torch.float64) for size in program.outputs)
     else:
-        outputs = {name: torch.empty_like(inputs[name]) for name in request.wanted}
-    if not owner.program(request)(count, inputs, outputs):
+        inputs = dict(zip(request.inputs, tensors, strict=True))
+        outputs = tuple(torch.empty_like(inputs[name]) for name in request.wanted)
+    if program.rows(count, tensors, outputs) & NOT_POSITIVE:
         raise NumericalError(NOT_POSITIVE_DEFINITE)
-    return tuple(outputs.values())
+    return outputs
 
 
 class _Value(torch.autograd.Function):
     """A function of the robot; its backward pass is the program of its derivatives."""
 
     @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, request: Request, *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.owner, ctx.request = owner, request
+    def forward(ctx: Any, owner: CompiledRobot, request: Request, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.owner, ctx.request, ctx.count = owner, request, count
         ctx.save_for_backward(*tensors)
-        return run(owner, request, len(tensors[0]), list(tensors))
+        return run(owner, request, count, list(tensors))
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        needed = dict(zip(ctx.request.inputs, ctx.needs_input_grad[2:], strict=True))
+        needed = dict(zip(ctx.request.inputs, ctx.needs_input_grad[3:], strict=True))
         inertias = needed.pop("inertias", False)
-        request = Request(ctx.request.function, ctx.request.free_inertias, any(needed.values()), inertias)
+        request = replace(ctx.request, states=any(needed.values()), inertias=inertias)
         tensors = *ctx.saved_tensors, *(cotangent.contiguous() for cotangent in cotangents)
-        found = dict(zip(request.wanted, _Derivative.apply(ctx.owner, request, *tensors), strict=True))
-        return None, None, *(found.get(name) for name in ctx.request.inputs)
+        found = dict(zip(request.wanted, _Derivative.apply(ctx.owner, request, ctx.count, *tensors), strict=True))
+        return None, None, None, *(found.get(name) for name in ctx.request.inputs)
 
 
 class _Derivative(torch.autograd.Function):
     """Derivatives of a function of the robot, which have none themselves."""
 
     @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, request: Request, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return run(owner, request, len(tensors[0]), list(tensors))
+    def forward(ctx: Any, owner: CompiledRobot, request: Request, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return run(owner, request, count, list(tensors))
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:

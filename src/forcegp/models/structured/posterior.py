@@ -26,15 +26,17 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
+from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
+from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.predictor import Predictor
-from forcegp.models.predictor_terms import TermsFunction
+from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
@@ -42,7 +44,7 @@ from forcegp.models.structured.components import Components, Curve, Latents, com
 from forcegp.models.structured.definition import StructuredModel
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.measured_torque import plus, second_moments, shrunk, without_force_noise
-from forcegp.models.structured.predictor_preparation import prepared_predictor
+from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
@@ -118,7 +120,7 @@ class StructuredPosterior(Posterior):
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
-        latents = self._latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
 
         def through(affine: AffineMap) -> Gaussian:
             return latents.through(affine.matrix @ B, affine.offset)
@@ -143,7 +145,7 @@ class StructuredPosterior(Posterior):
             return affine, None
         return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
-    def _latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
         """All processes at a batch of states."""
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.model.prior.features(dynamics))
@@ -181,24 +183,8 @@ class StructuredPosterior(Posterior):
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        return prepared_predictor(self.latent, self.widening, self.training, self._terms_function, **how)
-
-    def _terms_function(self, prepared: PreparedKernels, features: bool) -> TermsFunction:
-        """The terms of a predictor as a function of the state, differentiable, by the same code as `predict`.
-
-        Without `features` that list of them stays empty.
-        """
-        system, prior, known = self.system, self.model.prior, self.model.mean == "analytical"
-        inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
-        standardize = self.likelihood.standardization
-
-        def terms(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-            dynamics = system.dynamics(q, v, u, inertials)
-            affine, given = dynamics.acceleration_map(known), standardize(prior.features(dynamics))
-            joined = [affine.offset, affine.matrix @ prior.mixing(dynamics), *prepared.inputs(given)]
-            return [*joined, *given] if features else joined
-
-        return terms
+        physics = self._physics(self.system)
+        return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
 
     @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
@@ -210,7 +196,7 @@ class StructuredPosterior(Posterior):
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
-        latents = self._latents(dynamics, covariance)
+        latents = self.latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 
     @override
@@ -349,7 +335,26 @@ class StructuredPosterior(Posterior):
                 return mean()
             return through(draw_functions(self.latent, samples, seed, self.widening))
 
-        return AccelerationModel(system, baumgarte, mean, sampled)
+        noise = self.model.noise
+        if noise is not None and noise.measured_torque:  # whose accelerations are shrunk
+            return AccelerationModel(system, baumgarte, mean, sampled)
+
+        def compiled(integrator: str, samples: int, seed: int) -> list[FusedLoop] | None:
+            return self._code(system).loops(integrator, self.latent, samples, seed)
+
+        return AccelerationModel(system, baumgarte, mean, sampled, compiled)
+
+    def _code(self, system: MechanicalSystem) -> PredictorCode:
+        """Programs of the mean in a system."""
+        prepared = PreparedKernels.of(self.latent)
+        example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
+        calls = latent_calls(self.latent, prepared, None)
+        return PredictorCode.of(self._physics(system).traced, example, calls, None, self.widening)
+
+    def _physics(self, system: MechanicalSystem) -> PredictorPhysics:
+        inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
+        model, standardization = self.model, self.likelihood.standardization
+        return PredictorPhysics(system, model.prior, model.mean == "analytical", inertials, standardization)
 
     def at_iteration(self, iteration: int) -> StructuredPosterior:
         """The posterior as it was after that iteration of the search (0: the start), its system included.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -13,11 +14,14 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference.compressed_covariance import CompressedCovariance, Sample, compress
+from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.predictor import Predictor
-from forcegp.models.predictor_terms import EagerTerms, TapedTerms, TermsFunction
-from forcegp.models.training_data import TrainingData
+from forcegp.models.predictor_code import PredictorCode, TermsFunction
+from forcegp.models.training_data import Standardization, TrainingData
+from forcegp.priors import ForcePrior
 
 COVARIANCES = ("auto", "compressed", "exact", "none")
 SAMPLES, CHECKS = 300, 150
@@ -25,15 +29,39 @@ SAMPLES, CHECKS = 300, 150
 STEP = 0.3
 """Length of a step away from a training state, in differences of two others."""
 
-TermsOf = Callable[[PreparedKernels, bool], TermsFunction]
-"""(kernels, whether to give the prepared features, too) -> the terms as a function of the state."""
+
+@dataclass(frozen=True, eq=False)
+class PredictorPhysics:
+    """The physics of a predictor, differentiable, by the same code as `predict`."""
+
+    system: MechanicalSystem
+    prior: ForcePrior
+    analytical: bool
+    inertials: Mapping[str, Tensor] | None
+    standardization: Standardization
+
+    def terms(self, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+        """[offset, W, features of every process ...] with a = offset + W f."""
+        dynamics = self.system.dynamics(q, v, u, self.inertials)
+        affine = dynamics.acceleration_map(self.analytical)
+        return [affine.offset, affine.matrix @ self.prior.mixing(dynamics), *self._features(dynamics)]
+
+    def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
+        """[a, W, features ...]: what programs are written from, with few operations to differentiate."""
+        dynamics = self.system.dynamics(q, v, u, self.inertials)
+        B = self.prior.mixing(dynamics)
+        Q = (B @ f[..., None])[..., 0] + (dynamics.Q_K if self.analytical else 0.0)
+        return [dynamics.acceleration_under(Q), dynamics.H @ B, *self._features(dynamics)]
+
+    def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:
+        return list(self.standardization(self.prior.features(dynamics)))
 
 
 def prepared_predictor(
     latent: LatentPosterior,
     widening: float,
     training: TrainingData,
-    terms_of: TermsOf,
+    physics: PredictorPhysics,
     *,
     covariance: str,
     tolerance: float,
@@ -53,37 +81,40 @@ def prepared_predictor(
     nv, device = training.q.shape[-1], training.q.device
     if covariance == "auto":
         covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
-    prepared = PreparedKernels.of(latent, compile)
-    function, groups = terms_of(prepared, covariance == "exact"), len(prepared.groups)
-    example = [x[:1] for x in (training.q, training.v, training.u)]
-    terms = TapedTerms(function, example, groups) if compile else EagerTerms(function, nv, groups)
+    prepared = PreparedKernels.of(latent)
     compressed = None
-    if covariance == "compressed" and groups:
+    if covariance == "compressed" and prepared.groups:
         if not isinstance(latent, ExactPosterior):
             raise InvalidInput(
                 "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        eager = EagerTerms(terms_of(prepared, True), nv, groups)
-        compressed = _compressed(latent, training, prepared, eager, tolerance, largest_rank)
+        compressed = _compressed(latent, training, prepared, physics.terms, tolerance, largest_rank)
+    code = None
+    if compile:
+        example = [x[:1] for x in (training.q, training.v, training.u)]
+        code = PredictorCode.of(
+            physics.traced, example, latent_calls(latent, prepared, compressed), compressed, widening
+        )
+        code.function("mean" if compressed is None else "covariance")
     seconds = time.perf_counter() - begin
-    return Predictor(nv, device, latent, prepared, terms, covariance, compressed, widening, seconds)
+    return Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, seconds)
 
 
 def _compressed(
     latent: ExactPosterior,
     training: TrainingData,
     prepared: PreparedKernels,
-    terms: EagerTerms,
+    terms: TermsFunction,
     tolerance: float,
     largest_rank: int,
 ) -> CompressedCovariance:
     def sample(count: int, seed: int) -> Sample:
         with torch.no_grad():
-            at = terms(torch.cat(sample_states(training, count, seed), dim=-1))
-        usable = torch.isfinite(at.W).flatten(1).all(1)  # no state of its own has a surface without a normal
-        return Sample([z[usable] for z in at.features], at.W[usable])
+            _, W, *features = terms(*sample_states(training, count, seed))
+        usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
+        return Sample([z[usable] for z in features], W[usable])
 
     latents = [group.latents for group in prepared.groups]
     found = compress(latent, latents, sample(SAMPLES, 0), sample(CHECKS, 1), tolerance=tolerance, largest=largest_rank)

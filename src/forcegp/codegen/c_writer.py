@@ -1,0 +1,281 @@
+"""Graphs as C: the same text for one state (`real` is a double, C99) and for several in the lanes of vector registers.
+
+GCC and Clang understand vector types on every processor (`__attribute__((vector_size))`). A long program is cut into
+parts, functions of their own: in one function, twice as much takes a compiler far more than twice as long. Values that
+later parts use wait in an array, whose places are used again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from forcegp.codegen.graph import LEAVES, Graph
+from forcegp.codegen.vector_math import LANE_FUNCTIONS
+
+STATEMENTS = 500  # per part
+
+SCALAR_HEAD = """\
+typedef double real;
+#define LANES 1
+#define AT(x, k) (x)
+#define R(c) (c)
+#define LOAD(p) (*(p))
+#define STORE(p, x) (*(p) = (x))
+#define TOTAL(x) (x)
+#define r_exp exp
+#define r_tanh tanh
+#define r_asinh asinh
+#define r_sqrt sqrt
+#if defined(__GNUC__)
+#define APART __attribute__((noinline, unused))
+#else
+#define APART
+#endif
+"""
+SCALAR_NAMES = {"absolute": "fabs", "power": "pow"}
+INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
+COMPARED = {"less": "<", "at_most": "<=", "equal": "=="}
+
+
+@dataclass(frozen=True)
+class Program:
+    """Named vectors of nodes that are computed from named vectors of inputs; all `positive` must be > 0.
+
+    `inputs` follow each other as those of the graph do. Where `sums` names an output, a caller may ask for its sum over
+    all states instead.
+    """
+
+    graph: Graph
+    inputs: dict[str, int]
+    outputs: Mapping[str, Sequence[int]]
+    positive: Sequence[int] = ()
+    sums: tuple[str, ...] = ()
+
+    @property
+    def nodes(self) -> list[int]:
+        """All outputs, then what must be positive."""
+        return [node for vector in self.outputs.values() for node in vector] + list(self.positive)
+
+    @property
+    def operations(self) -> int:
+        """Number of operations."""
+        return self.graph.operations(self.nodes)
+
+
+def write_function(
+    name: str,
+    graph: Graph,
+    outputs: Sequence[int],
+    lanes: int,
+    tables: Sequence[str] = (),
+    statements: int = STATEMENTS,
+) -> str:
+    """`static void NAME(const double *const *t, long live, const real *x, real *y)`: y from x.
+
+    `t` are the tables of the C functions that the graph calls, in the order of their names in `tables`; `live` is the
+    number of states in the lanes.
+    """
+    order = _order(graph, outputs)
+    parts = [order[k : k + statements] for k in range(0, len(order), statements)] or [[]]
+    places, waiting = _places(graph, parts)
+    stores: dict[int, list[int]] = {}
+    for position, node in enumerate(outputs):
+        stores.setdefault(node, []).append(position)
+    arguments = "const double *const *t, long live, const real *x, real *y"
+    text: list[str] = []
+    looked_up: dict[tuple, int] = {}
+    for number, nodes in enumerate(parts):
+        here = {node for node in nodes if graph.nodes[node][0] != "call"}
+
+        def operand(node: int, here: set[int] = here) -> str:
+            operation, *rest = graph.nodes[node]
+            if operation == "constant":
+                return f"({_number(rest[0])})"
+            if operation == "input":
+                return f"x[{rest[0]}]"
+            return f"x{node}" if node in here else f"w[{places[node][1]}]"
+
+        text.append(f"static APART void {name}_{number}({arguments}, real *w) {{")
+        text.append("  (void)t; (void)live; (void)x; (void)y; (void)w;")
+        for node in nodes:
+            operation, *rest = graph.nodes[node]
+            if operation == "call":
+                given = ", ".join(_as_real(graph, k, operand) for k in graph.operands(node))
+                size = graph.outputs_of(node)
+                text.append(f"  real c{node}[{size}]; {{ const real z[] = {{{given}}};")
+                text.append(f"  {rest[0]}(t[{tables.index(rest[0])}], live, z, c{node}); }}")
+                continue
+            if operation not in LEAVES:
+                if operation == "output":
+                    made = f"c{rest[0]}[{rest[1]}]"
+                elif operation == "look up":
+                    table = f"{name}_table{looked_up.setdefault(rest[0], len(looked_up))}"
+                    text.append(f"  real x{node}; for (int k = 0; k < LANES; k++)")
+                    text.append(f"    AT(x{node}, k) = {table}[(int)AT({operand(rest[1])}, k)];")
+                    made = ""
+                else:
+                    made = c_value(graph, node, operand, lambda x, of=operand: _as_real(graph, x, of), lanes)
+                if made:
+                    text.append(f"  const real x{node} = {made};")
+            text += [f"  y[{position}] = {_as_real(graph, node, operand)};" for position in stores.get(node, ())]
+            if node in places:
+                text.append(f"  w[{places[node][1]}] = x{node};")
+        text.append("}")
+    text.append(f"static APART void {name}({arguments}) {{\n  real w[{max(waiting, 1)}];")
+    text += [f"  {name}_{number}(t, live, x, y, w);" for number in range(len(parts))]
+    text.append("}")
+    constants = [
+        f"static const double {name}_table{k}[] = {{{', '.join(map(_number, table))}}};"
+        for table, k in looked_up.items()
+    ]
+    return "\n".join(constants + text)
+
+
+def write_program(program: Program, lanes: int, statements: int = STATEMENTS) -> str:
+    """The C text of a program, whose function is `evaluate`."""
+    text = write_function("program", program.graph, program.nodes, lanes, (), statements)
+    return "\n".join([head(lanes), text, write_entry(program, "program")])
+
+
+def head(lanes: int) -> str:
+    """What stands before all functions: the type `real`, and functions on it."""
+    if lanes == 1:
+        return "#include <math.h>\n" + SCALAR_HEAD
+    return LANE_FUNCTIONS.replace("@LANES@", str(lanes))
+
+
+def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str, int]] | None = None) -> str:
+    """`evaluate(first, last, t, a0, s0, ..., o0, r0, ...)`: all states, rows of arrays.
+
+    A stride `s` or `r` is that from one state to the next; 0 serves all states with one row, and sums an output.
+    `finish` names outputs that a C function (t, y, out) makes of the vector y of that name, and their lengths. Returns
+    bits: 1 for inputs that are not finite, 2 for what should be positive, 4 for results that are not finite.
+    """
+    finish = finish or {}
+    shape = {name: (len(vector), finish.get(name, ("", len(vector)))[1]) for name, vector in program.outputs.items()}
+    arguments = [f"const double *a{k}, long s{k}" for k in range(len(program.inputs))]
+    arguments += [f"double *o{k}, long r{k}" for k in range(len(program.outputs))]
+    text = [
+        f"int evaluate(long first, long last, const double *const *t, {', '.join(arguments)}) {{",
+        f"  real x[{max(sum(program.inputs.values()), 1)}], y[{max(len(program.nodes), 1)}];",
+        "  int found = 0;",
+    ]
+    for k, name in enumerate(program.outputs):
+        if name in program.sums:
+            text.append(f"  real m{k}[{shape[name][0]}]; for (int j = 0; j < {shape[name][0]}; j++) m{k}[j] = R(0.0);")
+    text += [
+        "  for (long i = first; i < last; i += LANES) {",
+        "    const long live = last - i < LANES ? last - i : LANES;",
+    ]
+    start = 0
+    for k, size in enumerate(program.inputs.values()):
+        text += [
+            f"    if (s{k} || i == first) for (int k = 0; k < LANES; k++) {{",
+            f"      const double *p = a{k} + (k < live ? i + k : last - 1) * s{k};",
+            f"      for (int j = 0; j < {size}; j++) {{",
+            f"        AT(x[{start} + j], k) = p[j]; found |= !(p[j] - p[j] == 0.0);",
+            "      }",
+            "    }",
+        ]
+        start += size
+    text.append(f"    {function}(t, live, x, y);")
+    place = 0
+    for k, (name, (size, final)) in enumerate(shape.items()):
+        per_state = f"for (int k = 0; k < live; k++) {{ double *p = o{k} + (i + k) * r{k}; "
+        entry = f"AT(y[{place} + j], k)"
+        if name in finish:
+            store = f"double g[{size}]; for (int j = 0; j < {size}; j++) g[j] = {entry}; {finish[name][0]}(t, g, p);"
+        else:
+            store = f"for (int j = 0; j < {size}; j++) p[j] = {entry};"
+        check = f" for (int j = 0; j < {final}; j++) found |= !(p[j] - p[j] == 0.0) << 2; }}"
+        if name in program.sums:
+            text.append(
+                f"    if (!r{k}) for (int j = 0; j < {size}; j++) for (int k = 0; k < live; k++) "
+                f"AT(m{k}[j], k) += {entry};\n    else"
+            )
+        text.append(f"    {per_state}{store}{check}")
+        place += size
+    if program.positive:
+        text.append(
+            f"    for (int j = {place}; j < {place + len(program.positive)}; j++) for (int k = 0; k < live; k++) "
+            "found |= !(AT(y[j], k) > 0.0) << 1;"
+        )
+    text.append("  }")
+    for k, name in enumerate(program.outputs):
+        if name in program.sums:
+            text.append(
+                f"  if (!r{k}) for (int j = 0; j < {shape[name][0]}; j++) {{ o{k}[j] = 0.0; "
+                f"for (int k = 0; k < LANES; k++) o{k}[j] += AT(m{k}[j], k); }}"
+            )
+    text.append("  return found;\n}")
+    return "\n".join(text)
+
+
+def c_value(graph: Graph, node: int, operand: Callable[[int], str], as_real: Callable[[int], str], lanes: int) -> str:
+    """The C text of an operation; `as_real` is that of an operand where a function needs the type `real`."""
+    operation, *rest = graph.nodes[node]
+    if operation in INFIX:
+        return f"{operand(rest[0])} {INFIX[operation]} {operand(rest[1])}"
+    if operation == "negate":
+        return f"-{operand(rest[0])}"
+    given = [as_real(x) for x in rest]
+    if lanes > 1:
+        return f"r_{operation}({', '.join(given)})"
+    if operation in COMPARED:
+        return f"{given[0]} {COMPARED[operation]} {given[1]} ? 1.0 : 0.0"
+    if operation == "choose":
+        return f"{given[0]} != 0.0 ? {given[1]} : {given[2]}"
+    return f"{SCALAR_NAMES.get(operation, operation)}({', '.join(given)})"
+
+
+def _as_real(graph: Graph, node: int, operand: Callable[[int], str]) -> str:
+    return f"R{operand(node)}" if graph.nodes[node][0] == "constant" else operand(node)
+
+
+def _number(value: float) -> str:
+    if value == value and abs(value) != float("inf"):
+        return value.hex()
+    return "0.0 / 0.0" if value != value else f"{math.copysign(1.0, value)} / 0.0"
+
+
+def _order(graph: Graph, outputs: Sequence[int]) -> list[int]:
+    """Nodes in the order of their statements: outputs of a call follow it at once, for its array is not kept."""
+    wanted = set(outputs)
+    needed = [node for node in graph.needed(outputs) if node in wanted or graph.nodes[node][0] not in LEAVES]
+    of_call: dict[int, list[int]] = {}
+    for node in needed:
+        if graph.nodes[node][0] == "output":
+            of_call.setdefault(graph.nodes[node][1], []).append(node)
+    order: list[int] = []
+    for node in needed:
+        if graph.nodes[node][0] != "output":
+            order += [node, *of_call.get(node, ())]
+    return order
+
+
+def _places(graph: Graph, parts: list[list[int]]) -> tuple[dict[int, tuple[int, int]], int]:
+    """Last part that uses a node and its place in the waiting array, for nodes of earlier parts; size of that array."""
+    for number in range(1, len(parts)):  # no call is cut from its outputs
+        while parts[number] and graph.nodes[parts[number][0]][0] == "output":
+            parts[number - 1].append(parts[number].pop(0))
+    made = {node: part for part, nodes in enumerate(parts) for node in nodes}
+    last: dict[int, int] = {}
+    for node, part in made.items():
+        if graph.nodes[node][0] == "output":
+            continue
+        for operand in graph.operands(node):
+            if made.get(operand, part) < part and graph.nodes[operand][0] not in LEAVES:
+                last[operand] = max(part, last.get(operand, 0))
+    places: dict[int, tuple[int, int]] = {}
+    free: list[int] = []
+    size = 0
+    for part, nodes in enumerate(parts):
+        free += [place for until, place in places.values() if until == part - 1]
+        for node in nodes:
+            if node in last:
+                if not free:
+                    free, size = [size], size + 1
+                places[node] = last[node], free.pop()
+    return places, size

@@ -1,0 +1,296 @@
+"""Straight-line arithmetic on scalars: what every program that is made at run time is written from.
+
+A `Graph` holds each operation once: equal operations on equal operands are one node, what constants decide (products
+with zero, sums of known numbers) is never recorded, and negations move to where they cost nothing. Derivatives
+(`codegen.derivatives`) are nodes of the same graph, so they share what the values compute (Griewank & Walther,
+"Evaluating Derivatives", 2008, ch. 3 and 4). A node is a tuple of its operation and its operands, which have smaller
+numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+
+Slopes = Mapping[tuple[int, int], int]
+"""(value, operand) of a call -> the output that is the derivative of the one in the other; 0 where there is none."""
+
+ZERO, ONE = 0, 1
+"""Numbers of the nodes that hold these constants."""
+
+UNARY: dict[str, Callable[[float], float]] = {
+    "negate": lambda x: -x,
+    "absolute": abs,
+    "sqrt": math.sqrt,
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "asin": math.asin,
+    "acos": math.acos,
+    "atan": math.atan,
+    "sinh": math.sinh,
+    "cosh": math.cosh,
+    "tanh": math.tanh,
+    "asinh": math.asinh,
+    "exp": math.exp,
+    "log": math.log,
+    "log1p": math.log1p,
+    "expm1": math.expm1,
+    "erf": math.erf,
+}
+BINARY: dict[str, Callable[[float, float], float]] = {
+    "add": lambda x, y: x + y,
+    "subtract": lambda x, y: x - y,
+    "multiply": lambda x, y: x * y,
+    "divide": lambda x, y: x / y,
+    "power": math.pow,
+    "atan2": math.atan2,
+    "less": lambda x, y: float(x < y),
+    "at_most": lambda x, y: float(x <= y),
+    "equal": lambda x, y: float(x == y),
+}
+COMMUTATIVE = ("add", "multiply", "equal")
+LEAVES = ("constant", "input")
+
+
+class Graph:
+    """All operations recorded so far.
+
+    Beside the functions of `UNARY` and `BINARY` there are "choose" (m != 0 ? x : y), "input" (its position), "constant"
+    (its value), "look up" (a table of numbers, the place in it), "call" (a name of a C function, its operands) and
+    "output" (a call, its position).
+    """
+
+    def __init__(self, inputs: int = 0) -> None:
+        self.nodes: list[tuple] = []
+        self.slopes: dict[int, Slopes] = {}
+        self._outputs: dict[int, int] = {}
+        self._found: dict[tuple, int] = {}
+        self._record(("constant", 0.0))
+        self._record(("constant", 1.0))
+        self.inputs = [self._record(("input", position)) for position in range(inputs)]
+
+    def more_inputs(self, count: int) -> list[Expression]:
+        """Scalars that are given when the program runs, after those before."""
+        added = [self._record(("input", len(self.inputs) + k)) for k in range(count)]
+        self.inputs += added
+        return [Expression(self, node) for node in added]
+
+    def constant(self, value: float | int) -> int:
+        """The node of a number."""
+        return self._record(("constant", float(value) + 0.0))  # -0.0 becomes 0.0
+
+    def value(self, node: int) -> float | None:
+        """The number that a node holds whatever the inputs are, or None."""
+        operation, *operands = self.nodes[node]
+        return operands[0] if operation == "constant" else None
+
+    def call(self, name: str, operands: Sequence[int], outputs: int, slopes: Slopes | None = None) -> list[int]:
+        """The outputs of a C function; `slopes` names those beyond them that are derivatives."""
+        call = self._record(("call", name, *operands))
+        self._outputs[call] = max([outputs, *(1 + k for k in (slopes or {}).values())])
+        if slopes is not None:
+            self.slopes[call] = slopes
+        return [self.output(call, k) for k in range(outputs)]
+
+    def outputs_of(self, call: int) -> int:
+        """How many numbers a call gives."""
+        return self._outputs[call]
+
+    def output(self, call: int, position: int) -> int:
+        """One output of a call."""
+        return self._record(("output", call, position))
+
+    def copier(self, other: Graph, known: dict[int, int]) -> Copier:
+        """What copies nodes of another graph to this one."""
+        return Copier(self, other, known)
+
+    def look_up(self, table: Sequence[float], place: int) -> int:
+        """The entry of a table of numbers at the place that a node holds."""
+        known = self.value(place)
+        return self._record(("look up", tuple(table), place)) if known is None else self.constant(table[int(known)])
+
+    def apply(self, operation: str, *operands: int) -> int:
+        """The node of an operation on nodes."""
+        known = [self.value(operand) for operand in operands]
+        if operation == "choose":
+            if known[0] is not None:
+                return operands[1] if known[0] else operands[2]
+            return operands[1] if operands[1] == operands[2] else self._record((operation, *operands))
+        if None not in known:
+            return self.constant(_folded(operation, known))
+        simpler = self._simplified(operation, operands, known)
+        if simpler is not None:
+            return simpler
+        return self._record((operation, *(sorted(operands) if operation in COMMUTATIVE else operands)))
+
+    def sum(self, nodes: Iterable[int]) -> int:
+        """The sum of nodes."""
+        total = ZERO
+        for node in nodes:
+            total = self.apply("add", total, node)
+        return total
+
+    def dot(self, left: Iterable[int], right: Iterable[int]) -> int:
+        """sum_k left_k right_k."""
+        return self.sum(self.apply("multiply", x, y) for x, y in zip(left, right, strict=True))
+
+    def operands(self, node: int) -> tuple[int, ...]:
+        """The nodes that a node is computed from."""
+        operation, *rest = self.nodes[node]
+        if operation in LEAVES:
+            return ()
+        if operation in ("call", "look up"):
+            return tuple(rest[1:])
+        return (rest[0],) if operation == "output" else tuple(rest)
+
+    def needed(self, outputs: Iterable[int], given: Container[int] = ()) -> list[int]:
+        """The nodes that `outputs` depend on, operands first; not through those `given`."""
+        wanted = set(outputs)
+        for node in range(max(wanted, default=-1), -1, -1):
+            if node in wanted and node not in given:
+                wanted.update(self.operands(node))
+        return sorted(wanted)
+
+    def operations(self, outputs: Iterable[int]) -> int:
+        """How many operations these nodes take."""
+        return sum(self.nodes[node][0] not in LEAVES for node in self.needed(outputs))
+
+    def _simplified(self, operation: str, operands: tuple[int, ...], known: Sequence[float | None]) -> int | None:
+        """A node that is equal whatever the inputs are, or None."""
+        x = operands[0]
+        if operation == "negate":
+            inner = self.nodes[x]
+            if inner[0] == "subtract":
+                return self._record(("subtract", inner[2], inner[1]))
+            return self._negated(x)
+        if len(operands) < 2:
+            return None
+        y = operands[1]
+        minus_x, minus_y = self._negated(x), self._negated(y)
+        match operation:
+            case "add" if ZERO in operands:
+                return y if x == ZERO else x
+            case "add" if minus_y is not None:
+                return self.apply("subtract", x, minus_y)
+            case "add" if minus_x is not None:
+                return self.apply("subtract", y, minus_x)
+            case "subtract" if x == y:
+                return ZERO
+            case "subtract" if ZERO in operands:
+                return x if y == ZERO else self.apply("negate", y)
+            case "subtract" if minus_y is not None:
+                return self.apply("add", x, minus_y)
+            case "multiply" if ZERO in operands:
+                return ZERO
+            case "multiply" if ONE in operands:
+                return y if x == ONE else x
+            case "multiply" | "divide" if minus_x is not None:
+                return self.apply("negate", self.apply(operation, minus_x, y))
+            case "multiply" | "divide" if minus_y is not None:
+                return self.apply("negate", self.apply(operation, x, minus_y))
+            case "divide" if x == ZERO or y == ONE:
+                return x
+            case "divide" if known[1]:
+                return self.apply("multiply", x, self.constant(1.0 / known[1]))
+        return None
+
+    def _negated(self, node: int) -> int | None:
+        """x where the node is -x or a negative number."""
+        operation, *operands = self.nodes[node]
+        if operation == "constant" and operands[0] < 0.0:
+            return self.constant(-operands[0])
+        return operands[0] if operation == "negate" else None
+
+    def _record(self, entry: tuple) -> int:
+        found = self._found.get(entry)
+        if found is None:
+            found = self._found[entry] = len(self.nodes)
+            self.nodes.append(entry)
+        return found
+
+
+class Copier:
+    """Copies nodes of one graph to another; `known` are those that are there, such as the inputs."""
+
+    def __init__(self, graph: Graph, other: Graph, known: dict[int, int]) -> None:
+        self.graph, self.other, self.known = graph, other, known
+
+    def __call__(self, nodes: Sequence[int]) -> list[int]:
+        """The nodes there."""
+        graph, known = self.graph, self.known
+        for node in self.other.needed(nodes, known):
+            if node in known:
+                continue
+            operation, *rest = self.other.nodes[node]
+            if operation == "constant":
+                known[node] = graph.constant(rest[0])
+            elif operation == "look up":
+                known[node] = graph.look_up(rest[0], known[rest[1]])
+            else:
+                known[node] = graph.apply(operation, *(known[operand] for operand in rest))
+        return [known[node] for node in nodes]
+
+
+class Expression:
+    """A scalar that stands for a node of a `Graph`; what turns out to be known is a float."""
+
+    __slots__ = ("graph", "node")
+
+    def __init__(self, graph: Graph, node: int) -> None:
+        self.graph, self.node = graph, node
+
+    def _apply(self, operation: str, *operands: Expression | float) -> Expression | float:
+        node = self.graph.apply(operation, *(node_of(self.graph, x) for x in operands))
+        value = self.graph.value(node)
+        return Expression(self.graph, node) if value is None else value
+
+    def __add__(self, other: Expression | float) -> Expression | float:
+        return self._apply("add", self, other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Expression | float) -> Expression | float:
+        return self._apply("subtract", self, other)
+
+    def __rsub__(self, other: float) -> Expression | float:
+        return self._apply("subtract", other, self)
+
+    def __mul__(self, other: Expression | float) -> Expression | float:
+        return self._apply("multiply", self, other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Expression | float) -> Expression | float:
+        return self._apply("divide", self, other)
+
+    def __rtruediv__(self, other: float) -> Expression | float:
+        return self._apply("divide", other, self)
+
+    def __neg__(self) -> Expression | float:
+        return self._apply("negate", self)
+
+    def exp(self) -> Expression | float:
+        """Exponential."""
+        return self._apply("exp", self)
+
+    def sin(self) -> Expression | float:
+        """Sine."""
+        return self._apply("sin", self)
+
+    def cos(self) -> Expression | float:
+        """Cosine."""
+        return self._apply("cos", self)
+
+
+def node_of(graph: Graph, scalar: Expression | float) -> int:
+    """The node of a scalar; floats become constants."""
+    return scalar.node if isinstance(scalar, Expression) else graph.constant(scalar)
+
+
+def _folded(operation: str, operands: Sequence[float | None]) -> float:
+    """An operation on known numbers; outside its domain NaN, as a processor has it."""
+    try:
+        return {**UNARY, **BINARY}[operation](*operands)  # type: ignore[arg-type]  # the caller has checked that none is None
+    except (ValueError, ZeroDivisionError, OverflowError):
+        return math.nan

@@ -1,0 +1,246 @@
+"""Posterior means of latents as C: sums over the centres, f_c(z) = sum_j w_cj k_c(z, z_j), for kernels of any kind.
+
+The kernel of one pair (z, z_j) is traced as a graph (`codegen.tracing`) and taken apart: what depends on the centre
+alone is computed once, when the sums are made, and becomes a table; what depends on z alone is computed once per state
+and is an operand of the C function; only what depends on both is computed in its loop. Of scaled squared exponentials
+of latents that share their centres
+
+    log k_c(z, z_j) = log s_c - 1/2 |z / l_c|^2 + (z / l_c^2) . z_j - 1/2 |z_j / l_c|^2
+
+that is one product per feature, and one exponential. Several states stand in the lanes of vector registers, or, where
+there is only one, several centres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.codegen.c_writer import c_value
+from forcegp.codegen.derivatives import gradients
+from forcegp.codegen.graph import ONE, Graph, Slopes
+from forcegp.codegen.numerical import evaluated
+from forcegp.codegen.tracing import trace
+
+PADDING = 8
+"""Centres are filled up to a multiple of the most lanes, with weights of zero."""
+
+BLOCK = 64
+"""Centres whose kernels are held at once."""
+
+ROOTS = """
+static APART void NAME_roots(const double *t, const double *F, const double *z, double *P) {
+  const long n = (long)t[0]; double k[LATENTS * BLOCK];
+  for (long first = 0; first < n; first += BLOCK) {
+    const long count = n - first < BLOCK ? n - first : BLOCK;
+    NAME_kernels(t, z, first, count, k);
+    for (long g = 0; g < LATENTS; g++) for (long j = 0; j < count; j += 4) {
+      const double *f = F + (g * n + first + j) * RANK, *w = k + g * BLOCK + j; double *p = P + g * RANK;
+      for (long r = 0; r < RANK; r += LANES)
+        STORE(p + r, LOAD(p + r) + ((w[0] * LOAD(f + r) + w[1] * LOAD(f + RANK + r))
+                                    + (w[2] * LOAD(f + 2 * RANK + r) + w[3] * LOAD(f + 3 * RANK + r))));
+    }
+  }
+}
+"""
+
+PairFunction = Callable[[Tensor, Tensor], Tensor]
+"""(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair."""
+
+
+@dataclass(frozen=True, eq=False)
+class KernelSum:
+    """The sums of G latents over the same N centres, with what their C function needs.
+
+    `weights` (G, N) are those of the posterior mean. `name` is that of the C function.
+    """
+
+    name: str
+    latents: tuple[int, ...]
+    features: int
+    centers: Float[Tensor, "N d"]
+    weights: Float[Tensor, "G N"]
+    pair: Graph
+    kernels: tuple[int, ...]
+    prior: Graph
+    variances: tuple[int, ...]
+    level: tuple[float, ...]
+    roots: Float[Tensor, "G N R"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        latents: tuple[int, ...],
+        centers: Float[Tensor, "N d"],
+        weights: Float[Tensor, "G N"],
+        function: PairFunction,
+        diagonal: Callable[[Tensor], Tensor],
+        level: tuple[float, ...],
+    ) -> KernelSum:
+        """Traced from the kernels less a constant `level` of each.
+
+        Raises InvalidInput, naming the operation, for those that no graph holds.
+        """
+        example = centers[:1]
+        pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
+        prior, (variances,) = trace(lambda z: [diagonal(z)], [example])
+        nodes = (tuple(found.flatten().tolist()) for found in (kernels, variances))
+        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes), level)
+
+    def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
+        """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
+        operands = self.given(graph, z)
+        name = self.name + ("_slopes" if slopes else "")
+        called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        totals = (math.fsum(weights.tolist()) for weights in self.weights)
+        constants = (graph.constant(level * total) for level, total in zip(self.level, totals, strict=True))
+        return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
+
+    def _dependence(self) -> list[int]:
+        """Of every node of the pair: 1 if it depends on z, 2 on the centre, 3 on both, 0 on none."""
+        found: list[int] = []
+        for node, (operation, *rest) in enumerate(self.pair.nodes):
+            if operation == "input":
+                found.append(1 if rest[0] < self.features else 2)
+            else:
+                found.append(0)
+                for operand in self.pair.operands(node):
+                    found[node] |= found[operand]
+        return found
+
+    def _frontier(self, kind: int) -> list[int]:
+        """Nodes of one kind that those which depend on both, or the kernels themselves, are computed from."""
+        needed, dependence = self.pair.needed(self.kernels), self._dependence()
+        used = {x for node in needed if dependence[node] == 3 for x in self.pair.operands(node)}
+        return [node for node in needed if dependence[node] == kind and (node in used or node in self.kernels)]
+
+    @cached_property
+    def operands(self) -> list[int]:
+        """What a state gives: nodes of the pair."""
+        return self._frontier(1)
+
+    def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
+        """The operands at features z."""
+        return graph.copier(self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)
+
+    def variance(self, graph: Graph, z: Sequence[int]) -> list[int]:
+        """Prior variances at features z."""
+        return graph.copier(self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
+
+    @cached_property
+    def _rows(self) -> list[int]:
+        """What a centre gives: nodes of the pair."""
+        return self._frontier(2)
+
+    @cached_property
+    def _partials(self) -> dict[tuple[int, int], int]:
+        """(latent, operand) -> the node of d k / d operand."""
+        found = {}
+        for g, kernel in enumerate(self.kernels):
+            for k, node in enumerate(gradients(self.pair, [kernel], [ONE], self.operands)):
+                if self.pair.value(node) != 0.0:
+                    found[g, k] = node
+        return found
+
+    @cached_property
+    def _slopes(self) -> Slopes:
+        return {pair: len(self.latents) + k for k, pair in enumerate(self._partials)}
+
+    def table(self) -> np.ndarray:
+        """[number of centres filled up, true number, 0 ...], a row per quantity of the centres, a row of weights each.
+
+        Eight numbers stand before the rows, so that these are aligned as the table is.
+        """
+        valid = len(self.centers)
+        padded = valid + -valid % PADDING
+        centers = np.concatenate([self.centers.numpy(), np.repeat(self.centers[-1:].numpy(), padded - valid, 0)])
+        inputs = [*np.zeros((self.features, 1)), *centers.T]
+        rows = [np.broadcast_to(x, padded) for x in evaluated(self.pair, self._rows, inputs)]
+        weights = np.pad(self.weights.numpy(), ((0, 0), (0, padded - valid)))
+        return np.concatenate([[padded, valid, *[0.0] * 6], *rows, *weights])
+
+    def root_table(self) -> np.ndarray:
+        """The roots of the compressed covariance, of as many centres as there are in the table."""
+        assert self.roots is not None, "asked for with a compressed covariance only"
+        filled = -len(self.centers) % PADDING
+        return torch.nn.functional.pad(self.roots, (0, 0, 0, filled)).numpy().ravel()
+
+    def c_source(self, lanes: int, slopes: bool) -> str:
+        """The C function `NAME(table, live, z, f)`, or NAME_slopes, whose derivatives follow the values."""
+        name = self.name + ("_slopes" if slopes else "")
+        made = list(self.kernels) + (list(self._partials.values()) if slopes else [])
+        owner = list(range(len(self.latents))) + ([g for g, _ in self._partials] if slopes else [])
+        if lanes == 1:
+            return self._loop(name, made, owner, lanes, False)
+        both = [self._loop(f"{name}_{'one' if one else 'many'}", made, owner, lanes, one) for one in (True, False)]
+        choice = f"if (live == 1) {name}_one(t, live, z, f); else {name}_many(t, live, z, f);"
+        return "\n".join(
+            [*both, f"static void {name}(const double *t, long live, const real *z, real *f) {{ {choice} }}"]
+        )
+
+    def roots_source(self, lanes: int, rank: int) -> str:
+        """`NAME_roots(t, F, z, P)`: P (G, rank) += k(z, Z) F for one state, F (G, N filled up, rank)."""
+        kernels = self._loop(f"{self.name}_kernels", list(self.kernels), [], lanes, True)
+        return kernels + ROOTS.replace("NAME", self.name).replace("RANK", str(rank)).replace(
+            "LATENTS", str(len(self.latents))
+        ).replace("BLOCK", str(BLOCK))
+
+    def _loop(self, name: str, made: list[int], owner: list[int], lanes: int, one: bool) -> str:
+        """One state and several centres at a time with `one`, else several states."""
+        graph, dependence, keep = self.pair, self._dependence(), not owner
+        state, centre, step = ("double", "real", "LANES") if one else ("real", "double", "1")
+        G = len(self.latents)
+        operands = {node: k for k, node in enumerate(self.operands)}
+        rows = {node: k for k, node in enumerate(self._rows)}
+
+        def operand(node: int) -> str:
+            operation, *rest = graph.nodes[node]
+            if operation == "constant":
+                return f"({float(rest[0]).hex()})"
+            return f"z{operands[node]}" if node in operands else f"c{rows[node]}" if node in rows else f"x{node}"
+
+        def as_real(node: int) -> str:
+            """Constants, and what is a double here, as the type of what depends on both."""
+            narrow = dependence[node] == 0 or dependence[node] == (1 if one else 2)
+            return f"R({operand(node)})" if narrow else operand(node)
+
+        signature = (
+            "const double *t, const double *z, long first, long count, double *k"
+            if keep
+            else "const double *t, long live, const real *z, real *f"
+        )
+        text = [f"static APART void {name}({signature}) {{", "  const long n = (long)t[0]; const double *rows = t + 8;"]
+        if not keep:
+            text.append("  (void)live;")
+        pick = "AT(z[{0}], 0)" if one and not keep else "z[{0}]"
+        text += [f"  const {state} z{k} = {pick.format(k)};" for k in range(len(operands))]
+        if not keep:
+            text += [f"  real s{k} = R(0.0);" for k in range(len(made))]
+        text.append(
+            f"  for (long j = {'first' if keep else '0'}; j < {'first + count' if keep else 'n'}; j += {step}) {{"
+        )
+        load = "LOAD(rows + {0} * n + j)" if one else "rows[{0} * n + j]"
+        text += [f"    const {centre} c{k} = {load.format(k)};" for k in range(len(rows))]
+        for node in graph.needed(made):
+            if dependence[node] == 3:
+                text.append(f"    const real x{node} = {c_value(graph, node, operand, as_real, lanes)};")
+        if keep:
+            for g, (node, level) in enumerate(zip(made, self.level, strict=True)):
+                text.append(f"    STORE(k + {g} * {BLOCK} + j - first, {as_real(node)} + {level.hex()});")
+        else:
+            text += [f"    const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
+            text += [f"    s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made)]
+        text.append("  }")
+        if not keep:
+            total = "R(TOTAL(s{0}))" if one else "s{0}"
+            text += [f"  f[{k}] = {total.format(k)};" for k in range(len(made))]
+        text.append("}")
+        return "\n".join(text)

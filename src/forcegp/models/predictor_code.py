@@ -1,0 +1,189 @@
+"""A posterior's predictions as C: physics, features and processes of one state in one program.
+
+The Python code that `predict` runs is traced once (`codegen.tracing`); processes are C functions that the graph calls
+(`inference.kernel_sums`). From the one graph come the mean, its Jacobians and the covariance, each compiled when it is
+first asked for.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from forcegp.codegen.c_writer import Program, head, write_entry, write_function
+from forcegp.codegen.derivatives import jacobian
+from forcegp.codegen.graph import Graph
+from forcegp.codegen.library import VectorUnit, default_folder, load_library
+from forcegp.codegen.native_code import Purpose
+from forcegp.codegen.row_function import RowFunction, aligned
+from forcegp.codegen.tracing import trace
+from forcegp.errors import InvalidInput
+from forcegp.inference.compressed_covariance import CompressedCovariance
+from forcegp.inference.kernel_sums import PADDING
+from forcegp.inference.one_input_calls import LatentCall, drawn_calls
+from forcegp.inference.posterior import LatentPosterior
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
+
+TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
+"""States (n, nv) -> [offset (n, nv), W (n, nv, C), features of every process (n, d)], where a = offset + W f."""
+
+PURPOSE = Purpose("a compiled predictor", "the environment variable XDG_CACHE_HOME", "give compile=False")
+
+COVARIANCE = """
+static APART void covariance(const double *const *t, const double *y, double *out) {
+  enum {N = JOINTS, C = LATENTS, K = RANK};
+  const double *W = y, *d = y + N * C;
+  double P[C * K], Q[N * K];
+  memset(P, 0, sizeof P);
+  ROOTS
+  for (int a = 0; a < N; a++) for (int r = 0; r < K; r += LANES) {
+    real s = R(0.0);
+    for (int c = 0; c < C; c++) s += W[a * C + c] * LOAD(P + c * K + r);
+    STORE(Q + a * K + r, s);
+  }
+  for (int a = 0; a < N; a++) for (int b = 0; b <= a; b++) {
+    real s = R(0.0);
+    double prior = 0.0;
+    for (int r = 0; r < K; r += LANES) s += LOAD(Q + a * K + r) * LOAD(Q + b * K + r);
+    for (int c = 0; c < C; c++) prior += W[a * C + c] * d[c] * W[b * C + c];
+    out[a * N + b] = out[b * N + a] = WIDENED * (prior - TOTAL(s));
+  }
+}
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictorCode:
+    """What is traced once of a posterior, and the programs made of it; see `of`."""
+
+    nv: int
+    sums: tuple[LatentCall, ...]
+    physics: Graph
+    a: list[int]
+    W: list[list[int]]
+    features: list[list[int]]
+    compressed: CompressedCovariance | None
+    widening: float
+
+    @classmethod
+    def of(
+        cls,
+        traced: Callable[..., list[Tensor]],
+        example: Sequence[Tensor],
+        sums: tuple[LatentCall, ...],
+        compressed: CompressedCovariance | None,
+        widening: float,
+    ) -> PredictorCode:
+        """Trace the physics at an example (1, nv) of a state.
+
+        Raises InvalidInput for a system on another device and for operations that a graph cannot hold.
+        """
+        if example[0].device.type != "cpu":
+            raise InvalidInput(
+                f"a compiled predictor runs on the CPU, and the model is on {example[0].device}; give compile=False, "
+                "or a model on the CPU."
+            )
+        latents = sum(len(part.latents) for part in sums)
+        graph, found = trace(traced, [*example, torch.ones(1, latents, dtype=torch.float64)])
+        a, W, *features = (nodes[0].tolist() for nodes in found)
+        return cls(example[0].shape[-1], sums, graph, a, W, features, compressed, widening)
+
+    @property
+    def _latents(self) -> list[int]:
+        """All processes in the order of the sums."""
+        return [c for part in self.sums for c in part.latents]
+
+    def program(self, kind: str) -> Program:
+        """The program "mean", "linearize" or "covariance"."""
+        graph, f = Graph(3 * self.nv), {}
+        copied = graph.copier(self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
+        features = [copied(self.features[part.latents[0]]) for part in self.sums]
+        for part, z in zip(self.sums, features, strict=True):
+            f |= dict(zip(part.latents, part.call(graph, z, kind == "linearize"), strict=True))
+        copied.known.update(zip(self.physics.inputs[3 * self.nv :], (f[c] for c in sorted(f)), strict=True))
+        a = copied(self.a)
+        match kind:
+            case "mean":
+                outputs = {"a": a}
+            case "linearize":
+                outputs = {"a": a, "jacobian": [node for row in jacobian(graph, a, graph.inputs) for node in row]}
+            case _:
+                given = copied([row[c] for row in self.W for c in self._latents])
+                for part, z in zip(self.sums, features, strict=True):
+                    given += part.variance(graph, z)
+                for part, z in zip(self.sums, features, strict=True):
+                    given += part.given(graph, z)
+                outputs = {"a": a, "covariance": given}
+        return Program(graph, dict.fromkeys("qvu", self.nv), outputs)
+
+    def c_source(self, kind: str, lanes: int) -> str:
+        """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`."""
+        integrator, loop = kind, kind in STEPS
+        if loop:
+            kind = "linearize" if integrator == "implicit-midpoint" else "mean"
+        program, slopes = self.program(kind), kind == "linearize"
+        names = [part.name + ("_slopes" if slopes else "") for part in self.sums]
+        text = [head(lanes), *(part.c_source(lanes, slopes) for part in self.sums)]
+        finish = None
+        if kind == "covariance":
+            text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self._covariance_source()]
+            finish = {"covariance": ("covariance", self.nv**2)}
+        text.append(write_function("program", program.graph, program.nodes, lanes, names))
+        text.append(loop_source(integrator, "program", self.nv) if loop else write_entry(program, "program", finish))
+        return "\n".join(text)
+
+    def _covariance_source(self) -> str:
+        calls, C = [], len(self._latents)
+        first, place = 0, self.nv * C + C
+        for k, part in enumerate(self.sums):
+            calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
+            first, place = first + len(part.latents), place + len(part.operands)
+        sizes = {"JOINTS": self.nv, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
+        text = COVARIANCE.replace("  ROOTS", "  " + "\n  ".join(calls))
+        for name, value in sizes.items():
+            text = text.replace(name, str(value))
+        return text
+
+    @property
+    def rank(self) -> int:
+        """Numbers per process of the compressed covariance, filled up to whole vectors."""
+        assert self.compressed is not None, "asked for by programs of the covariance only"
+        return self.compressed.rank + -self.compressed.rank % PADDING
+
+    @cached_property
+    def tables(self) -> list[Tensor]:
+        """What the C functions of the sums take, then the roots of the covariance."""
+        found = [part.table() for part in self.sums]
+        if self.compressed is not None:
+            found += [part.root_table() for part in self.sums]
+        return [aligned(table) for table in found]
+
+    def function(self, kind: str) -> RowFunction:
+        """A program, compiled or found. Raises CompilerError where that cannot be."""
+        sizes = {"mean": [], "linearize": [3 * self.nv**2], "covariance": [self.nv**2]}[kind]
+        return RowFunction(self._library(kind), [self.nv] * 3, [self.nv, *sizes], self.tables)
+
+    def loops(
+        self, integrator: str, latent: LatentPosterior, samples: int = 0, seed: int = 0
+    ) -> list[FusedLoop] | None:
+        """A loop over the mean, or one over each function drawn from the posterior.
+
+        None where a drawn function has no form in pieces. Raises CompilerError where loops cannot be compiled.
+        """
+        if not samples or not self.sums:
+            return [FusedLoop(self._library(integrator), self.tables)] * max(1, samples)
+        drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)
+        if drawn is None:
+            return None
+        codes = [replace(self, sums=calls, compressed=None) for calls in drawn]
+        library = codes[0]._library(integrator)
+        return [FusedLoop(library, code.tables) for code in codes]
+
+    def _library(self, kind: str) -> ctypes.CDLL:
+        text = self.c_source(kind, VectorUnit.of_this_processor().lanes)
+        return load_library(f"predictor-{kind}", text, lambda _: text, default_folder(), PURPOSE)[0]

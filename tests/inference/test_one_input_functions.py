@@ -1,0 +1,309 @@
+"""Latents of one input in pieces, against sums of kernel functions."""
+
+import ctypes
+import math
+import subprocess
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from tests.inference.problems import normal
+
+from forcegp.codegen import native_code
+from forcegp.errors import CompilerError
+from forcegp.inference import ExactPosterior, LatentKernels
+from forcegp.inference.one_input_functions import drawn_form, one_input_form
+from forcegp.inference.pathwise import draw_functions
+from forcegp.inference.piecewise_tables import OneInputFunctions, cubic_table, value_and_slope
+from forcegp.priors.kernels import kernel_of
+
+EXACT = [
+    "friction",
+    "matern-1/2",
+    "matern-3/2",
+    "matern-5/2",
+    "linear",
+    "constant",
+    "linear * matern-5/2 + constant",
+    "friction * (constant + linear) + matern-3/2 + matern-1/2",
+]
+TABLES = ["squared-exponential", "rational-quadratic", "periodic", "deep", "squared-exponential * linear + matern-3/2"]
+
+# the macros of the C writer, for one state and for eight
+ONE = """#include <math.h>
+#include <stddef.h>
+typedef double real;
+#define LANES 1
+#define AT(x, k) (x)
+#define r_exp exp
+#define r_tanh tanh
+#define r_asinh asinh
+#define r_sqrt sqrt
+"""
+EIGHT = """#include <math.h>
+#include <stddef.h>
+typedef double real __attribute__((vector_size(64)));
+#define LANES 8
+#define AT(x, k) ((x)[k])
+#define EACH(f) static real r_##f(real x) { real y; for (int k = 0; k < 8; ++k) y[k] = f(x[k]); return y; }
+EACH(exp) EACH(tanh) EACH(asinh) EACH(sqrt)
+"""
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
+
+
+@dataclass
+class Latents:
+    """What the forms need of a posterior, with weights of our choice."""
+
+    kernels: LatentKernels
+    features: tuple[torch.Tensor, ...]
+    weights: tuple[torch.Tensor, ...]
+
+
+def latents(expression: str, centers: torch.Tensor, weights: torch.Tensor | None = None, scale: float | None = None):
+    kernels = LatentKernels([kernel_of(expression, 1, 2.0)])
+    with torch.no_grad():
+        for name, value in kernels.named_parameters():
+            if scale is not None and name.endswith("lengthscale"):
+                value.fill_(math.log(scale))
+    kernels.requires_grad_(False)
+    weights = normal(len(centers), seed=8) if weights is None else weights
+    return Latents(kernels, (centers[:, None],), (weights,))
+
+
+def summed(given, s: torch.Tensor) -> torch.Tensor:
+    return given.kernels.dense[0].cross(s[:, None], given.features[0]) @ given.weights[0]
+
+
+def points(centers: torch.Tensor) -> torch.Tensor:
+    """In their range and beyond it, at centres and near zero."""
+    spread = centers.abs().max()
+    return torch.cat([torch.linspace(-3, 3, 61) * spread, centers, torch.tensor([0.0, 1e-9, -1e-9])])
+
+
+def close(found: torch.Tensor, expected: torch.Tensor, relative: float) -> None:
+    """Relative to the largest value."""
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=relative * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("count", [1, 2, 30])
+@pytest.mark.parametrize("expression", EXACT)
+def test_exact_forms_are_the_sums_everywhere(expression, count):
+    given = latents(expression, normal(count, seed=3))
+    form = one_input_form(given, 0)
+    assert form is not None
+    assert form.error == 0.0
+    for s in (points(given.features[0][:, 0]), torch.tensor([-1e3, 1e3], dtype=torch.float64)):
+        close(form.values(s)[:, 0], summed(given, s), 1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+@pytest.mark.parametrize("expression", EXACT[:4])
+def test_exact_forms_at_extreme_length_scales(expression, scale):
+    """At centres and far from them, where everything has decayed."""
+    given = latents(expression, normal(30, seed=4), scale=scale)
+    s = points(given.features[0][:, 0])
+    # x / l is a thousand, whose rounding alone makes 1e-13 of a kernel function, twice
+    close(one_input_form(given, 0).values(s)[:, 0], summed(given, s), 1e-12)
+
+
+@pytest.mark.parametrize("expression", EXACT[:4])
+def test_exact_forms_of_many_centers_with_weights_that_cancel(expression):
+    centers = normal(1000, seed=5)
+    given = latents(expression, centers, weights=100.0 * normal(1000, seed=6))
+    s = points(centers[::10])
+    close(one_input_form(given, 0).values(s)[:, 0], summed(given, s), 1e-12)
+
+
+@pytest.mark.parametrize("expression", ["friction", "matern-5/2"])
+def test_repeated_centers_count_as_often_as_they_occur(expression):
+    centers = torch.tensor([0.5, -1.0, 0.5, 0.5, 0.0, 0.0], dtype=torch.float64)
+    given = latents(expression, centers)
+    form = one_input_form(given, 0)
+    assert len(form.knots) == 3
+    close(form.values(points(centers))[:, 0], summed(given, points(centers)), 1e-12)
+
+
+def test_several_functions_are_prepared_at_once():
+    """The roots of a compressed covariance: the same centres, one column of coefficients for each."""
+    given = latents("friction", normal(20, seed=7))
+    coefficients = normal(20, 3, seed=9)
+    form, s = one_input_form(given, 0, coefficients), points(given.features[0][:, 0])
+    close(form.values(s), given.kernels.dense[0].cross(s[:, None], given.features[0]) @ coefficients, 1e-12)
+    torch.testing.assert_close(form.only(1).values(s)[:, 0], form.values(s)[:, 1], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("expression", EXACT + TABLES)
+def test_slopes_are_those_of_the_sums(expression):
+    given = latents(expression, normal(30, seed=3))
+    form = one_input_form(given, 0)
+    s = torch.linspace(-2, 2, 101, dtype=torch.float64)  # no centres: kinks have no slope
+    expected = value_and_slope(lambda s: summed(given, s)[:, None], s)[1]
+    close(form.evaluate(s)[1], expected, 1e-11 if form.error == 0.0 else 1e-5)
+
+
+@pytest.mark.parametrize("expression", ["matern-3/2", "matern-5/2", *TABLES])
+def test_slopes_are_continuous_where_the_kernel_is_smooth(expression):
+    form = one_input_form(latents(expression, normal(30, seed=3)), 0)
+    inner = form.knots[1:-1]
+    left, right = form.evaluate(inner - 1e-12)[1], form.evaluate(inner)[1]
+    close(left, right, 1e-9)
+
+
+@pytest.mark.parametrize("expression", TABLES)
+def test_the_error_of_a_table_is_below_its_bound_on_a_fine_grid(expression):
+    given = latents(expression, normal(40, seed=11))
+    form = one_input_form(given, 0)
+    s = torch.linspace(form.low, form.high, 20001, dtype=torch.float64)
+    assert 0.0 < form.error <= 1e-8
+    close(form.values(s)[:, 0], summed(given, s), 1e-8)
+
+
+@pytest.mark.parametrize(("expression", "scale"), [("squared-exponential", 1e-3), ("rational-quadratic", 1e-2)])
+def test_a_table_finds_what_is_narrow_at_its_centers(expression, scale):
+    centers = torch.tensor([-1.0, 0.123, 0.7], dtype=torch.float64)
+    given = latents(expression, centers, scale=scale)
+    form = one_input_form(given, 0)
+    s = (centers[:, None] + scale * torch.linspace(-6, 6, 301, dtype=torch.float64)).flatten()
+    close(form.values(s)[:, 0], summed(given, s), 1e-8)
+
+
+def test_a_table_holds_a_margin_beyond_its_centers_and_is_nan_elsewhere():
+    centers = torch.tensor([-1.0, 3.0], dtype=torch.float64)
+    form = one_input_form(latents("squared-exponential", centers), 0)
+    assert (form.low, form.high) == (-2.0, 4.0)
+    f, slope = form.evaluate(torch.tensor([-2.0, 4.0, -2.001, 4.001, math.nan], dtype=torch.float64))
+    assert f[:, 0].isnan().tolist() == slope[:, 0].isnan().tolist() == [False, False, True, True, True]
+    one = one_input_form(latents("squared-exponential", centers[1:]), 0)
+    assert (one.low, one.high) == (2.25, 3.75)
+
+
+def test_kinks_are_smooth_in_a_table_of_the_exact_form():
+    given = latents("friction", normal(20, seed=3))
+    exact, smooth = one_input_form(given, 0), one_input_form(given, 0, smooth=True, tolerance=1e-4)
+    s = torch.linspace(smooth.low, smooth.high, 5001, dtype=torch.float64)
+    close(smooth.values(s), exact.values(s), 1e-4)
+    for form, continuous in ((exact, False), (smooth, True)):
+        inner = form.knots[1:-1]
+        left, right = form.evaluate(inner - 1e-12)[1], form.evaluate(inner)[1]
+        assert ((left - right).abs().max() < 1e-6 * right.abs().max()) == continuous
+
+
+def test_functions_without_any_weight_have_a_table():
+    form = one_input_form(latents("periodic", normal(5, seed=3), weights=torch.zeros(5, dtype=torch.float64)), 0)
+    assert (form.values(torch.tensor([0.3], dtype=torch.float64)) == 0.0).all()
+
+
+def test_what_has_no_form():
+    """Several inputs, and what varies too fast for a table."""
+    kernels = LatentKernels([kernel_of("matern-3/2", 2, 1.0)])
+    several = Latents(kernels, (normal(5, 2),), (normal(5),))
+    assert one_input_form(several, 0) is None
+    assert drawn_form(draw_functions(posterior("matern-3/2", 2), 2, seed=0), several, 0) is None
+    assert cubic_table(lambda s: torch.cos(1e6 * s)[:, None], normal(5), 0.25, 1e-8) is None
+
+
+def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
+    kernels = LatentKernels([kernel_of(expression, dimension, 1.0)])
+    kernels.requires_grad_(False)
+    W = torch.ones(12, 1, 1, dtype=torch.float64)
+    noise = torch.full((12, 1), 0.01, dtype=torch.float64)
+    return ExactPosterior.condition(kernels, [normal(12, dimension, seed=2)], W, normal(12, 1, seed=1), noise)
+
+
+@pytest.mark.parametrize(("expression", "tolerance"), [("squared-exponential", 1e-8), ("matern-5/2", 1e-6)])
+def test_drawn_functions_have_tables(expression, tolerance):
+    latent = posterior(expression)
+    drawn = draw_functions(latent, 3, seed=5)
+    form = drawn_form(drawn, latent, 0, tolerance)
+    s = torch.linspace(form.low, form.high, 2001, dtype=torch.float64)
+    close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, tolerance)
+
+
+@pytest.mark.parametrize("expression", ["friction", "linear * matern-1/2 + friction", "matern-1/2 + constant"])
+def test_drawn_functions_of_rough_kernels_are_exact(expression):
+    """The cosines of a Matern 1/2 have any frequency, and no table could hold them."""
+    latent = posterior(expression)
+    drawn = draw_functions(latent, 3, seed=5, widening=1.5)
+    form = drawn_form(drawn, latent, 0)
+    assert form.error == 0.0
+    s = torch.cat([latent.features[0][:, 0], torch.linspace(-90, 90, 2001, dtype=torch.float64)])
+    close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, 1e-11)
+    nothing = torch.zeros(12, 3, dtype=torch.float64)
+    assert (form.values(s) - one_input_form(latent, 0, nothing).values(s)).abs().max() > 0.1
+
+
+def test_only_a_matern_is_drawn_on_a_grid():
+    """A rational quadratic of alpha 1/2 has a factor of the same shape."""
+    latent = posterior("rational-quadratic")
+    latent.kernels[0].base_kernel.alpha = torch.tensor(0.5, dtype=torch.float64)
+    (term,) = draw_functions(latent, 2, seed=1).terms[0]
+    assert term.grid is None
+    assert len(term.frequencies) == 1
+
+
+def test_the_mean_of_a_posterior():
+    latent = posterior("friction")
+    z = normal(9, 1, seed=20)
+    close(one_input_form(latent, 0).values(z[:, 0]), latent.mean([z]), 1e-12)
+
+
+def test_one_source_serves_all_functions_of_a_structure():
+    forms = [one_input_form(latents("friction", normal(count, seed=count)), 0) for count in (3, 9)]
+    assert forms[0].c_source("f") == forms[1].c_source("f")
+    assert all(np.isfinite(form.table()).all() for form in forms)
+
+
+def compiled(form: OneInputFunctions, head: str, options: tuple[str, ...], folder) -> ctypes.CDLL:
+    """The form as a loop over states; skips the test where there is no compiler."""
+    loop = """
+extern void many(long n, const double *table, const double *s, double *f, double *slope, int functions);
+extern void many(long n, const double *table, const double *s, double *f, double *slope, int functions) {
+  for (long i = 0; i < n; i += LANES) {
+    real x, value[64], change[64];
+    for (int k = 0; k < LANES; ++k) AT(x, k) = s[i + k];
+    latent(table, x, value, slope ? change : NULL);
+    for (int k = 0; k < LANES; ++k) for (int r = 0; r < functions; ++r) {
+      f[(i + k) * functions + r] = AT(value[r], k);
+      if (slope) slope[(i + k) * functions + r] = AT(change[r], k);
+    }
+  }
+}
+"""
+    try:
+        compiler = native_code.Purpose("the test", "", "skip it").compiler()
+    except CompilerError as error:
+        pytest.skip(str(error))
+    source, library = folder / "latent.c", folder / "latent.so"
+    source.write_text(head + form.c_source("latent") + loop)
+    subprocess.run([*compiler, *options, "-O2", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"], check=True)
+    return ctypes.CDLL(str(library))
+
+
+def run(library: ctypes.CDLL, form: OneInputFunctions, s: np.ndarray, slopes: bool = True):
+    def pointer(array):
+        return array.ctypes.data_as(ctypes.c_void_p) if array is not None else None
+
+    table, functions = form.table(), len(form.constants)
+    f, slope = np.zeros((len(s), functions)), np.zeros((len(s), functions)) if slopes else None
+    library.many(ctypes.c_long(len(s)), pointer(table), pointer(s), pointer(f), pointer(slope), functions)
+    return f, slope
+
+
+@pytest.mark.parametrize(("head", "options"), [(ONE, STRICT), (EIGHT, ("-std=gnu99",))], ids=["one", "eight"])
+@pytest.mark.parametrize("expression", [EXACT[-1], "friction", "linear", "constant", "squared-exponential"])
+def test_the_c_code_computes_the_same(expression, head, options, tmp_path):
+    given = latents(expression, normal(30, seed=3))
+    form = one_input_form(given, 0, normal(30, 3, seed=4))
+    library = compiled(form, head, options, tmp_path)
+    s = torch.cat([torch.linspace(-1.2, 1.2, 170) * float(form.knots.abs().max()), form.knots[:16], torch.zeros(6)])
+    s = torch.cat([s.double()[: len(s) // 8 * 8], torch.tensor([math.nan] * 8, dtype=torch.float64)])
+    f, slope = run(library, form, s.numpy())
+    known = ~np.isnan(f)
+    assert (known == ~form.values(s).isnan().numpy()).all()
+    for found, expected in zip((f, slope), form.evaluate(s), strict=True):
+        np.testing.assert_allclose(
+            found[known], expected.numpy()[known], rtol=0, atol=1e-13 * float(expected[known].abs().max())
+        )
+    np.testing.assert_array_equal(run(library, form, s.numpy(), slopes=False)[0], f)
