@@ -33,6 +33,7 @@ FOLDERS = {
     "compare": "compare arm.h5 --prior joint --prior joint-friction --overwrite --out OUT",
     "evaluate": "evaluate run arm.h5 --overwrite --plots OUT",
     "rollout": "rollout run arm.h5 --overwrite --out OUT",
+    "export": "export run --to c --overwrite --out OUT",
     "check": "check arm.h5 --overwrite --plots OUT",
     "demo": "demo --out OUT",
 }

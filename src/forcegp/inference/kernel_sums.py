@@ -100,9 +100,14 @@ class KernelSum:
         operands = self.given(graph, z)
         name = self.name + ("_slopes" if slopes else "")
         called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
-        totals = (math.fsum(weights.tolist()) for weights in self.weights)
-        constants = (graph.constant(level * total) for level, total in zip(self.level, totals, strict=True))
+        constants = map(graph.constant, self.constants)
         return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
+
+    @property
+    def constants(self) -> list[float]:
+        """What the sums of `pair` lack."""
+        totals = (math.fsum(weights.tolist()) for weights in self.weights)
+        return [level * total for level, total in zip(self.level, totals, strict=True)]
 
     def _dependence(self) -> list[int]:
         """Of every node of the pair: 1 if it depends on z, 2 on the centre, 3 on both, 0 on none."""
@@ -136,7 +141,7 @@ class KernelSum:
         return graph.copier(self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
 
     @cached_property
-    def _rows(self) -> list[int]:
+    def rows(self) -> list[int]:
         """What a centre gives: nodes of the pair."""
         return self._frontier(2)
 
@@ -160,12 +165,15 @@ class KernelSum:
         Eight numbers stand before the rows, so that these are aligned as the table is.
         """
         valid = len(self.centers)
-        padded = valid + -valid % PADDING
-        centers = np.concatenate([self.centers.numpy(), np.repeat(self.centers[-1:].numpy(), padded - valid, 0)])
-        inputs = [*np.zeros((self.features, 1)), *centers.T]
-        rows = [np.broadcast_to(x, padded) for x in evaluated(self.pair, self._rows, inputs)]
-        weights = np.pad(self.weights.numpy(), ((0, 0), (0, padded - valid)))
-        return np.concatenate([[padded, valid, *[0.0] * 6], *rows, *weights])
+        filled = -valid % PADDING
+        rows = [np.pad(row, (0, filled), "edge") for row in self.row_values()]
+        weights = np.pad(self.weights.numpy(), ((0, 0), (0, filled)))
+        return np.concatenate([[valid + filled, valid, *[0.0] * 6], *rows, *weights])
+
+    def row_values(self) -> list[np.ndarray]:
+        """The numbers of every row, one per centre."""
+        inputs = [*np.zeros((self.features, 1)), *self.centers.numpy().T]
+        return [np.broadcast_to(x, len(self.centers)) for x in evaluated(self.pair, self.rows, inputs)]
 
     def root_table(self) -> np.ndarray:
         """The roots of the compressed covariance, of as many centres as there are in the table."""
@@ -199,7 +207,7 @@ class KernelSum:
         state, centre, step = ("double", "real", "LANES") if one else ("real", "double", "1")
         G = len(self.latents)
         operands = {node: k for k, node in enumerate(self.operands)}
-        rows = {node: k for k, node in enumerate(self._rows)}
+        rows = {node: k for k, node in enumerate(self.rows)}
 
         def operand(node: int) -> str:
             operation, *rest = graph.nodes[node]

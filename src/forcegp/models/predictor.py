@@ -73,7 +73,7 @@ class Predictor(Summary):
     any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
     `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
-    compressed; `prepare_seconds` is what preparing took, the C++ compiler included, which runs once per process.
+    compressed; `prepare_seconds` is what preparing took, the C compiler included where its work is not kept yet.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
     NumericalError where the result is not finite.
@@ -258,7 +258,7 @@ class Predictor(Summary):
         return outputs
 
     def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
-        """Rows that a program leaves NaN, because they lie outside of a table, by torch, to which no place is too far."""
+        """By torch what a program leaves NaN: states outside of a table."""
         bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
         given = [x[bad] for x in states]
         if kind == "linearize":

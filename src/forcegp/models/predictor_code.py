@@ -41,15 +41,22 @@ static APART void covariance(const double *const *t, const double *y, double *ou
   double P[C * K], Q[N * K];
   memset(P, 0, sizeof P);
   ROOTS
-  for (int a = 0; a < N; a++) for (int r = 0; r < K; r += LANES) {
-    real s = R(0.0);
-    for (int c = 0; c < C; c++) s += W[a * C + c] * LOAD(P + c * K + r);
-    STORE(Q + a * K + r, s);
-  }
+  memset(Q, 0, sizeof Q);
+  for (int a = 0; a < N; a++) for (int c = 0; c < C; c++) for (int r = 0; r < K; r += LANES)
+    STORE(Q + a * K + r, LOAD(Q + a * K + r) + W[a * C + c] * LOAD(P + c * K + r));
   for (int a = 0; a < N; a++) for (int b = 0; b <= a; b++) {
-    real s = R(0.0);
+    const double *x = Q + a * K, *z = Q + b * K;
+    real s = R(0.0), s1 = s, s2 = s, s3 = s; /* no addition waits for the one before */
     double prior = 0.0;
-    for (int r = 0; r < K; r += LANES) s += LOAD(Q + a * K + r) * LOAD(Q + b * K + r);
+    int r = 0;
+    for (; r + 3 * LANES < K; r += 4 * LANES) {
+      s += LOAD(x + r) * LOAD(z + r);
+      s1 += LOAD(x + r + LANES) * LOAD(z + r + LANES);
+      s2 += LOAD(x + r + 2 * LANES) * LOAD(z + r + 2 * LANES);
+      s3 += LOAD(x + r + 3 * LANES) * LOAD(z + r + 3 * LANES);
+    }
+    for (; r < K; r += LANES) s += LOAD(x + r) * LOAD(z + r);
+    s = (s + s1) + (s2 + s3);
     for (int c = 0; c < C; c++) prior += W[a * C + c] * d[c] * W[b * C + c];
     out[a * N + b] = out[b * N + a] = WIDENED * (prior - TOTAL(s));
   }

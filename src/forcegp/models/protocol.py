@@ -176,7 +176,7 @@ class Posterior(Summary, ABC):
         Raises
         ------
         InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
-        CompilerError: there is no C++ compiler, or it fails.
+        CompilerError: there is no C compiler, or it fails.
         """
         raise InvalidInput(
             f"a {self.description} has no predictor for control rates; call predict, or use a structured Gaussian "

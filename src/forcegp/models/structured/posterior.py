@@ -176,12 +176,7 @@ class StructuredPosterior(Posterior):
         largest_rank: int = 512,
         compile: bool = True,
     ) -> Predictor:
-        noise = self.model.noise
-        if noise is not None and noise.measured_torque:
-            raise InvalidInput(
-                "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
-                "predict, or fit with Noise(..., measured_torque=False)."
-            )
+        self._require_commanded_torques()
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
         physics = self._physics(self.system)
         return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
@@ -335,21 +330,30 @@ class StructuredPosterior(Posterior):
                 return mean()
             return through(draw_functions(self.latent, samples, seed, self.widening))
 
-        noise = self.model.noise
-        if noise is not None and noise.measured_torque:  # whose accelerations are shrunk
-            return AccelerationModel(system, baumgarte, mean, sampled)
-
         def compiled(integrator: str, samples: int, seed: int) -> list[FusedLoop] | None:
-            return self._code(system).loops(integrator, self.latent, samples, seed)
+            return self.code(system).loops(integrator, self.latent, samples, seed)
 
         return AccelerationModel(system, baumgarte, mean, sampled, compiled)
 
-    def _code(self, system: MechanicalSystem) -> PredictorCode:
-        """Programs of the mean in a system."""
+    def code(self, system: MechanicalSystem | None = None) -> PredictorCode:
+        """The mean as a graph, from which programs are written, in another system if one is given.
+
+        Raises InvalidInput for operations that no graph holds, models on another device, and noisy torques.
+        """
+        system = self.system if system is None else system
+        self._require_commanded_torques()
         prepared = PreparedKernels.of(self.latent)
         example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
         calls = latent_calls(self.latent, prepared, None)
         return PredictorCode.of(self._physics(system).traced, example, calls, None, self.widening)
+
+    def _require_commanded_torques(self) -> None:
+        noise = self.model.noise
+        if noise is not None and noise.measured_torque:
+            raise InvalidInput(
+                "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
+                "predict, or fit with Noise(..., measured_torque=False)."
+            )
 
     def _physics(self, system: MechanicalSystem) -> PredictorPhysics:
         inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None

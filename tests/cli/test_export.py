@@ -1,0 +1,70 @@
+"""`forcegp export` from end to end, and whatever can be asked wrongly."""
+
+import json
+import shutil
+import subprocess
+
+import pytest
+from tests.models.arm import arm_data
+
+QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1, "--no-checks")
+FILES = {"arm.c", "arm.h", "arm_external.c", "arm_acados.c", "CMakeLists.txt", "example.c", "self_test.c", "README.txt"}
+
+
+@pytest.fixture(scope="module")
+def folder(forcegp, tmp_path_factory):
+    """A model of the small arm, and one of another kind."""
+    place = tmp_path_factory.mktemp("export")
+    arm_data(40, 0).save(place / "arm.h5")
+    for name, more in (("run", ()), ("black", ("--model", "gp"))):
+        done = forcegp("fit", "arm.h5", *QUICK, *more, "--out", name, folder=place)
+        assert done.returncode == 0, done.stderr
+    return place
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+def test_a_model_becomes_a_program(forcegp, folder):
+    words = ("export", "run", "--to", "c", "--out", "deployed", "--steps", 0.02)
+    done = forcegp(*words, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    out = folder / "deployed"
+    assert set(summary["files"]) == FILES
+    assert {file.name for file in out.iterdir()} == FILES | {"config.json", "SHA256SUMS"}
+    assert set(summary["differences"]) == {"arm_mean", "arm_step"}
+    assert summary["differences"]["arm_mean"] < 5e-12
+    assert "model: run" in (out / "arm.h").read_text()
+    subprocess.run(["cc", "-std=c99", "self_test.c", "arm.c", "-o", "x", "-lm"], cwd=out, check=True)
+    assert subprocess.run(["./x"], cwd=out, capture_output=True, check=False).returncode == 0
+
+    again = forcegp(*words, folder=folder)
+    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
+    assert "add --overwrite" in again.stderr
+    shown = forcegp(*words, "--overwrite", "--unchecked", folder=folder)
+    assert shown.returncode == 0
+    assert "self_test.c" in shown.stdout
+    assert "arm_mean" not in shown.stdout  # nothing was compared
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("run", "--steps", 0), "dt is 0.0; give the time step as a positive number of seconds"),
+        (("run", "--integrator", "rk4"), "--integrator was given without --steps"),
+        (("run", "--steps", 0.1, "--integrator", "projected"), "an exported step is not 'projected'"),
+        (("run", "--steps", 0.1, "--integrator", "rk"), "integrator 'rk'"),
+        (("black",), "cannot be exported as C; only models with rigid-body dynamics can"),
+        (("nowhere",), "nowhere does not exist; give the folder that `forcegp fit --out` wrote"),
+    ],
+)
+def test_what_cannot_be_exported_is_one_line(forcegp, folder, words, message):
+    done = forcegp("export", *words, "--to", "c", "--out", "never", folder=folder)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert message in done.stderr
+    assert not (folder / "never").exists()
+    assert not list(folder.glob(".*"))
+
+
+def test_another_target_is_refused(forcegp, folder):
+    done = forcegp("export", "run", "--to", "onnx", "--out", "never", folder=folder)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
