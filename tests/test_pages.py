@@ -2,8 +2,11 @@
 
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
+import pytest
 from tests.cli.in_process import run_here
 from tests.examples import run_example
 
@@ -100,3 +103,23 @@ def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
     assert names == ["Simulate", "Simulate", "Fit", "Rollout"]
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "deploy.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    files, agree = run_example(example, tmp_path).splitlines()
+    assert "lbr_iiwa_acados.c" in files
+    assert agree == "True"
+    commands, build = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    for command in commands.splitlines():
+        done = run_here(*shlex.split(command)[1:], folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+    for command in build.splitlines():
+        done = subprocess.run(
+            command, shell=True, cwd=tmp_path / "controller", capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, command + done.stdout + done.stderr
+    assert "lbr_iiwa_acceleration" in page
+    assert "lbr_iiwa_acceleration(" in (tmp_path / "controller" / "lbr_iiwa_external.c").read_text()

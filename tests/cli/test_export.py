@@ -16,7 +16,7 @@ def folder(forcegp, tmp_path_factory):
     """A model of the small arm, and one of another kind."""
     place = tmp_path_factory.mktemp("export")
     arm_data(40, 0).save(place / "arm.h5")
-    for name, more in (("run", ()), ("black", ("--model", "gp"))):
+    for name, more in (("run", ()), ("black", ("--model", "independent-gp"))):
         done = forcegp("fit", "arm.h5", *QUICK, *more, "--out", name, folder=place)
         assert done.returncode == 0, done.stderr
     return place
@@ -34,8 +34,8 @@ def test_a_model_becomes_a_program(forcegp, folder):
     assert set(summary["differences"]) == {"arm_mean", "arm_step"}
     assert summary["differences"]["arm_mean"] < 5e-12
     assert "model: run" in (out / "arm.h").read_text()
-    subprocess.run(["cc", "-std=c99", "self_test.c", "arm.c", "-o", "x", "-lm"], cwd=out, check=True)
-    assert subprocess.run(["./x"], cwd=out, capture_output=True, check=False).returncode == 0
+    subprocess.run(["cc", "-std=c99", "self_test.c", "arm.c", "-o", "../x", "-lm"], cwd=out, check=True)
+    assert subprocess.run(["../x"], cwd=out, capture_output=True, check=False).returncode == 0
 
     again = forcegp(*words, folder=folder)
     assert (again.returncode, again.stderr.count("\n")) == (2, 1)

@@ -98,7 +98,7 @@ def export_c(
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(
             f"a {type(posterior).__name__} cannot be exported as C; only models with rigid-body dynamics can: fit a "
-            "StructuredGP (`forcegp fit` without --model)."
+            "StructuredGP (forcegp fit --model structured)."
         )
     posterior = posterior.to("cpu") if posterior.training.q.device.type != "cpu" else posterior
     if steps is not None:
