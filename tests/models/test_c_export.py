@@ -344,3 +344,18 @@ def test_a_folder_with_files_stays(posterior, tmp_path):
 )
 def test_names_for_c(given, found):
     assert identifier(given) == found
+
+
+def test_a_state_outside_of_a_table_is_reported(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = StructuredGP(arm_system(), JointFriction(kernel="squared-exponential")).fit(arm_data(140, 0), **options)
+    made = export_c(model, tmp_path / "arm")
+    assert 0.0 < made.differences["arm_mean"] < 1e-7
+    assert "tables of one input, relative error" in (tmp_path / "arm" / "arm.h").read_text()
+    mean = compiled(tmp_path / "arm", "arm.c").arm_mean
+    assert call(mean, [3], [0.3] * 3, [0.5] * 3, [0.0] * 3)[0] == 0
+    bits, (a,) = call(mean, [3], [0.3] * 3, [1e3] * 3, [0.0] * 3)
+    assert bits == 4
+    assert np.isnan(a).all()
