@@ -83,7 +83,9 @@ class LatentPosterior(ABC):
 
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
-        height = max(1, BLOCK_BYTES // max(1, 8 * len(centers)))
+        if not len(centers):
+            return z.new_zeros(len(z))
+        height = max(1, BLOCK_BYTES // (8 * len(centers)))
         blocks = []
         for i in range(0, len(z), height):
             K = kernel.cross(z[i : i + height], centers)
