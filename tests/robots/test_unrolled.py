@@ -51,7 +51,7 @@ def test_dynamics_equal_those_of_the_robot_and_of_pinocchio(case):
     scalars = Scalars(q, v, a)
     at = UnrolledKinematics(UnrolledRobot(robot), *scalars.given[:2])
     M, bias = scalars.numbers(at.mass_matrix()), scalars.numbers(at.bias_forces())
-    tau = scalars.numbers(at.inverse_dynamics(scalars.given[2]))
+    tau = scalars.numbers(at.inverse_dynamics(np.array(scalars.given[2], dtype=object)))
     close(M, robot.mass_matrix(q))
     close(bias, robot.bias_forces(q, v))
     close(scalars.numbers(at.gravity_forces()), robot.gravity_forces(q))
@@ -80,7 +80,7 @@ def test_coarser_rounding_drops_what_angles_of_twelve_digits_leave():
     robot = Robot.from_urdf_text(MODELS["iiwa"]())
     q = torch.randn(COUNT, robot.nv, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     fine, coarse = (UnrolledRobot(robot, rounding=rounding) for rounding in (1e-15, 1e-11))
-    entries = [[x for joint in of.joints for x in joint.rotation.flat] for of in (fine, coarse)]
+    entries = [[x for joint in of.joints for x in joint.rotation.ravel().tolist()] for of in (fine, coarse)]
     assert entries[0].count(0.0) < entries[1].count(0.0) == 6 * robot.nv  # the turns are signed permutations
     scalars = Scalars(q)
     close(scalars.numbers(UnrolledKinematics(coarse, *scalars.given).mass_matrix()), robot.mass_matrix(q))
