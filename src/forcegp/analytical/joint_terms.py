@@ -88,8 +88,7 @@ LAWS: dict[str, Law] = {
         ),
     ),
     "load": Law(
-        LoadJointFriction,
-        (COULOMB, Field("load", "1", (0, 0, 0.1), highest=9.0, known="coefficients"), VELOCITY_SCALE),
+        LoadJointFriction, (COULOMB, Field("load", "1", (0, 0, 0.1), highest=9.0, known="coefficients"), VELOCITY_SCALE)
     ),
     "offset": Law(ConstantJointForce, (Field("offset", "force", (1, 0, 0.1), lowest=-np.inf, known="values"),)),
 }

@@ -235,10 +235,7 @@ def _motion_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
             order = np.arange(len(names))
             order[[one, other]] = order[[other, one]]
             motion = now.correction.motion(order, ones)
-            for what, correction in (
-                ("positions and velocities", motion),
-                ("all signals", motion.torque(order, ones)),
-            ):
+            for what, correction in (("positions and velocities", motion), ("all signals", motion.torque(order, ones))):
                 finding = Finding(
                     severity="wrong",
                     subject="joints exchanged",

@@ -176,10 +176,7 @@ def _merged(findings: list[Finding], nv: int) -> list[Finding]:
         each = "" if alike else f" Factors: {', '.join(f'{factor:.3g}' for factor in factors)}."
         merged.append(
             replace(
-                first,
-                joints=joints,
-                seen=f"{seen}{each}",
-                numbers={"each": [dict(item.numbers) for item in group]},
+                first, joints=joints, seen=f"{seen}{each}", numbers={"each": [dict(item.numbers) for item in group]}
             )
         )
     return merged

@@ -154,12 +154,7 @@ class Posterior(Summary, ABC):
         raise InvalidInput(f"a {self.description} has no latent forces, so it has no curves; use a StructuredGP.")
 
     def predictor(
-        self,
-        *,
-        covariance: str = "auto",
-        tolerance: float = 0.01,
-        largest_rank: int = 512,
-        compile: bool = True,
+        self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 512, compile: bool = True
     ) -> Predictor:
         """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
 
@@ -352,12 +347,7 @@ class Model(ABC):
 
     @abstractmethod
     def fit(
-        self,
-        dataset: Dataset,
-        *,
-        points: int | None = None,
-        seed: int = 0,
-        progress: FitProgress | None = None,
+        self, dataset: Dataset, *, points: int | None = None, seed: int = 0, progress: FitProgress | None = None
     ) -> Posterior:
         """Learn from `points` rows that lie far apart in (q, v, u) (None: from all rows).
 

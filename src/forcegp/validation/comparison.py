@@ -15,11 +15,7 @@ from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions
-from forcegp.validation.identified_systems import (
-    DEFAULT_IDENTIFICATION,
-    FRICTION,
-    IDENTIFICATIONS,
-)
+from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, FRICTION, IDENTIFICATIONS
 from forcegp.validation.splits import Split
 from forcegp.validation.training_subsets import training_subset
 

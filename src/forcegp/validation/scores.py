@@ -49,9 +49,7 @@ def normalized_error(
 
 
 def force_errors(
-    predicted: Float[np.ndarray, "rows nv"],
-    target: Float[np.ndarray, "rows nv"],
-    mass: Float[np.ndarray, "rows nv nv"],
+    predicted: Float[np.ndarray, "rows nv"], target: Float[np.ndarray, "rows nv"], mass: Float[np.ndarray, "rows nv nv"]
 ) -> Float[np.ndarray, "rows nv"]:
     """M (predicted - target): the joint forces [Nm or N] that the errors of the acceleration amount to."""
     return (mass @ (predicted - target)[..., None])[..., 0]

@@ -94,12 +94,7 @@ class NeuralNetwork(NetworkModel):
         )
 
     def _descend(
-        self,
-        weights: dict[str, Tensor],
-        x: Tensor,
-        a: Tensor,
-        generator: torch.Generator,
-        progress: FitProgress | None,
+        self, weights: dict[str, Tensor], x: Tensor, a: Tensor, generator: torch.Generator, progress: FitProgress | None
     ) -> tuple[float, ...]:
         """Adam in place; the mean loss between any two reports."""
         layer = SigmoidLayer(self.width)
