@@ -108,10 +108,8 @@ class Posterior(Summary, ABC):
         """What `result.history` holds, with its unit in brackets."""
         return "negative log likelihood with hyperpriors [nats]"
 
-    @property
-    def predicts_forces(self) -> bool:
-        """Whether predictions hold the forces behind the acceleration."""
-        return True
+    predicts_forces: ClassVar[bool] = True
+    """Whether predictions hold the forces behind the acceleration."""
 
     @property
     def carries_known_forces(self) -> bool:
@@ -292,7 +290,7 @@ class Posterior(Summary, ABC):
             "a StructuredGP with engine='exact'."
         )
 
-    def with_system(self, system: MechanicalSystem) -> Posterior:
+    def with_system(self: AnyPosterior, system: MechanicalSystem) -> AnyPosterior:
         """The same knowledge in another system (robot, contacts, known forces) with the same joints.
 
         Raises InvalidInput for systems that it cannot be carried to: for every model that learned accelerations.
@@ -302,12 +300,19 @@ class Posterior(Summary, ABC):
             "another; fit it to data from there, or use a structured model, which learns forces."
         )
 
-    def with_contacts(self, contacts: Sequence[Contact]) -> Posterior:
-        """The same knowledge under other contacts. Raises InvalidInput as `with_system`."""
+    def with_contacts(self: AnyPosterior, contacts: Sequence[Contact]) -> AnyPosterior:
+        """The same knowledge under other contacts, without another fit: another surface, or none at all, `[]`.
+
+        What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
+        are zero without it. Raises InvalidInput as `with_system`.
+        """
         return self.with_system(self.system.with_contacts(contacts))
 
-    def with_robot(self, robot: Robot) -> Posterior:
-        """The same knowledge on another robot with the same joints. Raises InvalidInput as `with_system`."""
+    def with_robot(self: AnyPosterior, robot: Robot) -> AnyPosterior:
+        """The same knowledge on another robot with the same joints, for example with another known tool.
+
+        Raises InvalidInput as `with_system`.
+        """
         return self.with_system(self.system.with_robot(robot))
 
     def to(self: AnyPosterior, device: torch.device | str) -> AnyPosterior:

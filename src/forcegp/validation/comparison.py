@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -89,24 +89,13 @@ class Comparison:
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the numbers, as plain JSON values."""
-        options = (
-            "points",
-            "starts",
-            "integrator",
-            "identification",
-            "restarts",
-            "iterations",
-            "force_noise",
-            "measured_torque",
-            "friction",
-        )
-        given = {name: getattr(self, name) for name in options}
+        digested = ("rows", "recording", "system", "splits")
+        given = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in digested}
         return {
             "rows_sha256": fingerprint(self.rows),
             "recording_sha256": fingerprint(self.recording),
             "system_sha256": hashlib.sha256(self.system.to_json().encode()).hexdigest(),
             "splits": [split.to_dict() for split in self.splits],
-            "horizons": list(self.horizons),
             **{name: list(value) if isinstance(value, tuple) else value for name, value in given.items()},
         }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -133,6 +133,7 @@ class IndependentPosterior(Posterior):
     settings: Mapping[str, Any]
     latents: tuple[ExactPosterior, ...]
     """The posterior of every joint's function."""
+    predicts_forces: ClassVar[bool] = False
 
     @property
     @override
@@ -165,11 +166,6 @@ class IndependentPosterior(Posterior):
             return through([draw_functions(latent, samples, int(own)) for latent, own in each])
 
         return AccelerationModel(base.system, None, mean, sampled)
-
-    @property
-    @override
-    def predicts_forces(self) -> bool:
-        return False
 
     @property
     @override

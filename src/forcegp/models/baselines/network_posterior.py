@@ -94,6 +94,7 @@ class NetworkPosterior(Posterior):
     parameters: Mapping[str, Tensor]
     result: OptimizationResult
     settings: Mapping[str, Any]
+    predicts_forces: ClassVar[bool] = False
 
     @property
     @override
@@ -127,11 +128,6 @@ class NetworkPosterior(Posterior):
         with torch.no_grad():
             _, _, scatter = self._moments(self.data.q, self.data.v, self.data.u)
         return scatter.mean(0).sqrt()
-
-    @property
-    @override
-    def predicts_forces(self) -> bool:
-        return False
 
     @property
     @override

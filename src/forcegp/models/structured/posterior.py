@@ -29,7 +29,7 @@ from forcegp.inference.cholesky_update import rows_to_keep
 from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
+from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
@@ -47,7 +47,6 @@ from forcegp.models.structured.predictor_preparation import PredictorPhysics, pr
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
-from forcegp.robots import Robot
 from forcegp.robots.real_numbers import real_tensor
 
 
@@ -245,28 +244,12 @@ class StructuredPosterior(Posterior):
         return self.likelihood.standardization.scale
 
     @override
-    def with_contacts(self, contacts: Sequence[Contact]) -> StructuredPosterior:
-        """The same forces under other contacts, without another fit: another surface, or none at all, `[]`.
-
-        What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
-        are zero without it.
-        """
-        return self.with_system(self.system.with_contacts(contacts))
-
-    @override
-    def with_robot(self, robot: Robot) -> StructuredPosterior:
-        """The same forces on another robot with the same joints, for example with another known tool.
-
-        Raises InvalidInput for other joints, and for a model without analytical mean, whose processes hold the weight
-        and inertia of the robot that it was trained on.
-        """
-        return self.with_system(self.system.with_robot(robot))
-
-    @override
     def with_system(self, system: MechanicalSystem) -> StructuredPosterior:
         """The same forces in another system (robot, contacts, known forces, stabilisation) with the same joints.
 
-        Raises InvalidInput as `with_robot`, and UnknownFrame where a force acts on a frame that the robot lacks.
+        Raises InvalidInput for other joints, and, without an analytical mean, for another robot: the processes hold
+        the weight and inertia of the one that they were trained on; UnknownFrame where a force acts on a frame that the
+        robot lacks.
         """
         require_type("system", system, MechanicalSystem)
         trained = self.model.system
