@@ -9,6 +9,7 @@ TITLES = {
     "learning": "Learning from 100 points",
     "incremental": "Learning while the robot works",
     "prediction": "Predictions at control rates",
+    "searches": "Searches for hyper-parameters",
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
     "backends": "Restarts in several processes",
@@ -97,7 +98,15 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "predict_rank": ("", "combinations of the data that the compressed covariance uses, of 6000"),
         "predict_prepare_s": ("", "making the predictor: tracing, compiling, compressing [s, wall-clock]"),
     },
+    "searches": {
+        "search_evaluations_n100": (
+            "<= 360",
+            "evaluations of a fit with four starts, N = 100: largest of the medians over five recordings of S-GP [38], "
+            "S-GP without mean and S-GP + analytical mean",
+        ),
+    },
     "large_data": {
+        "fit_seconds_n1000_coulomb": ("<= 400", "Coulomb friction in the joints, joint prior, N = 1000 [CPU s]"),
         "fit_n1000_cpu_s": ("<= 480", "fit to 1000 rows, joint prior, to convergence [CPU s]"),
         "fit_n1000_memory_mib": ("<= 400", "the same: peak memory above the data [MiB]"),
         "fit_n10000_cpu_s": ("<= 480", "hyper-parameters from 600 rows, posterior from 10,000, joint prior [CPU s]"),

@@ -57,6 +57,7 @@ PACKAGES["cli"] = set(PACKAGES)
 # Optional or slow to import: imported inside the function that uses them. Modules named here may import them
 # at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
+    "casadi": (),
     "pybullet": (),
     "matplotlib": ("forcegp.evaluation.plots", "forcegp.experiments", "forcegp.validation.figures"),
     "joblib": (),

@@ -300,6 +300,7 @@ def test_other_errors_pass():
         {"tolerance": math.nan},
         {"adam_rate": 0.0},
         {"memory": 0},
+        {"patience": -1},
     ],
     ids=str,
 )
@@ -343,3 +344,36 @@ def test_slow_progress_ends_the_search_and_says_so():
     assert len(content.history) < len(patient.history)
     assert content.history[-6] - content.history[-1] < 50.0
     assert content.value == min(content.history)
+
+
+def test_a_search_without_hope_of_reaching_an_earlier_one_ends_and_says_so():
+    options = OptimizerOptions(patience=10)
+    alone = minimize_objective(rosenbrock, start(), options)
+    assert alone.converged
+    assert minimize_objective(rosenbrock, start(), options, rival=50.0).history == alone.history
+    behind = minimize_objective(rosenbrock, start(), options, rival=-100.0)
+    assert behind.status == "dropped: 10 iterations at its pace would not reach the best of earlier starts"
+    assert not behind.converged
+    k = len(behind.history) - 1
+    pace = [alone.history[i - 5] - alone.history[i] for i in range(5, k + 1)]
+    hopeless = [alone.history[i] + 100.0 > 2.0 * pace[i - 5] for i in range(5, k + 1)]
+    assert hopeless == [False] * (k - 5) + [True]
+
+
+def test_the_best_of_several_starts_counts_those_that_were_dropped():
+    options = OptimizerOptions(patience=10)
+    results = [minimize_objective(rosenbrock, start(), options, rival=rival) for rival in (math.inf, -100.0)]
+    assert best_of(results).status.endswith("(best of 2 starts, 1 of them dropped)")
+
+
+def test_a_search_that_remembers_all_steps_and_counts_in_nats_ends_with_half_of_the_evaluations():
+    curvature = torch.logspace(-1, 3, 80, dtype=torch.float64)
+
+    def quadratic(parameters):
+        return 700.0 + 0.5 * (curvature * parameters["x"].square()).sum()
+
+    begin = {"x": torch.ones(80, dtype=torch.float64)}
+    fast = minimize_objective(quadratic, begin, OptimizerOptions(slow=0.02))
+    slow = minimize_objective(quadratic, begin, OptimizerOptions(memory=20))
+    assert fast.evaluations <= 0.5 * slow.evaluations
+    assert fast.value < slow.value + 0.05

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -109,7 +109,8 @@ class Compare(LearningOptions):
         test: forcegp.Dataset | None,
     ) -> forcegp.PriorComparison:
         points = min(POINTS, len(dataset)) if self.points is None else self.points
-        options = forcegp.inference.OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps)
+        options = forcegp.models.default_options(points)
+        options = replace(options, iterations=self.iterations, adam_steps=self.adam_steps)
         restarts = forcegp.models.default_restarts(points) if self.restarts is None else self.restarts
         names, steps = list(priors), options.iterations + options.adam_steps
         with terminal.progress(f"comparing: {points} points", may_end_early=True) as report:

@@ -6,7 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -114,7 +114,7 @@ class Demo(Command):
             restarts=None,
             seed=0,
             jobs=self.jobs,
-            options=forcegp.inference.OptimizerOptions(iterations=self.iterations),
+            options=replace(forcegp.models.default_options(self.points), iterations=self.iterations),
         )
         seconds = time.monotonic() - start
         forcegp.save_posterior(posterior, run)

@@ -1,1 +1,1 @@
-"""Programs made while forcegp runs: tapes of torch code, and machine code from a C or C++ compiler."""
+"""Programs made while forcegp runs: graphs of scalars, their derivatives, their C text, and the C compiler."""

@@ -1,8 +1,8 @@
 """From a function written in torch to a graph: the tensor operations of one call, taken apart into scalars.
 
-The function runs once on an example, while `make_fx` of torch notes the operations; loops and branches of Python leave
-no trace. Operations that only move numbers (slices, stacks, transposes, ...) run on tensors of node numbers instead of
-values, so torch itself does the moving.
+The function runs once on an example, and every operation of it is noted; loops and branches of Python leave no trace.
+Operations that only move numbers (slices, stacks, transposes, ...) run on tensors of node numbers instead of values, so
+torch itself does the moving.
 
 A second implementation of each force is not needed: surfaces, known forces and priors of anybody are in the graph as
 they stand. At one state the cost of rigid-body dynamics is that of calling torch operations.
@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.fx.node import map_arg
+from torch import Tensor, _decomp
 from torch.utils import _pytree
+from torch.utils._python_dispatch import TorchDispatchMode
+from typing_extensions import override
 
 from forcegp.codegen.branch_free_linalg import StraightLineAlgebra
 from forcegp.codegen.graph import ONE, UNARY, ZERO, Expression, Graph
@@ -54,30 +56,62 @@ def trace(
     Inputs are flattened in order; with `graph` they are its `inputs`. Raises InvalidInput, naming the operation, where
     the function does what a graph cannot hold.
     """
-    from torch._decomp import core_aten_decompositions  # these two take a while to import
-    from torch.fx.experimental.proxy_tensor import make_fx
-
-    with torch.no_grad(), StraightLineAlgebra():
-        table = dict(core_aten_decompositions().items())
-        traced = make_fx(lambda *x: function(*x), decomposition_table=table)(*examples).graph  # type: ignore[arg-type]  # its keys are operations
+    examples = [x.detach().clone() for x in examples]
     graph = Graph(sum(x.numel() for x in examples)) if graph is None else graph
     nodes = torch.tensor([x.node for x in inputs] or graph.inputs).split([x.numel() for x in examples])
-    given = iter([_Numbers(part.view(x.shape)) for part, x in zip(nodes, examples, strict=True)])
-    owner = traced.owning_module
-    found: dict[torch.fx.Node, Any] = {}
-    for node in traced.nodes:
-        match node.op:
-            case "placeholder":
-                found[node] = next(given)
-            case "get_attr":
-                found[node] = getattr(owner, str(node.target))
-            case "output":
-                results = node.args[0] if isinstance(node.args[0], list | tuple) else [node.args[0]]
-                return graph, [_numbers(graph, found[result]).nodes for result in results]
-            case _:
-                args, kwargs = map_arg((node.args, node.kwargs), found.__getitem__)
-                found[node] = _apply(graph, node.target, args, kwargs)
-    raise AssertionError("a traced function has an output")
+    recorded = _Recording(graph)
+    for x, part in zip(examples, nodes, strict=True):
+        recorded.note(x, _Numbers(part.view(x.shape)))
+    with torch.no_grad(), StraightLineAlgebra(), recorded:
+        results = list(function(*examples))
+    return graph, [_numbers(graph, recorded.numbers_of(x)).nodes for x in results]
+
+
+class _Recording(TorchDispatchMode):
+    """Runs operations, and keeps the node numbers of what depends on the inputs."""
+
+    def __init__(self, graph: Graph) -> None:
+        super().__init__()
+        self.graph, self._known = graph, {}
+
+    def note(self, tensor: Tensor, numbers: _Numbers) -> None:
+        """The nodes of a tensor, which is kept alive so that no other gets its id."""
+        self._known[id(tensor)] = tensor, numbers
+
+    def numbers_of(self, value: Any) -> Any:
+        """The nodes of a tensor that depends on the inputs; anything else as it is."""
+        return self._known[id(value)][1] if id(value) in self._known else value
+
+    @classmethod
+    @override
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # whose import takes longer than all else here
+
+    @override
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
+        kwargs = kwargs or {}
+        with self:
+            found = _decompositions().get(func, func.decompose)(*args, **kwargs)  # type: ignore[reportOptionalCall]  # it is a method
+        if found is not NotImplemented:
+            return found
+        result = func(*args, **kwargs)
+        given = _pytree.tree_map(self.numbers_of, (args, kwargs))
+        if any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(given)):
+            numbers = _apply(self.graph, func, *given)
+            tensors, found = (x if isinstance(x, list | tuple) else [x] for x in (result, numbers))
+            for tensor, part in zip(tensors, found, strict=True):
+                if isinstance(part, _Numbers):
+                    self.note(tensor, part)
+        return result
+
+
+@cache
+def _decompositions() -> dict[Any, Callable[..., Any]]:
+    """What makes few operations of the many that torch has.
+
+    The public function gives those of torch.export as well, and takes a second to import it.
+    """
+    return getattr(_decomp, "_core_aten_decompositions_post_autograd", _decomp.core_aten_decompositions)()
 
 
 class _Numbers:
@@ -96,12 +130,7 @@ def _numbers(graph: Graph, value: _Numbers | Tensor | float | int) -> _Numbers:
 
 def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     """One operation of torch on constants or node numbers."""
-    flat = _pytree.tree_leaves((args, kwargs))
-    if not any(isinstance(value, _Numbers) for value in flat):
-        return target(*args, **kwargs)
     name = getattr(target, "__name__", str(target)).split(".")[0]
-    if name == "getitem":
-        return args[0][args[1]]
     known = not any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(args[1:]))
     if name in MOVING and (known or name not in INDEXED):
         return _moved(graph, target, args, kwargs, name in INDEXED)

@@ -67,10 +67,10 @@ INLINE real r_exp(real x) {
   const real y = WHERE(x > low, p * power + power, R(0.0));
   return WHERE(x == x, WHERE(x > R(709.7), R(INFINITY), y), x);
 }
-static APART real r_expm1(real x) {
-  if (any((x > 709.0) | (x < -708.0) | (x != x))) return by_lane(expm1, x);
-  real power; const real p = reduced_exp(x, &power);
-  return p * power + (power - 1.0);
+INLINE real r_expm1(real x) {
+  const real low = R(-708.0), high = R(709.0), bounded = WHERE(x > low, WHERE(x < high, x, high), low);
+  real power; const real p = reduced_exp(bounded, &power), y = p * power + (power - 1.0);
+  return WHERE(x == x, WHERE(x > R(709.7), R(INFINITY), y), x);
 }
 static APART real r_tanh(real x) {
   const real a = r_absolute(x), bounded = WHERE(a < 22.0, a, R(22.0)), e = r_expm1(2.0 * bounded), y = e / (e + 2.0);

@@ -69,9 +69,7 @@ def compress(
     """
     with torch.no_grad():
         D, _ = _directions(latent, sample)
-        _, vectors = torch.linalg.eigh(D.mT @ D)
-        columns = D @ vectors.flip(-1)[:, : min(largest, *D.shape)]
-        B, _ = torch.linalg.qr(columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300))
+        B = _leading(D, min(largest, *D.shape))
         at, total = _directions(latent, check)
         seen = (B.mT @ at).square_().cumsum_(0)
         excess = (total - seen).clamp_min_(0.0)  # in units of the exact variance
@@ -82,6 +80,20 @@ def compress(
         factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], rank))
         chosen = tuple(factors[list(group)].contiguous() for group in groups)
     return CompressedCovariance(chosen, (1.0 + excess[rank - 1]).sqrt() - 1.0)
+
+
+def _leading(D: Float[Tensor, "n m"], count: int) -> Float[Tensor, "n count"]:
+    """The leading left singular vectors of D, from its smaller Gram matrix."""
+    if len(D) <= D.shape[1]:
+        return torch.linalg.eigh(D @ D.mT)[1].flip(-1)[:, :count]
+    columns = D @ torch.linalg.eigh(D.mT @ D)[1].flip(-1)[:, :count]
+    for _ in range(2):  # Cholesky's QR: nearly orthogonal the first time, orthogonal to rounding the second
+        columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300)
+        lower, failed = torch.linalg.cholesky_ex(columns.mT @ columns)
+        if int(failed):
+            return torch.linalg.qr(columns)[0]
+        columns = torch.linalg.solve_triangular(lower.mT, columns, upper=True, left=False)
+    return columns
 
 
 def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "n _"], Float[Tensor, " _"]]:

@@ -13,6 +13,7 @@ there is only one, several centres.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -70,6 +71,7 @@ class KernelSum:
     kernels: tuple[int, ...]
     prior: Graph
     variances: tuple[int, ...]
+    level: tuple[float, ...]
     roots: Float[Tensor, "G N R"] | None = None
 
     @classmethod
@@ -81,19 +83,31 @@ class KernelSum:
         weights: Float[Tensor, "G N"],
         function: PairFunction,
         diagonal: Callable[[Tensor], Tensor],
+        level: tuple[float, ...],
     ) -> KernelSum:
-        """Traced from the kernels. Raises InvalidInput, naming the operation, for those that no graph holds."""
+        """Traced from the kernels less a constant `level` of each.
+
+        Raises InvalidInput, naming the operation, for those that no graph holds.
+        """
         example = centers[:1]
         pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
         prior, (variances,) = trace(lambda z: [diagonal(z)], [example])
         nodes = (tuple(found.flatten().tolist()) for found in (kernels, variances))
-        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes))
+        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes), level)
 
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
         """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
         operands = self.given(graph, z)
         name = self.name + ("_slopes" if slopes else "")
-        return graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        constants = map(graph.constant, self.constants)
+        return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
+
+    @property
+    def constants(self) -> list[float]:
+        """What the sums of `pair` lack."""
+        totals = (math.fsum(weights.tolist()) for weights in self.weights)
+        return [level * total for level, total in zip(self.level, totals, strict=True)]
 
     def _dependence(self) -> list[int]:
         """Of every node of the pair: 1 if it depends on z, 2 on the centre, 3 on both, 0 on none."""
@@ -127,7 +141,7 @@ class KernelSum:
         return graph.copier(self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
 
     @cached_property
-    def _rows(self) -> list[int]:
+    def rows(self) -> list[int]:
         """What a centre gives: nodes of the pair."""
         return self._frontier(2)
 
@@ -151,12 +165,15 @@ class KernelSum:
         Eight numbers stand before the rows, so that these are aligned as the table is.
         """
         valid = len(self.centers)
-        padded = valid + -valid % PADDING
-        centers = np.concatenate([self.centers.numpy(), np.repeat(self.centers[-1:].numpy(), padded - valid, 0)])
-        inputs = [*np.zeros((self.features, 1)), *centers.T]
-        rows = [np.broadcast_to(x, padded) for x in evaluated(self.pair, self._rows, inputs)]
-        weights = np.pad(self.weights.numpy(), ((0, 0), (0, padded - valid)))
-        return np.concatenate([[padded, valid, *[0.0] * 6], *rows, *weights])
+        filled = -valid % PADDING
+        rows = [np.pad(row, (0, filled), "edge") for row in self.row_values()]
+        weights = np.pad(self.weights.numpy(), ((0, 0), (0, filled)))
+        return np.concatenate([[valid + filled, valid, *[0.0] * 6], *rows, *weights])
+
+    def row_values(self) -> list[np.ndarray]:
+        """The numbers of every row, one per centre."""
+        inputs = [*np.zeros((self.features, 1)), *self.centers.numpy().T]
+        return [np.broadcast_to(x, len(self.centers)) for x in evaluated(self.pair, self.rows, inputs)]
 
     def root_table(self) -> np.ndarray:
         """The roots of the compressed covariance, of as many centres as there are in the table."""
@@ -190,7 +207,7 @@ class KernelSum:
         state, centre, step = ("double", "real", "LANES") if one else ("real", "double", "1")
         G = len(self.latents)
         operands = {node: k for k, node in enumerate(self.operands)}
-        rows = {node: k for k, node in enumerate(self._rows)}
+        rows = {node: k for k, node in enumerate(self.rows)}
 
         def operand(node: int) -> str:
             operation, *rest = graph.nodes[node]
@@ -224,7 +241,8 @@ class KernelSum:
             if dependence[node] == 3:
                 text.append(f"    const real x{node} = {c_value(graph, node, operand, as_real, lanes)};")
         if keep:
-            text += [f"    STORE(k + {g} * {BLOCK} + j - first, {as_real(node)});" for g, node in enumerate(made)]
+            for g, (node, level) in enumerate(zip(made, self.level, strict=True)):
+                text.append(f"    STORE(k + {g} * {BLOCK} + j - first, {as_real(node)} + {level.hex()});")
         else:
             text += [f"    const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
             text += [f"    s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made)]

@@ -13,7 +13,8 @@ import torch
 from forcegp.codegen.graph import Graph
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.kernel_sums import PADDING, KernelSum
-from forcegp.inference.one_input_functions import markov_functions, one_input_form
+from forcegp.inference.one_input_functions import drawn_form, markov_functions, one_input_form
+from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.piecewise_tables import OneInputFunctions
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
@@ -114,6 +115,21 @@ def latent_calls(
             continue
         found.append(OneInputCall(part, functions, of_roots))
     return tuple(found)
+
+
+def drawn_calls(
+    latent: LatentPosterior, calls: Sequence[LatentCall], samples: int, seed: int, widening: float
+) -> list[tuple[LatentCall, ...]] | None:
+    """The functions that `draw_functions` draws, in the forms that `calls` have; None where one has no such form."""
+    drawn = draw_functions(latent, samples, seed, widening)
+    forms = []
+    for part in calls:
+        index = part.latents[0]
+        form = drawn_form(drawn, latent, index) if latent.features[index].shape[-1] == 1 else None
+        if form is None:
+            return None
+        forms.append((part.summed if isinstance(part, OneInputCall) else part, form))
+    return [tuple(OneInputCall(summed, form.only(r)) for summed, form in forms) for r in range(samples)]
 
 
 def _once(functions: OneInputFunctions, purpose: str, lanes: int) -> tuple[str, str]:

@@ -37,23 +37,26 @@ class OptimizerOptions:
 
     `iterations`: most L-BFGS iterations; `tolerance`: stop when an iteration lowers the objective by less than this
     fraction of it; `slow`: stop when `SLOW_ITERATIONS` of them together lower it by less than this (nats), 0 for never;
-    `gradient_tolerance`: stop when the largest gradient entry is below this; `adam_steps`, `adam_rate`: optional warm-
-    up; `keep_iterates`: keep the parameters after every iteration, too.
+    `patience`: stop when so many iterations at the present pace would not reach the best of earlier starts, 0 for
+    never; `gradient_tolerance`: stop when the largest gradient entry is below this; `memory`: iterations that make up
+    the curvature; `adam_steps`, `adam_rate`: optional warm-up; `keep_iterates`: keep the parameters after every one.
     """
 
     iterations: int = 200
     tolerance: float = 1e-8
     gradient_tolerance: float = 1e-4
-    memory: int = 20
+    memory: int = 200
     adam_steps: int = 0
     adam_rate: float = 0.1
     keep_iterates: bool = False
     slow: float = 0.0
+    patience: int = 0
 
     @usable_arguments("OptimizerOptions")
     def __post_init__(self) -> None:
-        if min(map(operator.index, (self.iterations, self.adam_steps))) < 0:
-            raise InvalidInput(f"iterations={self.iterations} and adam_steps={self.adam_steps} must be >= 0")
+        if min(map(operator.index, (self.iterations, self.adam_steps, self.patience))) < 0:
+            counts = f"iterations={self.iterations}, adam_steps={self.adam_steps} and patience={self.patience}"
+            raise InvalidInput(f"{counts} must be >= 0")
         if not (
             self.tolerance >= 0
             and self.slow >= 0
@@ -155,13 +158,14 @@ def minimize_objective(
     initial: Mapping[str, Tensor],
     options: OptimizerOptions | None = None,
     progress: ProgressCallback | None = None,
+    rival: float = np.inf,
 ) -> OptimizationResult:
     """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed).
 
     L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). Where the objective cannot be evaluated, the line search
     shortens its step. If it finds none that helps, the search rolls back to the best point seen and starts again from
     there with an empty memory, twice at most; then it ends there, with the reason.
-    `progress(iteration, value)` is called after every iteration.
+    `progress(iteration, value)` is called after every iteration; `rival` is the best value of earlier starts.
 
     Raises
     ------
@@ -185,12 +189,12 @@ def minimize_objective(
 
     def after_iteration(intermediate_result: OptimizeResult) -> None:
         record(float(intermediate_result.fun), intermediate_result.x)
-        if (
-            options.slow
-            and len(history) > SLOW_ITERATIONS
-            and history[-1 - SLOW_ITERATIONS] - history[-1] < options.slow
-        ):
+        hopeless = options.patience and SLOW_ITERATIONS * (history[-1] - rival) > options.patience * pace()
+        if len(history) > SLOW_ITERATIONS and (pace() < options.slow or hopeless):
             raise StopIteration  # ends the search at this point
+
+    def pace() -> float:
+        return history[-1 - SLOW_ITERATIONS :][0] - history[-1]
 
     if options.adam_steps:
         _adam(search, options, record)
@@ -220,6 +224,9 @@ def minimize_objective(
         remaining -= int(result.nit)
         converged = bool(result.success) or result.status == HALTED
         status = _sentence(int(result.status), str(result.message), options)
+        if result.status == HALTED and pace() >= options.slow:
+            converged = False
+            status = f"dropped: {options.patience} iterations at its pace would not reach the best of earlier starts"
         steep = bool(np.abs(search.best_slope).max() > options.gradient_tolerance)
         if result.status == LINE_SEARCH_FAILED and search.failures > failures_before:
             status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
@@ -275,4 +282,6 @@ def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float, n
 def best_of(results: list[OptimizationResult]) -> OptimizationResult:
     """The result with the lowest final value; its status holds how many searches it was chosen from."""
     chosen = min(results, key=lambda result: result.value)
-    return replace(chosen, status=f"{chosen.status} (best of {len(results)} starts)") if len(results) > 1 else chosen
+    dropped = sum(result.status.startswith("dropped") for result in results)
+    note = f"best of {len(results)} starts" + (f", {dropped} of them dropped" if dropped else "")
+    return replace(chosen, status=f"{chosen.status} ({note})") if len(results) > 1 else chosen

@@ -6,9 +6,11 @@ exact posterior has the training points as centres; others may have fewer.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -83,8 +85,17 @@ class LatentPosterior(ABC):
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
         height = max(1, BLOCK_BYTES // max(1, 8 * len(centers)))
-        blocks = [kernel.cross(z[i : i + height], centers) @ weights for i in range(0, len(z), height)]
+        blocks = []
+        for i in range(0, len(z), height):
+            K = kernel.cross(z[i : i + height], centers)
+            level = K.detach().mean(1, keepdim=True)  # with long length scales K is nearly constant, and all cancels
+            blocks.append((K - level) @ weights + level[:, 0] * self._totals[index])
         return torch.cat(blocks) if blocks else z.new_zeros(0)
+
+    @cached_property
+    def _totals(self) -> tuple[float, ...]:
+        """The sums of the weights, correctly rounded."""
+        return tuple(math.fsum(weights.tolist()) for weights in self.weights)
 
 
 class FactorizedPosterior(LatentPosterior):

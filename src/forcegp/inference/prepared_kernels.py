@@ -32,6 +32,7 @@ class SharedCenters:
     precisions: Float[Tensor, "G d"]  # 1 / l^2
     variances: Float[Tensor, " G"]
     own: Float[Tensor, "G N"]  # log s - 1/2 |z_j / l|^2
+    own_centers: Float[Tensor, "N d"]  # as they are in the posterior
 
     @classmethod
     def of(
@@ -40,7 +41,7 @@ class SharedCenters:
         """`scales` are the length scales and the variance of every latent."""
         precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])
         variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])
-        shift = centers.mean(0)
+        given, shift = centers, centers.mean(0)
         centers = centers - shift  # or what cancels would be large
         return cls(
             latents,
@@ -49,6 +50,7 @@ class SharedCenters:
             precisions,
             variances,
             variances.log()[:, None] - 0.5 * precisions @ centers.square().mT,
+            given,
         )
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n _"]:
@@ -68,16 +70,16 @@ class SharedCenters:
         return self.variances.expand(len(inputs), -1)
 
     def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, "1 G"]:
-        """k_c(z, z_j) from the features themselves, by the same formula."""
+        """k_c(z, z_j) - s_c from the features themselves: with long length scales k is nearly s, and sums cancel."""
         z, center = z - self.shift, center - self.shift
         scaled = z * self.precisions
-        own = self.variances.log() - 0.5 * (self.precisions * center.square()).sum(-1)
-        return (((scaled * center).sum(-1) + own) - 0.5 * (scaled * z).sum(-1)).exp()
+        own = -0.5 * (self.precisions * center.square()).sum(-1)
+        return self.variances * (((scaled * center).sum(-1) + own) - 0.5 * (scaled * z).sum(-1)).expm1()
 
     @property
-    def own_centers(self) -> Float[Tensor, "N d"]:
-        """As they are in the posterior."""
-        return self.centers + self.shift
+    def level(self) -> tuple[float, ...]:
+        """What `pair` leaves out."""
+        return tuple(self.variances.tolist())
 
     def variances_at(self, z: Float[Tensor, "1 d"]) -> Float[Tensor, "1 G"]:
         """k_c(z, z)."""
@@ -113,6 +115,11 @@ class AnyKernel:
         """As they are in the posterior."""
         return self.centers
 
+    @property
+    def level(self) -> tuple[float, ...]:
+        """What `pair` leaves out."""
+        return (0.0,)
+
     def variances_at(self, z: Float[Tensor, "1 d"]) -> Float[Tensor, " 1"]:
         """k(z, z)."""
         return self.kernel.diagonal(z)
@@ -140,10 +147,11 @@ class PreparedKernels:
 
     def sums(self) -> tuple[KernelSum, ...]:
         """The groups as C functions. Raises InvalidInput for a kernel that cannot be traced."""
-        return tuple(
-            KernelSum.of(f"latents{k}", group.latents, group.own_centers, weights, group.pair, group.variances_at)
-            for k, (group, weights) in enumerate(zip(self.groups, self.weights, strict=True))
-        )
+        found = []
+        for k, (group, weights) in enumerate(zip(self.groups, self.weights, strict=True)):
+            given = (group.own_centers, weights, group.pair, group.variances_at, group.level)
+            found.append(KernelSum.of(f"latents{k}", group.latents, *given))
+        return tuple(found)
 
     def inputs(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "n _"]]:
         """What the kernels need of the features of all latents, group by group."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
@@ -31,13 +31,14 @@ class Trajectory:
     """n motions of T steps: q, v (T+1, n, nv) and a (T, n, nv), the acceleration at the beginning of each step.
 
     `diverged_at` (n,) is the first row of q and v that does not exist (NaN from there on), -1 for a motion that lasted
-    to the end.
+    to the end; `not_found` marks those that the integrator could not carry on.
     """
 
     q: Float[Tensor, "rows n nv"]
     v: Float[Tensor, "rows n nv"]
     a: Float[Tensor, "steps n nv"]
     diverged_at: Int[Tensor, " n"]
+    not_found: Bool[Tensor, " n"]
 
 
 def integrate(
@@ -91,8 +92,8 @@ def integrate(
             break
         if progress is not None:
             progress(k + 1, steps)
-    _warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
-    return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at)
+    warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
+    return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at, not_found)
 
 
 def check_start(v0: Tensor, dt: float) -> None:
@@ -122,7 +123,8 @@ def _at_finite_states(acceleration: Acceleration, q0: Tensor, v0: Tensor) -> Acc
     return guarded
 
 
-def _warn_of_divergence(diverged_at: Tensor, not_found: Tensor, failure: str, dt: float, what: str) -> None:
+def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, failure: str, dt: float, what: str) -> None:
+    """A NumericalWarning of those that ended."""
     ended = diverged_at >= 0
     if not bool(ended.any()):
         return

@@ -3,6 +3,7 @@ from .baselines.independent_posterior import IndependentPosterior as Independent
 from .baselines.network_ensemble import NetworkEnsemble as NetworkEnsemble
 from .baselines.network_posterior import NetworkPosterior as NetworkPosterior
 from .baselines.neural_network import NeuralNetwork as NeuralNetwork
+from .casadi_export import casadi_function as casadi_function
 from .discrete_steps import StepLinearization as StepLinearization
 from .identification.identification import Identification as Identification
 from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned

@@ -8,6 +8,7 @@ Newton's method fails, or because it leaves the range of a table, is left to `in
 from __future__ import annotations
 
 import ctypes
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,8 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.errors import NumericalWarning
 from forcegp.integration.integrators import Integrator
-from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate
+from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate, warn_of_divergence
 
 STEPS = {
     "symplectic-euler": """
@@ -110,7 +112,9 @@ int evaluate(long first, long last, const double *const *t, long steps, double d
       }
       if (k < live) { ended[row] = -1; going |= 1 << k; }
     }
+    long stopped = 0;
     for (long s = 0; s < steps && going; s++) {
+      stopped = s + 1;
       for (int k = 0; k < LANES; k++) {
         const double *p = u + ((k < live ? i + k : last - 1) * steps + s) * N;
         for (int j = 0; j < N; j++) AT(x[2 * N + j], k) = p[j];
@@ -119,19 +123,27 @@ int evaluate(long first, long last, const double *const *t, long steps, double d
       for (int j = 0; j < N; j++) { qs[j] = x[j]; vs[j] = x[N + j]; }
       { STEP }
       for (int k = 0; k < live; k++) {
-        int good = 1;
-        for (int j = 0; j < N; j++)
-          good &= fabs(AT(v1[j], k)) <= LIMIT && AT(q1[j], k) - AT(q1[j], k) == 0.0;
-        if ((going >> k & 1) && !good) { going &= ~(1 << k); ended[i + k] = s + 1; }
+        double *to_q = Q + ((i + k) * (steps + 1) + s + 1) * N, *to_v = V + ((i + k) * (steps + 1) + s + 1) * N;
+        int finite = 1, slow = 1;
+        const int before = going >> k & 1;
+        for (int j = 0; j < N; j++) {
+          finite &= AT(q1[j], k) - AT(q1[j], k) == 0.0 && AT(v1[j], k) - AT(v1[j], k) == 0.0;
+          slow &= fabs(AT(v1[j], k)) <= LIMIT;
+          A[((i + k) * steps + s) * N + j] = before ? AT(a[j], k) : NAN;
+        }
+        if (before && !(finite && slow)) { going &= ~(1 << k); ended[i + k] = finite ? s + 1 : -2 - (s + 1); }
         for (int j = 0; j < N; j++) {
           const int on = going >> k & 1;
           AT(x[j], k) = on ? AT(q1[j], k) : AT(qs[j], k); /* where it stopped the program can be asked */
           AT(x[N + j], k) = on ? AT(v1[j], k) : AT(vs[j], k);
-          Q[((i + k) * (steps + 1) + s + 1) * N + j] = AT(x[j], k);
-          V[((i + k) * (steps + 1) + s + 1) * N + j] = AT(x[N + j], k);
-          A[((i + k) * steps + s) * N + j] = AT(a[j], k);
+          to_q[j] = on ? AT(q1[j], k) : NAN;
+          to_v[j] = on ? AT(v1[j], k) : NAN;
         }
       }
+    }
+    for (int k = 0; k < live; k++) for (long s = stopped; s < steps; s++) for (int j = 0; j < N; j++) {
+      Q[((i + k) * (steps + 1) + s + 1) * N + j] = V[((i + k) * (steps + 1) + s + 1) * N + j] = NAN;
+      A[((i + k) * steps + s) * N + j] = NAN;
     }
   }
   return 0;
@@ -149,7 +161,7 @@ def loop_source(method: str, function: str, nv: int) -> str:
 
 
 def fused(
-    loop: FusedLoop | None,
+    loops: Sequence[FusedLoop],
     method: Integrator,
     acceleration: Callable[[Tensor, Tensor, Tensor], Tensor],
     q: Float[Tensor, "n nv"],
@@ -159,18 +171,27 @@ def fused(
     threads: int,
     what: str = "motions",
 ) -> Trajectory:
-    """`integrate`, by the compiled loop where there is one; motions that it could not finish are integrated again."""
+    """`integrate`, by compiled loops; each takes as many motions as the others, one after the other.
+
+    Motions that a loop could not finish are integrated again, with those of the other loops from the same place.
+    """
     check_start(v, dt)
-    if loop is None:
-        return integrate(method, acceleration, q, v, u, dt, what=what)
-    Q, V, A, ended = loop(q, v, u.movedim(0, 1), dt, threads)
-    left = torch.nonzero(ended >= 0)[:, 0]
+    own, count, forces = len(q) // len(loops), len(q), u.movedim(0, 1)
+    places = [slice(own * k, own * (k + 1)) for k in range(len(loops))]
+    parts = [loop(q[at], v[at], forces[at], dt, threads) for loop, at in zip(loops, places, strict=True)]
+    Q, V, A, ended = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
+    not_found = torch.zeros(count, dtype=torch.bool)
+    left = torch.nonzero((ended < -1).view(-1, own).any(0))[:, 0]
     if len(left):
-        again = integrate(method, acceleration, q[left], v[left], u[:, left], dt, what=f"of {len(q)} {what}")
-        for rows, found in ((Q, again.q), (V, again.v), (A, again.a)):
-            rows[left] = found.movedim(0, 1)
-        ended[left] = again.diverged_at
-    return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended)
+        rows = (own * torch.arange(len(loops))[:, None] + left).flatten()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NumericalWarning)  # given below, of all motions
+            again = integrate(method, acceleration, q[rows], v[rows], u[:, rows], dt)
+        for kept, found in ((Q, again.q), (V, again.v), (A, again.a)):
+            kept[rows] = found.movedim(0, 1)
+        ended[rows], not_found[rows] = again.diverged_at, again.not_found
+    warn_of_divergence(ended, not_found, method.failure, dt, what)
+    return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended, not_found)
 
 
 class FusedLoop:
@@ -189,7 +210,8 @@ class FusedLoop:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """q, v (n, T + 1, nv), a (n, T, nv) from states (n, nv) under forces (n, T, nv), and where motions stopped.
 
-        (n,) -1 for those that lasted, else the first row that the loop could not compute; what follows is not defined.
+        (n,) -1 for those that lasted, the row from which on a motion is NaN for those that became too fast, and -2 less
+        that row for those that the loop could not carry on.
         """
         n, steps, nv = u.shape
         Q, V = torch.empty(2, n, steps + 1, nv, dtype=torch.float64).unbind()

@@ -22,12 +22,13 @@ from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
 from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_code import PredictorCode, TermsFunction
-from forcegp.models.rollout import checked_start
+from forcegp.models.rollout import by_sample, checked_start
 from forcegp.models.structured.components import Components
 from forcegp.models.structured.inverse_dynamics import inverse_dynamics
 from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
@@ -72,7 +73,7 @@ class Predictor(Summary):
     any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
 
     `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
-    compressed; `prepare_seconds` is what preparing took, the C++ compiler included, which runs once per process.
+    compressed; `prepare_seconds` is what preparing took, the C compiler included where its work is not kept yet.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
     NumericalError where the result is not finite.
@@ -92,7 +93,7 @@ class Predictor(Summary):
     prepare_seconds: float
     posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
     _functions: dict[str, RowFunction] = field(default_factory=dict)
-    _loops: dict[str, FusedLoop] = field(default_factory=dict)
+    _loops: dict[tuple[str, int, int], list[FusedLoop] | None] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_functions": {}, "_loops": {}}  # loaded code means nothing in another process
@@ -190,25 +191,42 @@ class Predictor(Summary):
         dt: float,
         *,
         integrator: str = "symplectic-euler",
+        functions: int = 0,
+        seed: int = 0,
         threads: int | None = None,
     ) -> Motions:
-        """Motions under the mean from q0, v0 (..., nv) and forces u (..., T, nv), with batches that broadcast.
+        """Motions from q0, v0 (..., nv) under forces u (..., T, nv), with batches that broadcast.
 
         As `posterior.rollout` with the predictor's own system: rad, rad/s, Nm and s (m, m/s, N); what diverges is NaN
-        from the row `diverged_at` on. A compiled predictor steps many motions at once, without Python in between, on
-        `threads` threads (None: as many as torch has). Without a graph. Raises InvalidInput for arguments that do not
-        fit.
+        from the row `diverged_at` on. Under the mean, or with `functions` once under each of so many functions drawn
+        from the posterior, which then are the first dimension. A compiled predictor steps many motions at once, without
+        Python in between, on `threads` threads (None: as many as torch has). Without a graph.
+        Raises InvalidInput for arguments that do not fit.
         """
         most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
+        functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(
             self.nv, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
         )
         method = integrator_named(integrator, self.posterior.system)
         check_time_step(dt)
-        loop = None
-        if self.code is not None and integrator in STEPS:
-            loop = self._loops.get(integrator) or self._loops.setdefault(integrator, self.code.loop(integrator))
-        motion = fused(loop, method, self.mean, start, v, forces, dt, most)
+        how = integrator, functions, seed
+        loops, acceleration = self._loops.get(how), self.mean
+        if loops is None and self.code is not None and integrator in STEPS:
+            loops = self._loops[how] = self.code.loops(integrator, self.latent, functions, seed)
+        if functions:
+            model = self.posterior.accelerations(self.posterior.system.baumgarte)
+
+            def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
+                return by_sample(model.sampled(functions, seed), functions)(q, v, u)
+
+            start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
+            batch = (functions, *batch)
+        with torch.no_grad():
+            if loops is None:
+                motion = integrate(method, acceleration, start, v, forces, dt)
+            else:
+                motion = fused(loops, method, acceleration, start, v, forces, dt, most)
         q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), self.nv) for x in (motion.q, motion.v, motion.a))
         return Motions(q, v, a, motion.diverged_at.reshape(batch))
 
@@ -236,8 +254,20 @@ class Predictor(Summary):
         states = [x.detach().contiguous() for x in states]
         outputs = [torch.empty(count, size, dtype=torch.float64) for size in function.outputs]
         if function.rows(count, states, outputs):
-            raise NumericalError(NO_RESULT)
+            self._repair(kind, states, outputs)
         return outputs
+
+    def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
+        """By torch what a program leaves NaN: states outside of a table."""
+        bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
+        given = [x[bad] for x in states]
+        if kind == "linearize":
+            found = self._linearize(given)
+        else:
+            mean, W, *latents = self._mean(*given)
+            found = (mean,) if kind == "mean" else (mean, W @ self._covariance(W, *latents) @ W.mT)
+        for output, rows in zip(outputs, found, strict=True):
+            output[bad] = _finished([rows], False).reshape(len(bad), -1)
 
     def _at_one(self, kind: str, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
         """The same at one state that needs no conversion, whose numbers are checked on the way."""
@@ -246,7 +276,7 @@ class Predictor(Summary):
         if bits & NOT_FINITE:
             raise InvalidInput("q, v or u has values that are not finite; drop or repair those rows.")
         if bits:
-            raise NumericalError(NO_RESULT)
+            self._repair(kind, [q[None], v[None], u[None]], [x[None] for x in outputs])
         return outputs
 
     def _function(self, kind: str) -> RowFunction:

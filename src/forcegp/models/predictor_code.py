@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -25,7 +25,8 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.kernel_sums import PADDING
-from forcegp.inference.one_input_calls import LatentCall
+from forcegp.inference.one_input_calls import LatentCall, drawn_calls
+from forcegp.inference.posterior import LatentPosterior
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
@@ -167,9 +168,21 @@ class PredictorCode:
         sizes = {"mean": [], "linearize": [3 * self.nv**2], "covariance": [self.nv**2]}[kind]
         return RowFunction(self._library(kind), [self.nv] * 3, [self.nv, *sizes], self.tables)
 
-    def loop(self, integrator: str) -> FusedLoop:
-        """A loop over the mean. Raises CompilerError where it cannot be compiled."""
-        return FusedLoop(self._library(integrator), self.tables)
+    def loops(
+        self, integrator: str, latent: LatentPosterior, samples: int = 0, seed: int = 0
+    ) -> list[FusedLoop] | None:
+        """A loop over the mean, or one over each function drawn from the posterior.
+
+        None where a drawn function has no form in pieces. Raises CompilerError where loops cannot be compiled.
+        """
+        if not samples or not self.sums:
+            return [FusedLoop(self._library(integrator), self.tables)] * max(1, samples)
+        drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)
+        if drawn is None:
+            return None
+        codes = [replace(self, sums=calls, compressed=None) for calls in drawn]
+        library = codes[0]._library(integrator)
+        return [FusedLoop(library, code.tables) for code in codes]
 
     def _library(self, kind: str) -> ctypes.CDLL:
         text = self.c_source(kind, VectorUnit.of_this_processor().lanes)

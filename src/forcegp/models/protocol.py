@@ -19,7 +19,7 @@ from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
-from forcegp.models.prediction import Prediction, join_predictions
+from forcegp.models.prediction import Prediction, Rows, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
@@ -81,9 +81,7 @@ class Posterior(Summary, ABC):
         """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
 
     @abstractmethod
-    def predict_rows(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
-    ) -> Prediction:
+    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
         """`predict` for one block of checked states."""
 
     @override
@@ -169,14 +167,14 @@ class Posterior(Summary, ABC):
         Raises
         ------
         InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
-        CompilerError: there is no C++ compiler, or it fails.
+        CompilerError: there is no C compiler, or it fails.
         """
         raise InvalidInput(
             f"a {self.description} has no predictor for control rates; call predict, or use a structured Gaussian "
             "process."
         )
 
-    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Float[Tensor, "rows nv"]], torch.Size]:
+    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Rows], torch.Size]:
         """States as rows of float64 tensors on the model's device, and their batch dimensions.
 
         Raises InvalidInput for wrong shapes or values that are not finite.

@@ -43,8 +43,9 @@ class AccelerationModel:
     baumgarte: Baumgarte | None
     mean: Callable[[], AccelerationFunction]
     sampled: Callable[[int, int], AccelerationFunction]
-    compiled: Callable[[str], FusedLoop] | None = None
-    """The loop of an integrator over the mean as machine code; None for models that have none."""
+    compiled: Callable[[str, int, int], list[FusedLoop] | None] | None = None
+    """(integrator, samples, seed) -> loops over the functions that `sampled` draws, or with 0 samples over the mean, as
+    machine code; None where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +138,13 @@ def roll_out(
         control = None if feedback is None else _flat_feedback(feedback, shape)
         report = None if counted is None else counted(before)
         given = (method, function, *start, forces.repeat(1, count, 1), dt)
-        loop = None if copies or feedback is not None or grad else _loop(model, integrator, steps)
-        if loop is None:
+        loops = None
+        if feedback is None and not grad:
+            loops = _loops(model, integrator, steps, math.prod(copies) if copies else 0, seed)
+        if loops is None:
             motion = integrate(*given, feedback=control, what=what, progress=report)
         else:
-            motion = fused(loop, *given, torch.get_num_threads(), what)
+            motion = fused(loops, *given, torch.get_num_threads(), what)
             if report is not None:
                 report(steps, steps)
         q_rows, v_rows, a_rows = (
@@ -159,19 +162,19 @@ def roll_out(
     with torch.set_grad_enabled(grad), blas_threads(0):
         mean = run(model.mean(), (), "rollouts", 0)
         if samples:
-            sampled = _by_sample(model.sampled(samples, seed), samples)
+            sampled = by_sample(model.sampled(samples, seed), samples)
             mean = replace(mean, samples=run(sampled, (samples,), "sampled rollouts", steps))
         return mean
 
 
-def _loop(model: AccelerationModel, integrator: str, steps: int) -> FusedLoop | None:
-    """The compiled loop, where motions are long enough to be worth compiling it."""
-    if model.compiled is None or integrator not in STEPS or steps < STEPS_TO_COMPILE:
+def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, seed: int) -> list[FusedLoop] | None:
+    """Compiled loops, where motions are long enough to be worth compiling them."""
+    if model.compiled is None or integrator not in STEPS or steps * max(1, samples) < STEPS_TO_COMPILE:
         return None
     try:
-        return model.compiled(integrator)
+        return model.compiled(integrator, samples, seed)
     except CompilerError as error:
-        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=4)
+        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=5)
     except InvalidInput:  # an operation that no program holds, another device
         pass
     return None
@@ -191,7 +194,7 @@ def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
     return flat
 
 
-def _by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
+def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
     """A function of (samples, n, nv) as one of (samples * n, nv)."""
 
     def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:

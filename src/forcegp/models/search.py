@@ -15,7 +15,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from forcegp.errors import NumericalError, NumericalWarning
+from forcegp.errors import FitError, NumericalError, NumericalWarning
 from forcegp.inference import OptimizationResult, OptimizerOptions
 from forcegp.parallel import Backend, Joblib, Serial
 
@@ -49,6 +49,14 @@ Objective = Callable[[Mapping[str, Tensor]], Tensor]
 Outcome = TypeVar("Outcome")
 
 
+AT_ONCE = 2
+"""Starts that run at once where later ones are dropped that fall behind. Behind a single poor one, others were dropped
+that end 22 nats lower (docs/solvers.md).
+"""
+
+SMALL = OptimizerOptions(slow=0.02, patience=100)
+"""The search on so few rows: to hundredths of a nat, which no prediction shows."""
+
 LARGE = OptimizerOptions(tolerance=1e-6, slow=3.0)
 """The search on more rows than that, where an evaluation takes seconds, and three nats of hundreds over several
 iterations change nothing that is predicted.
@@ -57,7 +65,7 @@ iterations change nothing that is predicted.
 
 def default_options(points: int) -> OptimizerOptions:
     """The search where none is given."""
-    return LARGE if points > MOST_POINTS_FOR_RESTARTS else OptimizerOptions()
+    return LARGE if points > MOST_POINTS_FOR_RESTARTS else SMALL
 
 
 def default_restarts(points: int) -> int:
@@ -89,19 +97,27 @@ def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
 
 
 def run_restarts(
-    search: Callable[[int, FitProgress | None], Outcome], restarts: int, backend: Backend, progress: FitProgress | None
+    search: Callable[..., Outcome], restarts: int, patience: int, backend: Backend, progress: FitProgress | None
 ) -> Sequence[Outcome]:
-    """`search(0, progress)`, `search(1, progress)`, ... on a backend, on which the outcomes do not depend.
+    """`search(index, before=outcomes, progress=progress)` from 0 on, on a backend, on which outcomes do not depend.
 
-    Only this process can report progress. A single search needs no other process of this machine.
+    Those before are given with `patience` only, and then `AT_ONCE` run at once. Only this process can report progress.
+    A single search needs no other process of this machine.
     """
-    if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
-        return [search(index, progress) for index in range(restarts)]
-    return list(backend.map(partial(_silently, search), range(restarts)))
+    outcomes: list[Outcome] = []
+    while len(outcomes) < restarts:
+        last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
+        indices, before = range(len(outcomes), last), tuple(outcomes)
+        if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
+            outcomes += [search(index, before=before, progress=progress) for index in indices]
+        else:
+            outcomes += backend.map(partial(search, before=before, progress=None), indices)
+    return outcomes
 
 
-def _silently(search: Callable[[int, FitProgress | None], Outcome], index: int) -> Outcome:
-    return search(index, None)
+def best_value(found: Sequence[OptimizationResult | FitError]) -> float:
+    """The lowest objective that was found; infinite where there is none."""
+    return min((each.value for each in found if isinstance(each, OptimizationResult)), default=math.inf)
 
 
 def with_steps_before(

@@ -31,13 +31,16 @@ from forcegp.models.fit_arguments import (
 )
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.protocol import Model
-from forcegp.models.search import FitProgress, blas_threads, default_restarts, perturbed, run_restarts
+from forcegp.models.search import FitProgress, best_value, blas_threads, default_restarts, perturbed, run_restarts
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import JointForces
 
 Outcomes = list[OptimizationResult | FitError]
 Value = TypeVar("Value")
+
+SEARCH = OptimizerOptions(slow=0.05, patience=5)
+"""Of every joint, whose few parameters show soon which start is the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +109,14 @@ class IndependentGP(Model):
         noise_parameters = noise.parameters(self.system.robot.nv, self.system.robot.device)
         fixed = {} if noise.learn else noise_parameters
         moments = kernels.initial_parameters() | (noise_parameters if noise.learn else {})
-        options = require_type("options", OptimizerOptions() if options is None else options, OptimizerOptions)
+        options = require_type("options", SEARCH if options is None else options, OptimizerOptions)
         objectives = tuple(
             _JointObjective(likelihood, joint, one_joint(kernels, joint), noise, joint_part(fixed, joint), hyperprior)
             for joint in range(self.system.robot.nv)
         )
         search = _JointSearches(objectives, moments, first_start(moments, start or {}, fixed), seed, options)
         with blas_threads(len(rows)):
-            outcomes = run_restarts(search, restarts, workers, progress)
+            outcomes = run_restarts(search, restarts, options.patience, workers, progress)
         result = self._chosen(outcomes)
         settings = {
             **described_rows(rows, dataset),
@@ -125,6 +128,7 @@ class IndependentGP(Model):
             "optimizer": {name: getattr(options, name) for name in options.__dataclass_fields__},
             "hyperprior": hyperprior,
             "restart_objective": [_total(each) for each in outcomes],
+            "restart_status": [[getattr(found, "status", str(found)) for found in each] for each in outcomes],
         }
         fitted = IndependentGP(self.system, self.inputs, noise)
         return fitted.condition(training, result.parameters | fixed, result, settings)
@@ -209,7 +213,7 @@ class _JointSearches:
     seed: int
     options: OptimizerOptions
 
-    def __call__(self, index: int, progress: FitProgress | None = None) -> Outcomes:
+    def __call__(self, index: int, before: Sequence[Outcomes], progress: FitProgress | None) -> Outcomes:
         first = perturbed(self.moments, self.seed, index) if index else self.first
         outcomes: Outcomes = []
         steps = self.options.iterations + self.options.adam_steps
@@ -220,7 +224,8 @@ class _JointSearches:
                     progress(index, (joint * steps + min(iteration, steps)) // len(self.objectives), value)
 
             try:
-                outcomes.append(minimize_objective(objective, joint_part(first, joint), self.options, note))
+                rival = best_value([each[joint] for each in before])
+                outcomes.append(minimize_objective(objective, joint_part(first, joint), self.options, note, rival))
             except FitError as error:
                 outcomes.append(error)
         return outcomes

@@ -84,9 +84,10 @@ class StructuredGP(StructuredModel):
         dataset: rows with the joints of the robot in its order; nothing in it is changed.
         points: train on this many rows, chosen by farthest-point sampling of (q, v, u); None takes all rows.
         restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
-            factors, every other one from a smoother start; the best final value wins. None means 4 up to 400 points,
-            where local optima cost most and searches cost little, and 1 beyond, which then begins where searches on
-            250 and 500 of the rows ended.
+            factors, every other one from a smoother start; the best final value wins, and by default starts that fall
+            behind two earlier ones are dropped (`settings["restart_status"]`). None means 4 up to 400 points, where
+            local optima cost most and searches cost little, and 1 beyond, which then begins where searches on 250 and
+            500 of the rows ended.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
         backend: where restarts run: `Serial()`, `Joblib(jobs)`, `Ray(address)` or a name, "serial", "joblib", "ray"

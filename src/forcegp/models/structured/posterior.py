@@ -30,10 +30,11 @@ from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
+from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
-from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
@@ -112,9 +113,7 @@ class StructuredPosterior(Posterior):
         return self.system.dynamics(q, v, u, inertials_of(self.parameters) or None)
 
     @override
-    def predict_rows(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
-    ) -> Prediction:
+    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
@@ -174,12 +173,7 @@ class StructuredPosterior(Posterior):
         largest_rank: int = 512,
         compile: bool = True,
     ) -> Predictor:
-        noise = self.model.noise
-        if noise is not None and noise.measured_torque:
-            raise InvalidInput(
-                "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
-                "predict, or fit with Noise(..., measured_torque=False)."
-            )
+        self._require_commanded_torques()
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
         physics = self._physics(self.system)
         return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
@@ -317,17 +311,30 @@ class StructuredPosterior(Posterior):
                 return mean()
             return through(draw_functions(self.latent, samples, seed, self.widening))
 
-        noise = self.model.noise
-        if noise is not None and noise.measured_torque:  # whose accelerations are shrunk
-            return AccelerationModel(system, baumgarte, mean, sampled)
-        return AccelerationModel(system, baumgarte, mean, sampled, lambda name: self._code(system).loop(name))
+        def compiled(integrator: str, samples: int, seed: int) -> list[FusedLoop] | None:
+            return self.code(system).loops(integrator, self.latent, samples, seed)
 
-    def _code(self, system: MechanicalSystem) -> PredictorCode:
-        """Programs of the mean in a system."""
+        return AccelerationModel(system, baumgarte, mean, sampled, compiled)
+
+    def code(self, system: MechanicalSystem | None = None) -> PredictorCode:
+        """The mean as a graph, from which programs are written, in another system if one is given.
+
+        Raises InvalidInput for operations that no graph holds, models on another device, and noisy torques.
+        """
+        system = self.system if system is None else system
+        self._require_commanded_torques()
         prepared = PreparedKernels.of(self.latent)
         example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
         calls = latent_calls(self.latent, prepared, None)
         return PredictorCode.of(self._physics(system).traced, example, calls, None, self.widening)
+
+    def _require_commanded_torques(self) -> None:
+        noise = self.model.noise
+        if noise is not None and noise.measured_torque:
+            raise InvalidInput(
+                "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
+                "predict, or fit with Noise(..., measured_torque=False)."
+            )
 
     def _physics(self, system: MechanicalSystem) -> PredictorPhysics:
         inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -13,7 +13,9 @@ from forcegp.inference import OptimizationResult, OptimizerOptions, best_of, min
 from forcegp.models.fit_arguments import check_search_numbers, first_start
 from forcegp.models.identification.physical_parameters import PHYSICAL
 from forcegp.models.search import (
+    SMALL,
     FitProgress,
+    best_value,
     blas_threads,
     default_options,
     default_restarts,
@@ -66,11 +68,13 @@ class Search:
         evaluated.
         """
         restarts, options = self.resolved(len(objective.likelihood.training))
+        if objective.physical is not None and options is SMALL:
+            options = OptimizerOptions()  # standard errors are those of the optimum itself
         first = first_start(moments, self.start or {}, objective.fixed)
         kept = replace(options, keep_iterates=True) if keep_iterates else options
         one = _OneStart(objective, moments, first, self.seed, kept)
         with blas_threads(objective.likelihood.training.q.numel()):
-            results = run_restarts(one, restarts, self.backend, self.progress)
+            results = run_restarts(one, restarts, options.patience, self.backend, self.progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
@@ -87,6 +91,7 @@ class Search:
             "optimizer": asdict(options),
             "hyperprior": self.hyperprior,
             "restart_objective": [each.value if isinstance(each, OptimizationResult) else None for each in results],
+            "restart_status": [each.status if isinstance(each, OptimizationResult) else str(each) for each in results],
         }
         return best, settings
 
@@ -104,11 +109,13 @@ class _OneStart:
     seed: int
     options: OptimizerOptions
 
-    def __call__(self, index: int, progress: FitProgress | None = None) -> OptimizationResult | FitError:
+    def __call__(
+        self, index: int, before: Sequence[OptimizationResult | FitError], progress: FitProgress | None
+    ) -> OptimizationResult | FitError:
         """Where it ended, or why it could not begin."""
         first = perturbed(self.moments, self.seed, index) if index else self.first
         note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
         try:
-            return minimize_objective(self.objective, first, self.options, note)
+            return minimize_objective(self.objective, first, self.options, note, best_value(before))
         except FitError as error:
             return error

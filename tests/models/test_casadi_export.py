@@ -1,0 +1,88 @@
+"""A posterior as a CasADi function: `predict`, its derivatives, and what CasADi makes of it."""
+
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp.codegen.native_code import Purpose, compile_library
+from forcegp.errors import InvalidInput, MissingExtra
+from forcegp.inference import OptimizerOptions
+from forcegp.models import IndependentGP, StructuredGP, StructuredPosterior, casadi_function
+from forcegp.priors import ContactFriction, JointForces, JointFriction, NoForces
+
+casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
+
+PRIORS = {
+    "joint": JointForces(),
+    "friction under load": JointFriction() + ContactFriction(load=True, expected=0.2),
+    "matern": JointFriction(kernel="matern-5/2") + JointForces(kernel="matern-3/2 * periodic + linear", inputs=("q",)),
+    "none": NoForces(),
+}
+
+
+@pytest.fixture(scope="module", params=PRIORS)
+def posterior(request) -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
+        return StructuredGP(arm_system(), PRIORS[request.param]).fit(arm_data(30, 0), **options)
+
+
+@pytest.fixture(scope="module")
+def states() -> list[torch.Tensor]:
+    data = arm_data(6, 1)
+    return [torch.tensor(x) for x in (data.q, data.v, data.u)]
+
+
+def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
+    function = casadi_function(posterior)
+    slopes = function.jacobian()
+    expected = posterior.predict(*states, covariance=False).mean.numpy()
+    linear = posterior.predictor(covariance="none").linearize(*states)
+    jacobians = torch.cat([linear.da_dq, linear.da_dv, linear.da_du], dim=-1).numpy()
+    for k, state in enumerate(zip(*(x.numpy() for x in states), strict=True)):
+        np.testing.assert_allclose(
+            np.array(function(*state)).ravel(), expected[k], rtol=0, atol=1e-12 * abs(expected).max()
+        )
+        found = np.hstack([np.array(part) for part in slopes(*state, 0)])
+        np.testing.assert_allclose(found, jacobians[k], rtol=0, atol=1e-12 * abs(jacobians).max())
+
+
+def test_second_derivatives_are_differences_of_first_ones(posterior, states):
+    q, v, u = (x[0].numpy() for x in states)
+    function = casadi_function(posterior)
+    x = casadi.MX.sym("v", 3)
+    gradient = casadi.Function("g", [x], [casadi.gradient(casadi.sumsqr(function(q, x, u)), x)])
+    hessian = np.array(gradient.jacobian()(v, 0))
+    step = 1e-6
+    columns = [
+        (np.array(gradient(v + step * e)) - np.array(gradient(v - step * e))).ravel() / (2 * step) for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(hessian, np.stack(columns, axis=1), rtol=1e-4, atol=1e-5 * abs(hessian).max())
+
+
+def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function = casadi_function(posterior, name="arm")
+    function.generate("arm.c", {"with_header": False})
+    source, library = (tmp_path / "arm.c").read_text(encoding="utf-8"), tmp_path / "arm.so"
+    compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm", Purpose("a test", "MOVE", "give up"))
+    external = casadi.external("arm", str(library))
+    state = [x[2].numpy() for x in states]
+    np.testing.assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
+
+
+def test_without_casadi_and_without_a_program(states, monkeypatch):
+    network = IndependentGP(arm_system())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        other = network.fit(arm_data(20, 0), restarts=1, options=OptimizerOptions(iterations=2))
+    with pytest.raises(InvalidInput, match=r"no program can be written of a .*export a StructuredGP"):
+        casadi_function(other)
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'forcegp\[casadi\]'"):
+        casadi_function(other)
