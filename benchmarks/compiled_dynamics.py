@@ -17,7 +17,7 @@ Our side goes further, to the log-Cholesky parameters, and takes the time of a f
 the first result of forward dynamics, with torch and the robot loaded (wall-clock time both).
 
     python -m benchmarks.compiled_dynamics
-    python -m benchmarks.compiled_dynamics inductor     the same unrolled scalars through torch.compile (minutes)
+    python -m benchmarks.compiled_dynamics inductor     the same operations through torch.compile (minutes)
     python -m benchmarks.compiled_dynamics chain 30     compiling forward dynamics of 30 skew joints in series
 """
 
@@ -41,7 +41,6 @@ from forcegp.robots import Robot, physical_from_parameters
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.dynamics_programs import Request, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
-from forcegp.robots.unrolled_kinematics import UnrolledKinematics
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 
@@ -178,13 +177,23 @@ def cold(robot: Robot, folder: Path) -> dict[str, float]:
 def inductor() -> None:
     """Print what torch.compile makes of the unrolled forward dynamics, and how long it takes to."""
     states = States(BATCH)
-    unrolled = UnrolledRobot(states.robot)
+    program = trace_dynamics(UnrolledRobot(states.robot), Request("forward_dynamics"))
+    graph = program.graph
 
     @torch.compile(dynamic=True, fullgraph=True)
     def forward(q: torch.Tensor, v: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
-        return torch.stack(
-            UnrolledKinematics(unrolled, q.unbind(-1), v.unbind(-1)).forward_dynamics(tau.unbind(-1)), dim=-1
-        )
+        inputs = [*q.unbind(-1), *v.unbind(-1), *tau.unbind(-1)]
+        found: dict[int, torch.Tensor] = {}
+        for node in graph.needed(program.nodes):
+            operation, *rest = graph.nodes[node]
+            match operation:
+                case "constant":
+                    found[node] = torch.tensor(rest[0], dtype=torch.float64)
+                case "input":
+                    found[node] = inputs[rest[0]]
+                case _:
+                    found[node] = getattr(torch, operation.replace("negate", "neg"))(*(found[x] for x in rest))
+        return torch.stack([found[node] for node in program.outputs["result 0"]], dim=-1)
 
     with tempfile.TemporaryDirectory() as folder:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder

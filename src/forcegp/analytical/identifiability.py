@@ -106,10 +106,7 @@ def base_parameters(robot: Robot) -> BaseParameters:
 
 
 def excitation(
-    robot: Robot,
-    q: Float[np.ndarray, "rows nv"],
-    v: Float[np.ndarray, "rows nv"],
-    a: Float[np.ndarray, "rows nv"],
+    robot: Robot, q: Float[np.ndarray, "rows nv"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
 ) -> BaseParameters:
     """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
     states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))

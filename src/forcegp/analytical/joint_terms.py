@@ -6,8 +6,8 @@ system (which has the opposite sign). A new friction law is one entry in `LAWS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,12 +22,12 @@ from forcegp.mechanics import (
     LoadJointFriction,
     MechanicalSystem,
     RotorInertia,
+    State,
     StribeckJointFriction,
     ViscousJointFriction,
 )
 
 Arrays = Mapping[str, np.ndarray]
-Reader = Callable[[KnownForce], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class Field:
 
     `size` is (power of the typical torque, power of the typical velocity, factor). With `logarithm` the coordinate is
     the logarithm of the number over that size, within `lowest` and `highest` times it; else the number over it.
+    `known` is what the known force calls it, which holds the sum with the field `above` where that is given.
     """
 
     name: str
@@ -44,115 +45,59 @@ class Field:
     lowest: float = 0.0
     highest: float = np.inf
     logarithm: bool = False
+    known: str = ""
+    above: str | None = None
 
 
 @dataclass(frozen=True)
 class Law:
-    """A joint force as a function of velocity, with its parameters, derivatives, and the known force it becomes.
-
-    `torque(values, v, |u|)` gives f (rows, nv) and df (fields, rows, nv), where values[name] has shape (nv,).
-    """
+    """A known force that depends on v and u alone, with the numbers in it that are estimated."""
 
     kind: type[KnownForce]
     fields: tuple[Field, ...]
-    torque: Callable[[Arrays, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-    known: Callable[[Arrays], KnownForce]
-    read: Reader
 
+    def force(self, values: Mapping[str, torch.Tensor]) -> KnownForce:
+        """The known force with these numbers, by the names of the fields."""
+        sums = {f: values[f.name] + (values[f.above] if f.above else 0.0) for f in self.fields}
+        return self.kind(**{f.known or f.name: number for f, number in sums.items()})
 
-def _viscous(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return p["viscous"] * v, v[None]
+    def read(self, force: KnownForce) -> dict[str, np.ndarray]:
+        """The numbers of a known force by the names of the fields."""
+        read = {f.name: torch.as_tensor(getattr(force, f.known or f.name)).numpy().copy() for f in self.fields}
+        return {f.name: np.maximum(read[f.name] - read[f.above], 0.0) if f.above else read[f.name] for f in self.fields}
 
-
-def _offset(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.broadcast_to(-p["offset"], v.shape), -np.ones((1, *v.shape))
-
-
-def _coulomb(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scale = p["velocity_scale"]
-    sign = np.tanh(v / scale)
-    return p["coulomb"] * sign, np.stack([sign, -p["coulomb"] * (1.0 - sign**2) * v / scale**2])
-
-
-def _load(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scale = p["velocity_scale"]
-    sign, level = np.tanh(v / scale), p["coulomb"] + p["load"] * load
-    return level * sign, np.stack([sign, load * sign, -level * (1.0 - sign**2) * v / scale**2])
-
-
-def _stribeck(p: Arrays, v: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scale, fall = p["velocity_scale"], p["stribeck_velocity"]
-    sign, bump = np.tanh(v / scale), np.exp(-((v / fall) ** 2))
-    level = p["coulomb"] + p["breakaway"] * bump
-    in_fall = p["breakaway"] * bump * 2.0 * v**2 / fall**3 * sign
-    return level * sign, np.stack([sign, bump * sign, in_fall, -level * (1.0 - sign**2) * v / scale**2])
-
-
-def _numbers(force: KnownForce, **names: str) -> dict[str, np.ndarray]:
-    return {name: torch.as_tensor(getattr(force, field)).numpy().copy() for name, field in names.items()}
-
-
-def _read_stribeck(force: KnownForce) -> dict[str, np.ndarray]:
-    values = _numbers(force, **{name: name for name in StribeckJointFriction.per_joint})
-    values["breakaway"] = np.maximum(values.pop("static") - values["coulomb"], 0.0)
-    return values
+    def torque(self, values: Arrays, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """What it adds to the torque (rows, nv), and the derivative in each field (fields, rows, nv)."""
+        numbers = [torch.tensor(values[f.name]).expand(state.v.shape).clone().requires_grad_() for f in self.fields]
+        torque = -self.force(dict(zip((f.name for f in self.fields), numbers, strict=True))).force(state)
+        return torque.detach().numpy(), torch.stack(torch.autograd.grad(torque.sum(), numbers)).numpy()
 
 
 VELOCITY_SCALE = Field("velocity_scale", "1/s", (0, 1, 0.1), 0.03, 20.0, logarithm=True)
 COULOMB = Field("coulomb", "force", (1, 0, 0.1))
 LAWS: dict[str, Law] = {
-    "viscous": Law(
-        ViscousJointFriction,
-        (Field("viscous", "force s", (1, -1, 0.1)),),
-        _viscous,
-        lambda p: ViscousJointFriction(torch.tensor(p["viscous"])),
-        lambda force: _numbers(force, viscous="coefficients"),
-    ),
-    "coulomb": Law(
-        CoulombJointFriction,
-        (COULOMB, VELOCITY_SCALE),
-        _coulomb,
-        lambda p: CoulombJointFriction(torch.tensor(p["coulomb"]), torch.tensor(p["velocity_scale"])),
-        lambda force: _numbers(force, coulomb="coefficients", velocity_scale="velocity_scale"),
-    ),
+    "viscous": Law(ViscousJointFriction, (Field("viscous", "force s", (1, -1, 0.1), known="coefficients"),)),
+    "coulomb": Law(CoulombJointFriction, (replace(COULOMB, known="coefficients"), VELOCITY_SCALE)),
     "stribeck": Law(
         StribeckJointFriction,
         (
             COULOMB,
-            Field("breakaway", "force", (1, 0, 0.1)),
+            Field("breakaway", "force", (1, 0, 0.1), known="static", above="coulomb"),
             Field("stribeck_velocity", "1/s", (0, 1, 0.3), 0.1, 10.0, logarithm=True),
             VELOCITY_SCALE,
         ),
-        _stribeck,
-        lambda p: StribeckJointFriction(
-            torch.tensor(p["coulomb"]),
-            torch.tensor(p["coulomb"] + p["breakaway"]),
-            torch.tensor(p["stribeck_velocity"]),
-            torch.tensor(p["velocity_scale"]),
-        ),
-        _read_stribeck,
     ),
     "load": Law(
-        LoadJointFriction,
-        (COULOMB, Field("load", "1", (0, 0, 0.1), highest=9.0), VELOCITY_SCALE),
-        _load,
-        lambda p: LoadJointFriction(*(torch.tensor(p[name]) for name in ("load", "coulomb", "velocity_scale"))),
-        lambda force: _numbers(force, coulomb="coulomb", load="coefficients", velocity_scale="velocity_scale"),
+        LoadJointFriction, (COULOMB, Field("load", "1", (0, 0, 0.1), highest=9.0, known="coefficients"), VELOCITY_SCALE)
     ),
-    "offset": Law(
-        ConstantJointForce,
-        (Field("offset", "force", (1, 0, 0.1), lowest=-np.inf),),
-        _offset,
-        lambda p: ConstantJointForce(torch.tensor(p["offset"])),
-        lambda force: _numbers(force, offset="values"),
-    ),
+    "offset": Law(ConstantJointForce, (Field("offset", "force", (1, 0, 0.1), lowest=-np.inf, known="values"),)),
 }
 """Friction laws and the offset by the name that `friction=` has for them."""
 LINEAR_SPREAD = 10.0
 """Standard deviation of the prior on numbers that are not logarithms, in their sizes: as large as the torques."""
 DRY = ("coulomb", "stribeck", "load")
 """Laws of dry friction: each has a constant part."""
-INERTIA = Field("armature", "inertia", (0, 0, 0.1))
+INERTIA = Field("armature", "inertia", (0, 0, 0.1), known="inertia")
 INERTIAS: dict[str, type[Armature | RotorInertia]] = {"armature": Armature, "rotor": RotorInertia}
 
 
@@ -191,7 +136,8 @@ class JointTerms:
             raise InvalidInput(f"rotors are {inertia!r}; give one of {', '.join(INERTIAS)}, or None.")
         self.laws = [LAWS[name] for name in dict.fromkeys(friction)]
         self.inertia = inertia
-        self.joints = system.robot.joint_names
+        self.robot, self.joints = system.robot, system.robot.joint_names
+        self._rest = system.robot.kinematics(torch.zeros_like(system.robot.armature))
         self.kinds = tuple([law.kind for law in self.laws] + ([INERTIAS[inertia]] if inertia else []))
         listed = {kind: [force for force in system.known_forces if type(force) is kind] for kind in self.kinds}
         twice = next((kind.__name__ for kind, found in listed.items() if len(found) > 1), None)
@@ -237,9 +183,10 @@ class JointTerms:
     def start(self, unlisted: float = 1.0) -> Float[np.ndarray, " k"]:
         """Coordinates of what the system lists; of what it does not, `unlisted`, and typical velocities."""
         rows: list[np.ndarray] = []
-        for kind, fields, read in self._blocks():
-            given = read(self._given[kind]) if kind in self._given else {}
-            for field in fields:
+        blocks = self.laws + ([Law(INERTIAS[self.inertia], (INERTIA,))] if self.inertia else [])
+        for law in blocks:
+            given = law.read(self._given[law.kind]) if law.kind in self._given else {}
+            for field in law.fields:
                 size = self._sizes[len(rows)]
                 value = given.get(field.name, size if field.logarithm else unlisted * size)
                 rows.append(np.log(value / size) if field.logarithm else value / size)
@@ -272,9 +219,11 @@ class JointTerms:
         total, nv, row = np.zeros_like(v), len(self.joints), 0
         jacobian = np.zeros((*v.shape, len(self.fields), nv))
         diagonal = np.arange(nv)
+        at_v = torch.tensor(v)
+        state = State(at_v, at_v, torch.tensor(load), self.robot, self._rest)  # laws look at v and u alone
         for law in self.laws:
             named = {field.name: values[row + k] for k, field in enumerate(law.fields)}
-            added, derivatives = law.torque(named, v, load)
+            added, derivatives = law.torque(named, state)
             total = total + added
             for k in range(len(law.fields)):
                 jacobian[:, diagonal, row + k, diagonal] = derivatives[k] * slopes[row + k]
@@ -295,21 +244,13 @@ class JointTerms:
         """The terms as known forces of a system."""
         values, forces, row = self.values(x), [], 0
         for law in self.laws:
-            named = {field.name: values[row + k] for k, field in enumerate(law.fields)}
-            forces.append(law.known(named))
+            forces.append(law.force({field.name: torch.tensor(values[row + k]) for k, field in enumerate(law.fields)}))
             row += len(law.fields)
         if self.inertia == "armature":
             forces.append(Armature(torch.tensor(values[row])))
         elif self.inertia == "rotor":
             forces.append(RotorInertia(torch.tensor(values[row]), self._transmission()))
         return tuple(forces)
-
-    def _blocks(self) -> list[tuple[type[KnownForce], tuple[Field, ...], Reader]]:
-        blocks: list[tuple[type[KnownForce], tuple[Field, ...], Reader]]
-        blocks = [(law.kind, law.fields, law.read) for law in self.laws]
-        if self.inertia:
-            blocks.append((INERTIAS[self.inertia], (INERTIA,), lambda force: _numbers(force, armature="inertia")))
-        return blocks
 
     def _transmission(self) -> torch.Tensor:
         if self.inertia == "armature":

@@ -28,18 +28,13 @@ from forcegp.analytical.joint_terms import JointTerms
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.mechanics import KnownForce, LoadJointFriction, MechanicalSystem, RigidBodyBias, State
 
+Rows = Float[np.ndarray, "rows nv"]
+
 
 class RecordedRows:
     """States (rows, nv) of a robot, the given forces there, and the terms of the equation of motion."""
 
-    def __init__(
-        self,
-        system: MechanicalSystem,
-        terms: JointTerms,
-        q: Float[np.ndarray, "rows nv"],
-        v: Float[np.ndarray, "rows nv"],
-        u: Float[np.ndarray, "rows nv"],
-    ):
+    def __init__(self, system: MechanicalSystem, terms: JointTerms, q: Rows, v: Rows, u: Rows):
         robot = system.robot
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
         state = State.of(robot, at_q, at_v, at_u)
@@ -55,7 +50,7 @@ class RecordedRows:
             self.inertia = self.inertia + (0.0 if added is None else added.detach().cpu().numpy())
         self._armature = np.diag(robot.armature.cpu().numpy())
 
-    def regressor(self, a: Float[np.ndarray, "rows nv"]) -> Float[np.ndarray, "rows nv bodies 10"]:
+    def regressor(self, a: Rows) -> Float[np.ndarray, "rows nv bodies 10"]:
         """Y at these states and accelerations."""
         at = torch.as_tensor(np.array(a), device=self.kinematics.robot.device)
         return self.kinematics.torque_regressor(at).cpu().numpy()

@@ -123,8 +123,7 @@ class CheckInput:
                 compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
         return cls(
             log=dataset,
-            robot=None if system is None else system.robot,
-            contacts=0 if system is None else len(system.contacts),
+            **_known(system),
             even=even,
             prepared=prepared,
             compared=compared,
@@ -159,8 +158,7 @@ class CheckInput:
             noise = noise if seen is None else np.nan_to_num(seen)
         return cls(
             log=dataset,
-            robot=None if system is None else system.robot,
-            contacts=0 if system is None else len(system.contacts),
+            **_known(system),
             even=even,
             prepared=prepared,
             compared=compared,
@@ -172,6 +170,13 @@ class CheckInput:
             compared_noise=noise,
             most_rows=QUICK_ROWS,
         )
+
+
+def _known(system: MechanicalSystem | None) -> dict[str, Any]:
+    return {
+        "robot": None if system is None else system.robot,
+        "contacts": 0 if system is None else len(system.contacts),
+    }
 
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:

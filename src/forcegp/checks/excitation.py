@@ -8,7 +8,7 @@ import numpy as np
 
 from forcegp.analytical.identifiability import base_parameters, excitation
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.findings import Finding, listed
+from forcegp.checks.findings import Finding, listed, look
 from forcegp.errors import InvalidInput
 
 WELL = 100.0
@@ -43,31 +43,23 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
             still.append(name)
         elif changes < FEWEST_CHANGES:
             one_way.append(name)
-    found = []
-    if still:
-        found.append(
-            Finding(
-                severity="look",
-                subject="excitation",
-                seen=f"{listed(still)} moved less than 0.02 rad (2 mm): {'its' if len(still) == 1 else 'their'} "
-                "friction and inertia do not show.",
-                remedy="Move every joint that is to be learned, or lock it in the robot (`locked`).",
-                joints=tuple(still),
-                numbers={"joints": motions},
-            )
+    whose = "its" if len(still) == 1 else "their"
+    idle = f"moved less than 0.02 rad (2 mm): {whose} friction and inertia do not show."
+    turned = "changed direction less than twice: friction of both directions cannot be separated from gravity."
+    found = [
+        look(
+            subject="excitation",
+            seen=f"{listed(joints)} {what}",
+            remedy=remedy,
+            joints=tuple(joints),
+            numbers={"joints": motions},
         )
-    if one_way:
-        found.append(
-            Finding(
-                severity="look",
-                subject="excitation",
-                seen=f"{listed(one_way)} changed direction less than twice: friction of both "
-                "directions cannot be separated from gravity.",
-                remedy="Record motion to and fro.",
-                joints=tuple(one_way),
-                numbers={"joints": motions},
-            )
+        for joints, what, remedy in (
+            (still, idle, "Move every joint that is to be learned, or lock it in the robot (`locked`)."),
+            (one_way, turned, "Record motion to and fro."),
         )
+        if joints
+    ]
     return [*found, *_held(inputs, still), *_base_parameters(inputs)]
 
 
@@ -87,8 +79,7 @@ def _held(inputs: CheckInput, still: list[str]) -> Iterator[Finding]:
         first = int(held[0])
         unit = "rad" if inputs.rotates[joint] else "m"
         begin = float(rows.time[rows.episode == rows.episodes[first]][0])
-        yield Finding(
-            severity="look",
+        yield look(
             subject="held joint",
             seen=f"{name} stays within {spans[first, joint]:.2g} {unit} in {len(held)} of {len(spans)} stretches "
             f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
@@ -113,8 +104,7 @@ def _base_parameters(inputs: CheckInput) -> list[Finding]:
     size = f"condition number {seen.condition:.3g} of {seen.rank} base parameters"
     if seen.rank < every.rank:
         return [
-            Finding(
-                severity="look",
+            look(
                 subject="excitation",
                 seen=f"{size}; {every.rank - seen.rank} more of this robot never show in this motion.",
                 remedy="Identify few parameters, or record a motion of all joints at once.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -33,14 +34,10 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        return {
-            "severity": self.severity,
-            "subject": self.subject,
-            "seen": self.seen,
-            "remedy": self.remedy,
-            "joints": list(self.joints),
-            "numbers": dict(self.numbers),
-        }
+        return {**vars(self), "joints": list(self.joints), "numbers": dict(self.numbers)}
+
+
+wrong, look, ok = partial(Finding, severity="wrong"), partial(Finding, severity="look"), partial(Finding, severity="ok")
 
 
 def worst(findings: Sequence[Finding]) -> Severity:

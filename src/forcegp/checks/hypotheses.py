@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from forcegp.checks.check_input import DEGREE, CheckInput
-from forcegp.checks.findings import Finding, listed
+from forcegp.checks.findings import Finding, listed, wrong
 from forcegp.checks.gravity import estimated_gravity, with_gravity
 from forcegp.checks.torques import Correction, TorqueFit, fit_torques, inverse_dynamics, unexplained_share
 from forcegp.data import Dataset
@@ -123,8 +123,7 @@ def _torque_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> It
     if not turned.any():
         return
     joints = tuple(names[joint] for joint in np.flatnonzero(turned))
-    finding = Finding(
-        severity="wrong",
+    finding = wrong(
         subject="torque sign",
         seen=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
         f"motion needs ({_remains(now.fit, other, turned)}).",
@@ -154,8 +153,7 @@ def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
     correction = now.correction.torque(order, np.ones(len(names)))
     better = _hypothesis(now.robot, correction, given, cost=0.5, concerns=_places(moved))
     text = ", ".join(f"that of {names[joint]} stands under {names[int(order[joint])]}" for joint in _places(moved))
-    finding = Finding(
-        severity="wrong",
+    finding = wrong(
         subject="joints exchanged",
         seen=f"torques stand under wrong joints: {text} ({_remains(now.fit, better.fit, moved)}).",
         remedy="Correct the order of the torque columns.",
@@ -174,8 +172,7 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
             alone = turned is not inputs.rotates
             if not turned.any() or (alone and (inputs.rotates.sum() == 1 or len(places) > ALL_TRIED)):
                 continue
-            finding = Finding(
-                severity="wrong",
+            finding = wrong(
                 subject="degrees",
                 seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
                 "for radians.",
@@ -188,8 +185,7 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
         if not now.fit.unexplained[joint] > STILL_UNEXPLAINED / 2:
             continue
         for ratio in GEARS:
-            finding = Finding(
-                severity="wrong",
+            finding = wrong(
                 subject="motion unit",
                 seen=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
                 "look like those of a motor before its gear.",
@@ -215,8 +211,7 @@ def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> It
             (f"positions and velocities of {name} have", motion),
             (f"the whole joint {name} (motion and torque) has", motion.torque(places, turned)),
         ):
-            finding = Finding(
-                severity="wrong",
+            finding = wrong(
                 subject="motion sign",
                 seen=f"{seen} the opposite sign of the URDF's.",
                 remedy="Turn the signs (forcegp import --sign), or the joint's axis in the URDF.",
@@ -235,12 +230,8 @@ def _motion_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> I
             order = np.arange(len(names))
             order[[one, other]] = order[[other, one]]
             motion = now.correction.motion(order, ones)
-            for what, correction in (
-                ("positions and velocities", motion),
-                ("all signals", motion.torque(order, ones)),
-            ):
-                finding = Finding(
-                    severity="wrong",
+            for what, correction in (("positions and velocities", motion), ("all signals", motion.torque(order, ones))):
+                finding = wrong(
                     subject="joints exchanged",
                     seen=f"{what} of {names[one]} and {names[other]} stand in each other's place.",
                     remedy="Correct the order of the columns, or the joint names of the log.",
@@ -264,8 +255,7 @@ def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
             continue
         gravity = size * direction
         text = ", ".join(f"{value + 0.0:.3g}" for value in gravity)
-        finding = Finding(
-            severity="wrong",
+        finding = wrong(
             subject="gravity",
             seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
             f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",

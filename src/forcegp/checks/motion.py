@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, CheckInput
-from forcegp.checks.findings import Finding, listed
+from forcegp.checks.findings import Finding, listed, ok
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 
@@ -61,8 +62,7 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
             if found_ok:
                 error = max(unexplained for _, _, unexplained in found_ok)
                 found.append(
-                    Finding(
-                        severity="ok",
+                    ok(
                         subject="velocity",
                         seen=f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not).",
                         numbers={"unexplained": error},
@@ -108,49 +108,37 @@ def _finding(
     factor, shift, unexplained = fit
     label = inputs.names[joint]
     numbers = {"quantity": name, "factor": factor, "delay": shift if np.isfinite(shift) else None}
-    numbers["unexplained"] = unexplained
+    about = partial(Finding, subject=what, joints=(label,), numbers={**numbers, "unexplained": unexplained})
     if unexplained > UNEXPLAINED:
-        return Finding(
+        return about(
             severity="wrong" if name == "v" else "look",
-            subject=what,
             seen=f"the {what} of {label} is not {derivative}: {100.0 * unexplained:.0f} % of its power is something "
             "else.",
             remedy=f"Check which column {name} was read from; or leave it out, so that it is computed from "
             f"{'q' if name == 'v' else 'v'}.",
-            joints=(label,),
-            numbers=numbers,
         )
     if unexplained < FEW and factor < 0.0:
-        return Finding(
+        return about(
             severity="wrong",
-            subject=what,
             seen=f"the {what} of {label} has the opposite sign of {derivative} (factor {factor:.3g}).",
             remedy=f"Turn the sign of {name} or of {'q' if name == 'v' else 'v'} for this joint, whichever is wrong.",
-            joints=(label,),
-            numbers=numbers,
         )
     if unexplained < FEW and abs(factor - 1.0) > CLOSE:
         unit = next((unit for known, unit in FACTORS.items() if abs(factor / known - 1.0) < CLOSE), None)
         guess = f": {name} looks like {unit}" if unit and name == "v" else ""
-        return Finding(
+        return about(
             severity="wrong" if abs(factor - 1.0) > 4 * CLOSE else "look",
-            subject=what,
             seen=f"the {what} of {label} is {factor:.4g} times {derivative}{guess}.",
             remedy=f"Convert {name} or {'q' if name == 'v' else 'v'} to SI units, or remove the gear ratio.",
-            joints=(label,),
-            numbers=numbers,
         )
     step = float(np.median(np.diff(inputs.even.time)))
     if unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
-        return Finding(
+        return about(
             severity="look",
-            subject=what,
             seen=f"the {what} of {label} is logged {1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'} "
             f"than {derivative}: {abs(shift) / step:.1f} time steps.",
             remedy=f"It was filtered by the robot: compute {name} from positions (forcegp prepare --cutoff auto "
             "--differentiate q).",
-            joints=(label,),
-            numbers=numbers,
         )
     return None
 
@@ -176,10 +164,7 @@ def _merged(findings: list[Finding], nv: int) -> list[Finding]:
         each = "" if alike else f" Factors: {', '.join(f'{factor:.3g}' for factor in factors)}."
         merged.append(
             replace(
-                first,
-                joints=joints,
-                seen=f"{seen}{each}",
-                numbers={"each": [dict(item.numbers) for item in group]},
+                first, joints=joints, seen=f"{seen}{each}", numbers={"each": [dict(item.numbers) for item in group]}
             )
         )
     return merged

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.findings import Finding, plain
+from forcegp.checks.findings import Finding, look, ok, plain
 from forcegp.checks.successive_rows import white_noise
 
 MUCH = 0.2
@@ -60,7 +60,7 @@ def noise_findings(inputs: CheckInput) -> list[Finding]:
     cutoff = report.get("cutoff")
     measured = report.get("acceleration_noise", {})
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
-        return [Finding(severity="ok", subject="noise", seen="the positions show no noise worth a filter.")]
+        return [ok(subject="noise", seen="the positions show no noise worth a filter.")]
     before, after = (numbers_of(measured[when]) for when in ("before", "after"))
     spread = np.std(inputs.prepared.dataset.a, axis=0)
     why = "where the spectrum shows the end of the motion" if inputs.automatic else "as asked for"
@@ -71,8 +71,7 @@ def noise_findings(inputs: CheckInput) -> list[Finding]:
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
         unit = "rad/s²" if inputs.rotates[worst] else "m/s²"
         found.append(
-            Finding(
-                severity="ok",
+            ok(
                 subject="noise",
                 seen=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
                 f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
@@ -86,8 +85,7 @@ def noise_findings(inputs: CheckInput) -> list[Finding]:
     if raw and len(loud) and _measured_noise(inputs, loud):
         names = tuple(inputs.names[joint] for joint in loud)
         found.append(
-            Finding(
-                severity="look",
+            look(
                 subject="noise",
                 seen=f"the acceleration in this dataset is not filtered: its noise is up to "
                 f"{np.max(before[loud] / spread[loud]):.2g} "
@@ -100,8 +98,7 @@ def noise_findings(inputs: CheckInput) -> list[Finding]:
     if len(left):
         names = tuple(inputs.names[joint] for joint in left)
         found.append(
-            Finding(
-                severity="look",
+            look(
                 subject="noise",
                 seen=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
                 f"{', '.join(names)}.",
@@ -125,8 +122,7 @@ def _in_torques(inputs: CheckInput, after: np.ndarray) -> list[Finding]:
         return []
     text = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
     return [
-        Finding(
-            severity="look",
+        look(
             subject="noise",
             seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
             remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "

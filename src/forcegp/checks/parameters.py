@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.checks.findings import Finding
+from forcegp.checks.findings import Finding, look
 from forcegp.checks.gravity import with_gravity
 from forcegp.checks.torques import SLOW, inverse_dynamics
 from forcegp.data import Dataset
@@ -127,8 +127,7 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
     others.pop(best.seen(1.0), None)  # a mass with and without its inertia reads the same
     also = f" Nearly as well: {'; '.join(others.values())}." if others else ""
     return [
-        Finding(
-            severity="look",
+        look(
             subject=best.subject,
             seen=f"{best.seen(value)}; then {100.0 * np.exp(-gain / rows.nv):.2g} % of what was unexplained remains."
             f"{also}",

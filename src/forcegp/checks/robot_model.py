@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forcegp.checks.findings import Finding, listed
+from forcegp.checks.findings import Finding, listed, look
 from forcegp.robots import Robot
 
 
@@ -18,8 +18,7 @@ def robot_findings(robot: Robot) -> list[Finding]:
     alone = [name for name in light if name in {joint.child for joint in robot.joints}]
     if alone:
         found.append(
-            Finding(
-                severity="look",
+            look(
                 subject="URDF",
                 seen=f"{listed(alone)} move with a joint of their own but have no mass.",
                 remedy="Add their <inertial>, or expect their inertia to be missing.",
@@ -28,8 +27,7 @@ def robot_findings(robot: Robot) -> list[Finding]:
     shapes = {(link.mass, link.inertia) for link in heavy}
     if len(heavy) > 2 and len(shapes) == 1:
         found.append(
-            Finding(
-                severity="look",
+            look(
                 subject="URDF",
                 seen=f"all {len(heavy)} moving links have the same mass and inertia ({heavy[0].mass:g} kg): a "
                 "placeholder.",
@@ -41,8 +39,7 @@ def robot_findings(robot: Robot) -> list[Finding]:
         center = float(np.linalg.norm(link.center_of_mass))
         if reach > 0.0 and (gyration > reach or center > 2.0 * reach):
             found.append(
-                Finding(
-                    severity="look",
+                look(
                     subject="URDF",
                     seen=f"link {link.name} has a radius of gyration of {gyration:.3g} m and its centre of mass "
                     f"{center:.3g} m "

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.checks.check_input import GAP, CheckInput
-from forcegp.checks.findings import Finding
+from forcegp.checks.findings import Finding, look, ok
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data.filtering import JITTER
 
@@ -41,8 +41,7 @@ def sampling_findings(inputs: CheckInput) -> list[Finding]:
     seconds = float(steps.sum())
     numbers = {"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)}
     found = [
-        Finding(
-            severity="ok",
+        ok(
             subject="sampling",
             seen=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
             numbers=numbers,
@@ -53,8 +52,7 @@ def sampling_findings(inputs: CheckInput) -> list[Finding]:
     spread = float(np.abs(regular - median).max()) / median
     if spread > JITTER:
         found.append(
-            Finding(
-                severity="look",
+            look(
                 subject="jitter",
                 seen=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
                 f"median {1e3 * median:.3g} ms.",
@@ -107,8 +105,7 @@ def _repeated(inputs: CheckInput) -> list[Finding]:
         return []
     row = int(np.flatnonzero(same & moves)[0]) + 1
     return [
-        Finding(
-            severity="look",
+        look(
             subject="repeated rows",
             seen=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
             f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",

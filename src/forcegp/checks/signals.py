@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.findings import Finding, listed
+from forcegp.checks.findings import Finding, listed, look, wrong
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
 
@@ -53,8 +53,7 @@ def _leaps(inputs: CheckInput) -> Iterator[Finding]:
         if places.any():
             row, joint = (int(index) for index in np.argwhere(places)[0])
             name = inputs.names[joint]
-            yield Finding(
-                severity="wrong",
+            yield wrong(
                 subject="jumps",
                 seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
                 f"({int(places.sum())} times in all).",
@@ -72,8 +71,7 @@ def _dropped(inputs: CheckInput) -> Iterator[Finding]:
     rows = np.logical_or.reduce([each.any(axis=1) for each in lost.values()])
     first = int(np.flatnonzero(rows)[0])
     joints = np.logical_or.reduce([each.any(axis=0) for each in lost.values()])
-    yield Finding(
-        severity="wrong",
+    yield wrong(
         subject="drop-outs",
         seen=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
         f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
@@ -199,8 +197,7 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
         near = int(((below > 1e-9 * np.ptp(u)) & (below <= 1e-9 * np.ptp(u) + width)).sum())
         start, length = _runs(np.abs(log.u[:, joint] - sign * extreme) <= 1e-9 * np.ptp(u))
         if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
-            yield Finding(
-                severity="wrong",
+            yield wrong(
                 subject="saturation",
                 seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
                 f"{at} "
@@ -237,8 +234,7 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
         beyond = tuple(inputs.names[k] for k in np.flatnonzero((excess > 0.0).any(axis=0)))
         others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
         unit = log.units[name] if isinstance(log.units[name], str) else log.units[name][joint]
-        yield Finding(
-            severity="look",
+        yield look(
             subject="limits",
             seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
             f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
@@ -266,8 +262,7 @@ def _resolution(inputs: CheckInput) -> Iterator[Finding]:
             joints.append(label)
             quanta[label] = quantum
         if quantized:
-            yield Finding(
-                severity="look",
+            yield look(
                 subject="resolution",
                 seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
                 remedy="Log more digits, or expect noise from this.",

@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 import forcegp.parallel
-from forcegp.cli.command import Command
+from forcegp.cli.command import Command, unless_given
 from forcegp.errors import InvalidInput
 
 
@@ -20,9 +20,7 @@ class BackendOptions(Command):
     backend: Annotated[str | None, arg(metavar="serial|joblib|ray", constructor=str, help_behavior_hint="")] = None
     """serial: in this process. joblib: in processes of this machine. ray: on the machines of a Ray cluster; see
     docs/clusters.md. (default: serial for one job, else joblib)"""
-    address: Annotated[
-        str | None, arg(metavar="HOST:PORT", constructor=str, help_behavior_hint="(default: that of this machine)")
-    ] = None
+    address: Annotated[str | None, unless_given("HOST:PORT", "that of this machine", str)] = None
     """The head of the Ray cluster, for --backend ray."""
 
     def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:

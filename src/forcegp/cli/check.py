@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.output_folders import plots_folder, require_free_folder
 from forcegp.cli.preparation_options import CutoffOptions
 from forcegp.cli.robot_options import RobotOptions
@@ -42,9 +42,7 @@ class Check(CutoffOptions, RobotOptions):
     """The dataset to check (HDF5)."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Filter for the comparison of q, v, a and u. auto: where the spectrum shows that motion ends and noise begins."""
-    plots: Annotated[Path | None, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: no plots)")] = (
-        None
-    )
+    plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
     """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""

@@ -19,6 +19,11 @@ Json = Annotated[bool, arg(help="Print one JSON object on stdout, and nothing el
 Debug = Annotated[bool, arg(help="Show the traceback of an error.")]
 
 
+def unless_given(metavar: str, default: str, constructor: type | None = None) -> Any:
+    """Annotates an option that is None unless it is given: what `--help` calls its value, and its default."""
+    return arg(metavar=metavar, constructor=constructor, help_behavior_hint=f"(default: {default})")
+
+
 @dataclass(frozen=True)
 class InputPath:
     """Annotates a field with a path that must be there: `refusal` follows the path in the error where it is not."""

@@ -17,7 +17,7 @@ import forcegp.inference
 import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.fit_options import POINTS
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import resolved_noise
@@ -46,21 +46,17 @@ class Compare(LearningOptions):
         arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(give it twice or more)"),
     ] = ()
     """A candidate: the name of a prior as in forcegp fit, or a sum such as "tool-friction + joint-friction"."""
-    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: nothing is written)")] = None
+    out: Annotated[Path | None, unless_given("FOLDER", "nothing is written")] = None
     """Also write every fitted model and comparison.json into this folder."""
-    points: Annotated[
-        int | None, arg(metavar="N", constructor=int, help_behavior_hint=f"(default: {POINTS}, or all rows)")
-    ] = None
+    points: Annotated[int | None, unless_given("N", f"{POINTS}, or all rows", int)] = None
     """Train on N rows that lie farthest apart. Time grows with the cube of N."""
     mean: Literal["analytical", "zero"] = "analytical"
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
     iterations: Annotated[int, arg(metavar="N")] = 200
     """Most L-BFGS iterations of each start."""
-    block_seconds: Annotated[
-        float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: a twentieth of the recording)")
-    ] = None
+    block_seconds: Annotated[float | None, unless_given("S", "a twentieth of the recording", float)] = None
     """Length of the stretches of time that are left out; longer than the time over which motion is correlated."""
-    test: Annotated[Path | None, DATASET, arg(metavar="TEST.h5", help_behavior_hint="(default: none)")] = None
+    test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none")] = None
     """Another recording to score the candidates on as well."""
     json: Json = False
     debug: Debug = False
@@ -141,11 +137,7 @@ class Compare(LearningOptions):
             )
 
     def _write(
-        self,
-        out: Path,
-        comparison: forcegp.PriorComparison,
-        content: Mapping[str, Any],
-        folders: Mapping[str, str],
+        self, out: Path, comparison: forcegp.PriorComparison, content: Mapping[str, Any], folders: Mapping[str, str]
     ) -> None:
         with output_folder(out, KIND, self._given(), overwrite=self.overwrite) as folder:
             for name, posterior in comparison.posteriors.items():

@@ -172,10 +172,7 @@ def _multiplier_line(evaluations: Mapping[str, forcegp.Evaluation]) -> str:
 
 
 def _draw_all(
-    terminal: Terminal,
-    folder: Path,
-    models: Mapping[str, forcegp.models.StructuredPosterior],
-    test: forcegp.Dataset,
+    terminal: Terminal, folder: Path, models: Mapping[str, forcegp.models.StructuredPosterior], test: forcegp.Dataset
 ) -> list[str]:
     pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
     forcegp.evaluation.save_figure(

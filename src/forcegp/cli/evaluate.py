@@ -13,7 +13,7 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
 from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.cli.output_folders import plots_folder, require_free_folder
 from forcegp.cli.system_choice import SystemChoice, carried_over
@@ -55,7 +55,7 @@ class Evaluate(Command):
         arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: those of --system)"),
     ] = ()
     """Predict under these contacts instead, for example a joint that stuck; written as for forcegp fit."""
-    plots: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: no plots)")] = None
+    plots: Annotated[Path | None, unless_given("FOLDER", "no plots")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
     overwrite: bool = False
     """Replace the folder of plots if forcegp wrote it."""

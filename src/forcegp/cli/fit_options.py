@@ -11,6 +11,7 @@ from tyro.conf import UseAppendAction, arg
 
 import forcegp
 import forcegp.models
+from forcegp.cli.command import unless_given
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.output_folders import output_folder
 
@@ -19,11 +20,11 @@ ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp
 LearnFrom = Literal["accelerations", "increments", "weak-form"]
 
 POINTS, NETWORK_POINTS = 200, 10_000
-POINTS_HINT = f"(default: {POINTS}; networks {NETWORK_POINTS})"
+POINTS_HINT = f"{POINTS}; networks {NETWORK_POINTS}"
 WINDOW = 0.1
 """Length of a window where none is given, in s."""
 ITERATIONS = 200
-ITERATIONS_HINT = f"(default: {ITERATIONS}; networks 5000, ensembles 3000)"
+ITERATIONS_HINT = f"{ITERATIONS}; networks 5000, ensembles 3000"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,24 +52,16 @@ class ModelOptions(FitOptions):
     unconstrained: on the acceleration that the robot would have without contacts. analytical: known physics alone.
     independent-gp: one Gaussian process per joint, without physics. neural-network: one small network.
     ensemble: several networks with variances."""
-    points: Annotated[
-        int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint=POINTS_HINT),
-    ] = None
+    points: Annotated[int | None, unless_given("N", POINTS_HINT, int)] = None
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N as far as
     --engine is exact."""
     engine: Annotated[Literal["auto", "exact", "iterative", "inducing", "stochastic"], arg(metavar="NAME")] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. iterative: by conjugate gradients.
     inducing: through fewer points, for friction curves and the like. stochastic: the same, on mini-batches. auto: by
     the number of points, the features and the free memory, and reports why. See docs/large-data.md."""
-    learning_points: Annotated[
-        int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint="(default: all points up to 1500, else 600)"),
-    ] = None
+    learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
     """Find the hyper-parameters on N of the points; the posterior is that of all points."""
-    mean: Annotated[
-        Literal["analytical", "zero"] | None, arg(metavar="analytical|zero", help_behavior_hint="(default: analytical)")
-    ] = None
+    mean: Annotated[Literal["analytical", "zero"] | None, unless_given("analytical|zero", "analytical")] = None
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
     prior: Annotated[
         UseAppendAction[tuple[str, ...]],
@@ -80,14 +73,9 @@ class ModelOptions(FitOptions):
     learn_from: Annotated[LearnFrom, arg(metavar="accelerations|increments|weak-form")] = "accelerations"
     """accelerations: of the dataset. increments, weak-form: from raw velocities or positions over short windows, of
     which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
-    window: Annotated[
-        float | None, arg(metavar="SECONDS", constructor=float, help_behavior_hint=f"(default: {WINDOW})")
-    ] = None
+    window: Annotated[float | None, unless_given("SECONDS", f"{WINDOW}", float)] = None
     """Length of the windows."""
-    iterations: Annotated[
-        int | None,
-        arg(metavar="N", constructor=int, help_behavior_hint=ITERATIONS_HINT),
-    ] = None
+    iterations: Annotated[int | None, unless_given("N", ITERATIONS_HINT, int)] = None
     """Most L-BFGS iterations of each start, or training steps of a network."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/gpu.md. The folder that is written can be used on any machine."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
-from forcegp.cli.command import DATASET
+from forcegp.cli.command import DATASET, unless_given
 from forcegp.cli.fit_options import FitOptions
 
 
@@ -33,19 +33,13 @@ class IdentifyOptions(FitOptions):
     forward dynamics, where arms are light."""
     robust: Annotated[bool, arg(help_behavior_hint="")] = False
     """With the last two models: count outliers by their absolute value."""
-    test: Annotated[
-        Path | None, DATASET, arg(metavar="TEST.h5", constructor=Path, help_behavior_hint="(default: none)")
-    ] = None
+    test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none", Path)] = None
     """With the last two models: score on this recording, too."""
-    prior_strength: Annotated[
-        float | None, arg(metavar="W", constructor=float, help_behavior_hint="(default: 0; 1 for the last two models)")
-    ] = None
+    prior_strength: Annotated[float | None, unless_given("W", "0; 1 for the last two models", float)] = None
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
     points: Annotated[int, arg(metavar="N")] = 200
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N."""
-    learning_points: Annotated[
-        int | None, arg(metavar="N", constructor=int, help_behavior_hint="(default: all points)")
-    ] = None
+    learning_points: Annotated[int | None, unless_given("N", "all points", int)] = None
     """Find the estimates and all other parameters on N of the points; standard errors are those of N points."""
     mean: Literal["analytical", "zero"] = "analytical"
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""

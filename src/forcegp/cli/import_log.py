@@ -14,7 +14,7 @@ import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, URDF, Debug, Json
+from forcegp.cli.command import LOG, MAPPING, URDF, Debug, Json, unless_given
 from forcegp.cli.output_folders import require_free_file
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
@@ -24,9 +24,9 @@ from forcegp.errors import ForceGPError, InvalidInput
 COPIES = 10
 """Times the size of its file that a dataset is taken to need while it is prepared: numbers hardly shrink in it."""
 
-Columns = Annotated[str | None, arg(metavar="COLUMNS", constructor=str, help_behavior_hint="(default: by the names)")]
-Text = Annotated[str | None, arg(metavar="TEXT", constructor=str, help_behavior_hint="(default: none)")]
-Seconds = Annotated[float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: all)")]
+Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
+Text = Annotated[str | None, unless_given("TEXT", "none", str)]
+Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,25 +44,19 @@ class Import(PreparationOptions, RobotOptions):
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
     """
 
-    robot: Annotated[
-        Path | None, URDF, arg(metavar="ARM.urdf", constructor=Path, help_behavior_hint="(default: none)")
-    ] = None
+    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "none", Path)] = None
     """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
-    mapping: Annotated[
-        Path | None, MAPPING, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: beside)")
-    ] = None
+    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside", Path)] = None
     """What the columns mean; flags replace its entries. Default: log.yaml or forcegp.yaml beside the log."""
-    write_mapping: Annotated[
-        Path | None, arg(metavar="FILE.yaml", constructor=Path, help_behavior_hint="(default: no)")
-    ] = None
+    write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "no", Path)] = None
     """Write the mapping that results from flags and --mapping."""
     time: Columns = None
     """Time stamps."""
-    step: Annotated[float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: --time)")] = None
+    step: Annotated[float | None, unless_given("S", "--time", float)] = None
     """Seconds between two rows, for a log without time stamps."""
     q: Columns = None
     """Positions, one per joint."""
@@ -88,22 +82,15 @@ class Import(PreparationOptions, RobotOptions):
     """A pattern for arrays or groups of one file, each of which is an episode: piece*, data/demo_*."""
     headerless: Text = None
     """Text without names of columns: how many numbers make a row, for all files or for each: 1,7,7."""
-    delimiter: Annotated[
-        str | None,
-        arg(metavar="comma|tab|semicolon|blanks|LETTER", constructor=str, help_behavior_hint="(default: detected)"),
-    ] = None
+    delimiter: Annotated[str | None, unless_given("comma|tab|semicolon|blanks|LETTER", "detected", str)] = None
     """What separates the columns of a text."""
     side_by_side: bool = False
     """The files are one recording, with a signal in each; columns are called FILE:column."""
-    gap: Annotated[
-        float | None, arg(metavar="S", constructor=float, help_behavior_hint="(default: 10 median steps)")
-    ] = None
+    gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
     """A longer pause begins another episode."""
     resample: Literal["auto", "no"] = "auto"
     """auto: rows at uneven times are given even ones by a cubic spline. no: every stamp is kept."""
-    rate: Annotated[float | None, arg(metavar="HZ", constructor=float, help_behavior_hint="(default: the median)")] = (
-        None
-    )
+    rate: Annotated[float | None, unless_given("HZ", "the median", float)] = None
     """Of the even times."""
     start: Seconds = None
     """Leave out what comes earlier, in seconds from the first row of each episode."""

@@ -47,10 +47,7 @@ def with_learned_forces(
             forcegp.CoulombJointFriction,
             lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
         ),
-        "load-joint-friction": (
-            forcegp.LoadJointFriction,
-            lambda: forcegp.LoadJointFriction(0.0, 0.0, 0.1),
-        ),
+        "load-joint-friction": (forcegp.LoadJointFriction, lambda: forcegp.LoadJointFriction(0.0, 0.0, 0.1)),
         "armature": (forcegp.Armature, lambda: forcegp.Armature(0.0)),
         "rotor-inertia": (forcegp.RotorInertia, lambda: forcegp.RotorInertia(0.0)),
     }

@@ -13,7 +13,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 import forcegp
 import forcegp.checks
 from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import DATASET
+from forcegp.cli.command import DATASET, unless_given
 from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
 from forcegp.cli.contact_syntax import parse_contacts
 from forcegp.cli.findings_line import findings_in_one_line
@@ -30,22 +30,18 @@ class LearningOptions(BackendOptions, RobotOptions):
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
-    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
+    out: Annotated[Path | None, unless_given("FOLDER", "none")] = None
     """The folder to write."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
     where it does not)."""
-    force_noise: Annotated[
-        float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
-    ] = None
+    force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
     """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
-    restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
+    restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
     """Starts of the search; the best is kept."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the starts of the search after the first."""
-    jobs: Annotated[
-        int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: 1, or all that --backend has)")
-    ] = None
+    jobs: Annotated[int | None, unless_given("J", "1, or all that --backend has", int)] = None
     """Restarts at once."""
     adam_steps: Annotated[int, arg(metavar="N")] = 0
     """Adam steps before them."""

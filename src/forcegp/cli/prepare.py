@@ -14,7 +14,7 @@ import forcegp
 import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.output_folders import plots_folder, require_free_file, require_free_folder
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
@@ -40,9 +40,7 @@ class Prepare(PreparationOptions, RobotOptions):
     """The dataset to prepare (HDF5), as forcegp import wrote it."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write."""
-    plots: Annotated[Path | None, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: no plots)")] = (
-        None
-    )
+    plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
     """Also draw the spectra before and after, with the cut-off, into this folder."""
     overwrite: bool = False
     """Replace the file if it exists, and the folder if forcegp wrote it."""

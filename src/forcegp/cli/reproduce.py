@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 import forcegp.experiments
 from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import Debug, Json
+from forcegp.cli.command import Debug, Json, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -40,17 +40,15 @@ class Reproduce(BackendOptions):
     preset: Annotated[str, arg(metavar="smoke|paper|forces|forces-smoke")] = "smoke"
     """smoke: small, in a few minutes, to see that everything works. paper: the full experiments, CPU-hours.
     forces: what priors on forces are worth; forces-smoke: the same, small."""
-    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reproduction-PRESET)")] = None
+    out: Annotated[Path | None, unless_given("FOLDER", "reproduction-PRESET")] = None
     """The folder of results; an unfinished one is gone on with."""
-    docs: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: only into --out)")] = None
+    docs: Annotated[Path | None, unless_given("FOLDER", "only into --out")] = None
     """Write the page (reproduction.md, force-priors.md), its figures, JSON and CSV into this folder, too."""
-    points: Annotated[tuple[int, ...], arg(metavar="N", help_behavior_hint="(default: the preset's)")] = ()
+    points: Annotated[tuple[int, ...], unless_given("N", "the preset's")] = ()
     """Other numbers of training points."""
-    seeds: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: the preset's)")] = ()
+    seeds: Annotated[tuple[int, ...], unless_given("K", "the preset's")] = ()
     """Other trajectories."""
-    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: as many as cores)")] = (
-        None
-    )
+    jobs: Annotated[int | None, unless_given("J", "as many as cores", int)] = None
     """Pieces of work at once, each on one core."""
     json: Json = False
     debug: Debug = False
@@ -70,13 +68,7 @@ class Reproduce(BackendOptions):
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
             summaries = forcegp.experiments.reproduce(
-                experiments,
-                self.preset,
-                out,
-                command=self._command(),
-                docs=self.docs,
-                backend=backend,
-                progress=report,
+                experiments, self.preset, out, command=self._command(), docs=self.docs, backend=backend, progress=report
             )
         terminal.show(
             f"{out / forcegp.experiments.page_name(experiments, self.preset)} reports the results; figures, JSON and "

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
-from forcegp.cli.command import IDENTIFIED, URDF, Command
+from forcegp.cli.command import IDENTIFIED, URDF, Command, unless_given
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.file_digests import require_unchanged
 
@@ -23,7 +23,7 @@ SYSTEM_FILE = "system.json"
 class RobotOptions(Command):
     """What every command asks that needs a robot."""
 
-    robot: Annotated[Path | None, URDF, arg(metavar="ARM.urdf", help_behavior_hint="(default: the dataset's)")] = None
+    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
     """Use this robot instead of the dataset's."""
     inertias: Annotated[Literal["strict", "nearest"], arg(metavar="strict|nearest")] = "strict"
     """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
@@ -38,13 +38,9 @@ class RobotOptions(Command):
         arg(metavar="JOINT=VALUE", help_behavior_hint="(repeatable; default: as recorded, or 0)"),
     ] = ()
     """Rotor inertia seen at a joint, in kg m² (kg for a prismatic one)."""
-    gravity: Annotated[
-        str | None, arg(metavar="X,Y,Z", constructor=str, help_behavior_hint="(default: as recorded, or 0,0,-9.81)")
-    ] = None
+    gravity: Annotated[str | None, unless_given("X,Y,Z", "as recorded, or 0,0,-9.81", str)] = None
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
-    identified: Annotated[
-        Path | None, IDENTIFIED, arg(metavar="FOLDER", constructor=Path, help_behavior_hint="(default: none)")
-    ] = None
+    identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
     """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
 
     def chosen_robot(self, recorded: forcegp.Robot | None = None) -> forcegp.Robot | None:

@@ -14,7 +14,7 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
 from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import NONE, columns, facts, number, percent
@@ -42,9 +42,9 @@ class Rollout(Command):
     """A recording with equal time steps that the model has not seen (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: rollout.json, rollout.h5 and rollout.png."""
-    start: Annotated[str | None, arg(metavar="ROW[,ROW...]", help_behavior_hint="(default: --starts)")] = None
+    start: Annotated[str | None, unless_given("ROW[,ROW...]", "--starts")] = None
     """Begin at these rows of the dataset."""
-    starts: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 10)")] = None
+    starts: Annotated[int | None, unless_given("N", "10")] = None
     """Begin at so many rows, spread evenly over the recording."""
     seconds: Annotated[float, arg(metavar="S")] = 1.0
     """How long each motion lasts."""

@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.validation
 from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import DATASET, Debug, Json
+from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.friction_laws import friction_laws
 from forcegp.cli.preparation_options import PreparationOptions
 from forcegp.cli.robot_options import RobotOptions
@@ -54,9 +54,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     auto: a quarter of the episodes, or with one episode blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
     """Seconds of training rows left out beside held-out blocks."""
-    models: Annotated[
-        tuple[str, ...], arg(metavar="NAME", help_behavior_hint="(default: all but single networks)")
-    ] = ()
+    models: Annotated[tuple[str, ...], unless_given("NAME", "all but single networks")] = ()
     """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
     PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
     identified from the same rows."""
@@ -75,18 +73,16 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     """Motions from every held-out stretch of time."""
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
     """Of these motions: rk4, symplectic-euler, implicit-midpoint or projected."""
-    restarts: Annotated[int | None, arg(metavar="R", help_behavior_hint="(default: 4 up to 400 points, else 1)")] = None
+    restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
     """Starts of every search for hyper-parameters; the best is kept."""
-    iterations: Annotated[int | None, arg(metavar="N", constructor=int, help_behavior_hint="(default: 200)")] = None
+    iterations: Annotated[int | None, unless_given("N", "200", int)] = None
     """Most iterations of each start."""
-    force_noise: Annotated[
-        float | None, arg(metavar="SIGMA", constructor=float, help_behavior_hint="(default: none)")
-    ] = None
+    force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
     """Models with physics learn a noise of the joint forces as well, beginning at this standard deviation in Nm."""
     measured_torque: bool = False
     """u was measured by noisy sensors, and models with physics take it so when they predict: those with --force-noise,
     or a noise from an identification of all training rows."""
-    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="(default: 1)")] = None
+    jobs: Annotated[int | None, unless_given("J", "1", int)] = None
     """Pieces of work at once, each on one core."""
     overwrite: bool = False
     """Compute everything anew where the folder holds results."""

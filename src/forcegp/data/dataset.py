@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
@@ -156,7 +157,7 @@ class Dataset(Summary):
         return {name: values for name, values in {**stated, **by_row}.items() if values is not None}
 
     def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
-        return _rebuild, (self._fields(),)
+        return partial(Dataset, **self._fields()), ()
 
     @property
     def nv(self) -> int:
@@ -230,10 +231,6 @@ class Dataset(Summary):
 
     def _fields(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
-
-
-def _rebuild(arguments: dict[str, Any]) -> Dataset:
-    return Dataset(**arguments)
 
 
 def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSystem | None) -> tuple[str, ...]:

@@ -27,6 +27,8 @@ from forcegp.data.hdf5 import COMPRESSION, NewFile, describe
 from forcegp.data.units import validated_units
 from forcegp.errors import DatasetError
 
+Rows = Float[np.ndarray, "rows nv"]
+
 ROWS_PER_CHUNK = 8192
 TABLES = ("q", "v", "u", "a")
 THREADS = min(4, os.cpu_count() or 1)
@@ -90,16 +92,7 @@ class DatasetWriter:
             raise error
         return self._stack.__exit__(kind, error, trace)
 
-    def append(
-        self,
-        *,
-        q: Float[np.ndarray, "rows nv"],
-        v: Float[np.ndarray, "rows nv"],
-        u: Float[np.ndarray, "rows nv"],
-        a: Float[np.ndarray, "rows nv"],
-        time: Float[np.ndarray, " rows"],
-        episode: int,
-    ) -> None:
+    def append(self, *, q: Rows, v: Rows, u: Rows, a: Rows, time: Float[np.ndarray, " rows"], episode: int) -> None:
         """Add rows of one episode after those that are there. Raises DatasetError as a Dataset does."""
         given = {"q": q, "v": v, "u": u, "a": a}
         block = {name: finite_columns(name, values, self.joint_names, len(q)) for name, values in given.items()}

@@ -260,7 +260,6 @@ def _json(path: Path, name: str, text: str) -> dict[str, Any]:
 
 
 def _system(path: Path, text: str) -> Any:
-
     try:
         return forcegp.mechanics.MechanicalSystem.from_json(text)
     except ForceGPError as error:

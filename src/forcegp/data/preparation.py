@@ -12,14 +12,7 @@ from jaxtyping import Float
 
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import delayed, estimate_delay
-from forcegp.data.filtering import (
-    Signal,
-    differentiated,
-    episodes_in_order,
-    low_pass,
-    low_pass_gain,
-    uniform_step,
-)
+from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 

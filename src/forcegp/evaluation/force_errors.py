@@ -72,8 +72,8 @@ class ForceScore:
             own = mean[rows, column, None], variance[rows, column, None], truth[rows, column, None]
             covered.append(float(metrics.interval_coverage(*own)[0]) if rows.any() else None)
         return cls(
-            _numbers(metrics.mean_absolute_error(mean, truth)),
-            _numbers(metrics.root_mean_square_error(mean, truth)),
+            tuple(metrics.mean_absolute_error(mean, truth).tolist()),
+            tuple(metrics.root_mean_square_error(mean, truth).tolist()),
             tuple(covered),
             float(np.sqrt(np.square(error).mean())) / size if size > 0.0 else None,
         )
@@ -226,7 +226,3 @@ def _forces(
         if component.point_force is not None:
             forces[f"force {name}"] = component.point_force
     return forces
-
-
-def _numbers(values: np.ndarray) -> Numbers:
-    return tuple(float(value) for value in values)

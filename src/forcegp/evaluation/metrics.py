@@ -9,25 +9,24 @@ from scipy.special import ndtri
 
 from forcegp.errors import InvalidInput, NumericalError
 
+Columns = Float[np.ndarray, "rows k"]
+PerColumn = Float[np.ndarray, " k"]
+
 LOG_2_PI = float(np.log(2.0 * np.pi))
 
 
-def mean_absolute_error(
-    predicted: Float[np.ndarray, "rows k"], target: Float[np.ndarray, "rows k"]
-) -> Float[np.ndarray, " k"]:
+def mean_absolute_error(predicted: Columns, target: Columns) -> PerColumn:
     """Mean of |predicted - target| over the rows, in the units of the columns."""
     return np.abs(predicted - target).mean(axis=0)
 
 
-def root_mean_square_error(
-    predicted: Float[np.ndarray, "rows k"], target: Float[np.ndarray, "rows k"]
-) -> Float[np.ndarray, " k"]:
+def root_mean_square_error(predicted: Columns, target: Columns) -> PerColumn:
     """Root of the mean of (predicted - target)^2 over the rows, in the units of the columns."""
     return np.sqrt(np.square(predicted - target).mean(axis=0))
 
 
 def negative_log_density(
-    mean: Float[np.ndarray, "rows k"], covariance: Float[np.ndarray, "rows k k"], target: Float[np.ndarray, "rows k"]
+    mean: Columns, covariance: Float[np.ndarray, "rows k k"], target: Columns
 ) -> Float[np.ndarray, " rows"]:
     """-log N(target; mean, covariance) of every row, all columns jointly, in nats.
 
@@ -48,21 +47,14 @@ def negative_log_density(
     return 0.5 * (np.square(white).sum(axis=-1) + log_determinant + mean.shape[-1] * LOG_2_PI)
 
 
-def marginal_negative_log_density(
-    mean: Float[np.ndarray, "rows k"], variance: Float[np.ndarray, "rows k"], target: Float[np.ndarray, "rows k"]
-) -> Float[np.ndarray, " k"]:
+def marginal_negative_log_density(mean: Columns, variance: Columns, target: Columns) -> PerColumn:
     """Mean over the rows of -log N(target; mean, variance) of each column alone, in nats."""
     if not (variance > 0).all():
         raise NumericalError("a predicted variance is not positive, so it has no density; add that of the noise.")
     return (0.5 * (np.square(target - mean) / variance + np.log(variance) + LOG_2_PI)).mean(axis=0)
 
 
-def interval_coverage(
-    mean: Float[np.ndarray, "rows k"],
-    variance: Float[np.ndarray, "rows k"],
-    target: Float[np.ndarray, "rows k"],
-    level: float = 0.95,
-) -> Float[np.ndarray, " k"]:
+def interval_coverage(mean: Columns, variance: Columns, target: Columns, level: float = 0.95) -> PerColumn:
     """Share of targets inside the central `level` interval of each column: about `level` if the variance is right.
 
     `variance` must be that of `target`: with measurement noise for measured values, without for noise-free ones.
@@ -86,6 +78,6 @@ def joint_space_residual(
     return (np.linalg.pinv(A) @ residual[..., None])[..., 0] if A.shape[-2] else np.zeros((len(A), A.shape[-1]))
 
 
-def noise_floor(noise_std: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+def noise_floor(noise_std: PerColumn) -> PerColumn:
     """Mean absolute error of a perfect prediction against targets with Gaussian noise: std sqrt(2 / pi)."""
     return noise_std * np.sqrt(2.0 / np.pi)

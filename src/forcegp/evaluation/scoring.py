@@ -31,11 +31,8 @@ def evaluate(
     require_type("posterior", posterior, Posterior, " of a fit, and the dataset after it")
     require_rows("dataset", dataset, posterior.joint_names, "the model")
     predicted = predict_rows(posterior, dataset, progress)
-    scores = {
-        "known_physics_mae_per_joint": _numbers(metrics.mean_absolute_error(predicted.known_physics, dataset.a)),
-        **_against_measurements(predicted, dataset),
-        **_against_truth(predicted, dataset),
-    }
+    found = _against_measurements(predicted, dataset) | _against_truth(predicted, dataset) | _constraint(predicted)
+    scores: dict[str, Any] = {name: _numbers(x) if isinstance(x, np.ndarray) else x for name, x in found.items()}
     return Evaluation(
         rows=len(dataset),
         joint_names=posterior.joint_names,
@@ -50,7 +47,6 @@ def evaluate(
             *doubts(posterior, dataset, scores),
         ),
         **scores,
-        **_constraint(predicted),
     )
 
 
@@ -73,11 +69,12 @@ def _noise_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
 def _against_measurements(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]:
     measurement = predicted.measurement_variance
     return {
-        "mae_per_joint": _numbers(metrics.mean_absolute_error(predicted.mean, dataset.a)),
-        "rmse_per_joint": _numbers(metrics.root_mean_square_error(predicted.mean, dataset.a)),
+        "known_physics_mae_per_joint": metrics.mean_absolute_error(predicted.known_physics, dataset.a),
+        "mae_per_joint": metrics.mean_absolute_error(predicted.mean, dataset.a),
+        "rmse_per_joint": metrics.root_mean_square_error(predicted.mean, dataset.a),
         "nlpd": float(predicted.negative_log_density.mean()),
-        "nlpd_per_joint": _numbers(metrics.marginal_negative_log_density(predicted.mean, measurement, dataset.a)),
-        "coverage_95_per_joint": _numbers(metrics.interval_coverage(predicted.mean, measurement, dataset.a)),
+        "nlpd_per_joint": metrics.marginal_negative_log_density(predicted.mean, measurement, dataset.a),
+        "coverage_95_per_joint": metrics.interval_coverage(predicted.mean, measurement, dataset.a),
     }
 
 
@@ -86,15 +83,11 @@ def _against_truth(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]
     if "a" in dataset.truth:
         a = dataset.truth["a"]
         force_error = (predicted.mass @ (predicted.mean - a)[..., None])[..., 0]
-        out["mae_noise_free_per_joint"] = _numbers(metrics.mean_absolute_error(predicted.mean, a))
-        out["rmse_noise_free_per_joint"] = _numbers(metrics.root_mean_square_error(predicted.mean, a))
-        out["coverage_95_noise_free_per_joint"] = _numbers(
-            metrics.interval_coverage(predicted.mean, predicted.variance, a)
-        )
-        out["known_physics_mae_noise_free_per_joint"] = _numbers(
-            metrics.mean_absolute_error(predicted.known_physics, a)
-        )
-        out["force_mae_per_joint"] = _numbers(np.abs(force_error).mean(axis=0))
+        out["mae_noise_free_per_joint"] = metrics.mean_absolute_error(predicted.mean, a)
+        out["rmse_noise_free_per_joint"] = metrics.root_mean_square_error(predicted.mean, a)
+        out["coverage_95_noise_free_per_joint"] = metrics.interval_coverage(predicted.mean, predicted.variance, a)
+        out["known_physics_mae_noise_free_per_joint"] = metrics.mean_absolute_error(predicted.known_physics, a)
+        out["force_mae_per_joint"] = np.abs(force_error).mean(axis=0)
     if "Q_U" in dataset.truth and predicted.carried_known_force is not None:
         truth = dataset.truth["Q_U"] + predicted.carried_known_force
         out |= _forces("unknown_force", "_per_joint", predicted.unknown_force, predicted.unknown_force_variance, truth)
@@ -106,14 +99,14 @@ def _against_truth(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]
 
 def _forces(
     name: str, per: str, mean: np.ndarray | None, variance: np.ndarray | None, truth: np.ndarray
-) -> dict[str, Numbers]:
+) -> dict[str, np.ndarray]:
     """Scores of a force; none where the model lacks it, or of another number of contacts."""
     if mean is None or variance is None or mean.shape != truth.shape:
         return {}
     return {
-        f"{name}_mae{per}": _numbers(metrics.mean_absolute_error(mean, truth)),
-        f"{name}_rmse{per}": _numbers(metrics.root_mean_square_error(mean, truth)),
-        f"{name}_coverage_95{per}": _numbers(metrics.interval_coverage(mean, variance, truth)),
+        f"{name}_mae{per}": metrics.mean_absolute_error(mean, truth),
+        f"{name}_rmse{per}": metrics.root_mean_square_error(mean, truth),
+        f"{name}_coverage_95{per}": metrics.interval_coverage(mean, variance, truth),
     }
 
 
@@ -121,8 +114,8 @@ def _constraint(predicted: PredictedRows) -> dict[str, Any]:
     residual = metrics.constraint_residual(predicted.A, predicted.b, predicted.mean)
     per_joint = metrics.joint_space_residual(predicted.A, residual)
     return {
-        "constraint_error_per_contact": _numbers(np.abs(residual).mean(axis=0)),
-        "constraint_error_per_joint": _numbers(np.abs(per_joint).mean(axis=0)),
+        "constraint_error_per_contact": np.abs(residual).mean(axis=0),
+        "constraint_error_per_joint": np.abs(per_joint).mean(axis=0),
         "constraint_error_max": float(np.abs(residual).max(initial=0.0)),
     }
 

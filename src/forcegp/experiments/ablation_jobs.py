@@ -24,10 +24,7 @@ from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 PAPER_STEPS, PAPER_RATE = 500, 0.2
-SCHEDULES = {
-    "maximum-likelihood": "L-BFGS, no hyperprior",
-    "adam-ones": "Adam from ones",
-}
+SCHEDULES = {"maximum-likelihood": "L-BFGS, no hyperprior", "adam-ones": "Adam from ones"}
 """Searches without hyperprior and without restarts; "ones": all length scales and variances begin at 1."""
 
 WINDOW_ROWS, WINDOW_EVERY = 1000, 3

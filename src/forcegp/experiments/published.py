@@ -13,10 +13,7 @@ FIG2B_MAE = {
 }
 """Mean absolute error against noisy accelerations [rad/s^2], mean over the joints, by number of training points."""
 
-FIG2B_CONSTRAINT_ERROR = {
-    "gp": (0.229, 0.155, 0.087, 0.053, 0.041, 0.036),
-    "s-gp": (3e-12,) * 6,
-}
+FIG2B_CONSTRAINT_ERROR = {"gp": (0.229, 0.155, 0.087, 0.053, 0.041, 0.036), "s-gp": (3e-12,) * 6}
 """Mean |A a - b| [m/s^2] of the predicted mean; for S-GP the paper shows about 3e-12 throughout."""
 
 MAE_10000 = {"analytical": 0.57, "neural-network": 0.13}

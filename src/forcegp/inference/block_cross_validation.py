@@ -97,12 +97,7 @@ def leave_blocks_out(
         whole = whole - torch.stack([scale[list(block)].sum() for block in chosen])
         lower = lower[rows]
         return LeaveOut(
-            chosen,
-            whole,
-            rows.cpu(),
-            per_row,
-            (lower @ residual[..., None])[..., 0],
-            lower @ covariance @ lower.mT,
+            chosen, whole, rows.cpu(), per_row, (lower @ residual[..., None])[..., 0], lower @ covariance @ lower.mT
         )
 
 

@@ -8,6 +8,8 @@ the data hold about them.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -35,6 +37,24 @@ class Deflation:
     def rank(self) -> int:
         """The largest rank of W_i over the points (r)."""
         return self.C.shape[-2]
+
+    def columns(self, index: int, cross: Float[Tensor, "n N"]) -> Float[Tensor, "Nr n"]:
+        """Covariance of t with one latent at n points, from its kernel function `cross` between these and all rows."""
+        return (cross.mT[:, None, :] * self.C[:, :, index, None]).flatten(0, 1)
+
+    def drawn_weights(
+        self,
+        prior: Sequence[Float[Tensor, "S N"]],
+        generator: torch.Generator,
+        solve: Callable[[Tensor], Tensor],
+        jitter: float = 0.0,
+    ) -> tuple[Float[Tensor, "S N"], ...]:
+        """Matheron's rule: C^T T^-1 (t - C g_s - eps_s) with eps_s ~ N(0, 1 + jitter) and `solve` for T^-1."""
+        residual = self.t - torch.einsum("jac,csj->sja", self.C, torch.stack(list(prior)))
+        noise = torch.randn(residual.shape, generator=generator, dtype=self.C.dtype, device=self.C.device)
+        residual = residual - math.sqrt(1.0 + jitter) * noise
+        alpha = solve(residual.flatten(1).mT.contiguous()).mT.reshape(residual.shape)
+        return torch.einsum("jac,sja->csj", self.C, alpha).unbind(0)
 
 
 def whiten(

@@ -94,14 +94,10 @@ def _inner(kernel: Kernel) -> DenseKernel:
     if type(kernel) is ScaleKernel:
         base = kernel.base_kernel
         # active_dims of the base are those of the scaled kernel, which selects
-        return (
-            _Stationary(base, kernel) if type(base) in (RBFKernel, MaternKernel) else _Scaled(kernel, taken_apart(base))
-        )
-    if type(kernel) in (RBFKernel, MaternKernel):
-        return _Stationary(kernel, None)
-    if type(kernel) is ConstantKernel:
-        return _Constant(kernel)
-    return _Embedded(kernel) if embedding(kernel) is not None else _Weighted(kernel)
+        plain = type(base) in (RBFKernel, MaternKernel)
+        return _OfDistance(base, kernel) if plain else _Scaled(kernel, taken_apart(base))
+    of_distances = type(kernel) in (RBFKernel, MaternKernel) or embedding(kernel) is not None
+    return _OfDistance(kernel) if of_distances else _Weighted(kernel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,144 +119,95 @@ class _Called(DenseKernel):
         return cast(Tensor, self.kernel(z, z, diag=True))
 
 
+class _Composed(DenseKernel):
+    """A kernel made of others, in the same way for all three functions."""
+
+    @abstractmethod
+    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
+        """What `of(part, *points)` of the parts makes."""
+
+    @override
+    def matrix(self, z: Tensor) -> Tensor:
+        return self.composed(lambda part, z: part.matrix(z), z)
+
+    @override
+    def cross(self, z: Tensor, other: Tensor) -> Tensor:
+        return self.composed(lambda part, z, other: part.cross(z, other), z, other)
+
+    @override
+    def diagonal(self, z: Tensor) -> Tensor:
+        return self.composed(lambda part, z: part.diagonal(z), z)
+
+
 @dataclass(frozen=True, eq=False)
-class _Selected(DenseKernel):
+class _Selected(_Composed):
     """A kernel of some of the features, its `active_dims`."""
 
     kernel: Kernel
     inner: DenseKernel
 
     @override
-    def matrix(self, z: Tensor) -> Tensor:
-        return self.inner.matrix(self._of(z))
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self.inner.cross(self._of(z), self._of(other))
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return self.inner.diagonal(self._of(z))
-
-    def _of(self, z: Tensor) -> Tensor:
-        return z.index_select(-1, cast(Tensor, self.kernel.active_dims))
+    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
+        return of(self.inner, *(z.index_select(-1, cast(Tensor, self.kernel.active_dims)) for z in points))
 
 
 @dataclass(frozen=True, eq=False)
-class _Combined(DenseKernel):
+class _Combined(_Composed):
     """A sum or a product."""
 
     combine: Callable[[Tensor, Tensor], Tensor]
     parts: Sequence[DenseKernel]
 
     @override
-    def matrix(self, z: Tensor) -> Tensor:
-        return reduce(self.combine, [part.matrix(z) for part in self.parts])
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return reduce(self.combine, [part.cross(z, other) for part in self.parts])
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return reduce(self.combine, [part.diagonal(z) for part in self.parts])
+    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
+        return reduce(self.combine, [of(part, *points) for part in self.parts])
 
 
 @dataclass(frozen=True, eq=False)
-class _Scaled(DenseKernel):
+class _Scaled(_Composed):
     """An output scale (variance) times another kernel."""
 
     kernel: ScaleKernel
     base: DenseKernel
 
     @override
-    def matrix(self, z: Tensor) -> Tensor:
-        return self.kernel.outputscale * self.base.matrix(z)
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self.kernel.outputscale * self.base.cross(z, other)
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return self.kernel.outputscale * self.base.diagonal(z)
+    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
+        return self.kernel.outputscale * of(self.base, *points)
 
 
 @dataclass(frozen=True, eq=False)
-class _Stationary(DenseKernel):
-    """A squared exponential or a Matern, with an output scale where it has one."""
+class _OfDistance(DenseKernel):
+    """A squared exponential or a Matern, also of the distance in an embedding; with an output scale if it has one."""
 
     kernel: Kernel
-    scale: ScaleKernel | None
+    scale: ScaleKernel | None = None
 
     @override
     def matrix(self, z: Tensor) -> Tensor:
-        return stationary_matrix(z, lengthscale_of(self.kernel), self._variance(z), self._smoothness)
+        embed, lengthscale, smoothness = self._form(z)
+        return stationary_matrix(embed(z), lengthscale, self._variance(z), smoothness)
 
     @override
     def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        lengthscale = lengthscale_of(self.kernel)
-        return self._variance(z) * of_distance(z / lengthscale, other / lengthscale, self._smoothness)
+        embed, lengthscale, smoothness = self._form(z)
+        return self._variance(z) * of_distance(embed(z) / lengthscale, embed(other) / lengthscale, smoothness)
 
     @override
     def diagonal(self, z: Tensor) -> Tensor:
         return self._variance(z).expand(len(z))
 
-    @property
-    def _smoothness(self) -> float:
-        return self.kernel.nu if isinstance(self.kernel, MaternKernel) else math.inf
+    def _form(self, z: Tensor) -> tuple[PointMap, Tensor, float]:
+        """Embedding, length scales there, and smoothness."""
+        found = embedding(self.kernel)
+        if found is not None:
+            return found[0], torch.ones(1, dtype=z.dtype, device=z.device), found[1]
+        smoothness = self.kernel.nu if isinstance(self.kernel, MaternKernel) else math.inf
+        return lambda points: points, lengthscale_of(self.kernel), smoothness
 
     def _variance(self, z: Tensor) -> Tensor:
         if self.scale is None:
             return torch.ones((), dtype=z.dtype, device=z.device)
         return cast(Tensor, self.scale.outputscale)
-
-
-@dataclass(frozen=True, eq=False)
-class _Constant(DenseKernel):
-    """The same covariance of all points."""
-
-    kernel: ConstantKernel
-
-    @override
-    def matrix(self, z: Tensor) -> Tensor:
-        return self.cross(z, z)
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self.kernel.constant.reshape(1, 1).expand(len(z), len(other)).contiguous()
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return self.kernel.constant.reshape(1).expand(len(z))
-
-
-@dataclass(frozen=True, eq=False)
-class _Embedded(DenseKernel):
-    """A function of the distance in an embedding, with variance 1."""
-
-    kernel: Kernel
-
-    @override
-    def matrix(self, z: Tensor) -> Tensor:
-        embed, smoothness = self._embedding
-        one = torch.ones(1, dtype=z.dtype, device=z.device)
-        return stationary_matrix(embed(z), one, one[0], smoothness)
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        embed, smoothness = self._embedding
-        return of_distance(embed(z), embed(other), smoothness)
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return torch.ones(len(z), dtype=z.dtype, device=z.device)
-
-    @property
-    def _embedding(self) -> tuple[PointMap, float]:
-        found = embedding(self.kernel)
-        assert found is not None, "taken_apart found one"
-        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,19 +159,13 @@ class IterativePosterior(LatentPosterior):
 
     def _data_columns(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "_ n"]:
         """Covariance of the deflated data with one latent at points."""
-        cross = self.kernels.dense[index].cross(z, self.features[index])
-        return (cross.mT[:, None, :] * self.deflation.C[:, :, index, None]).flatten(0, 1)
+        return self.deflation.columns(index, self.kernels.dense[index].cross(z, self.features[index]))
 
     @override
     def function_weights(
         self, prior: Sequence[Float[Tensor, "S N"]], generator: torch.Generator
     ) -> tuple[Float[Tensor, "S N"], ...]:
-        # beta_s = C^T T^-1 (t - C g_s(Z) - eps_s) with eps_s ~ N(0, I), all functions in one search
-        C, t = self.deflation.C, self.deflation.t
-        residual = t - torch.einsum("jac,csj->sja", C, torch.stack(list(prior)))
-        noise = torch.randn(residual.shape, generator=generator, dtype=C.dtype, device=C.device)
-        alpha = self.solve((residual - noise).flatten(1).mT.contiguous()).mT.reshape(residual.shape)
-        return torch.einsum("jac,sja->csj", C, alpha).unbind(0)
+        return self.deflation.drawn_weights(prior, generator, self.solve)  # all functions in one search
 
     def solve(self, right: Float[Tensor, "n S"]) -> Float[Tensor, "n S"]:
         """T^-1 right, to the same tolerance. Raises NumericalError where it is not reached."""

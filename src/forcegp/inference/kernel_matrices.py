@@ -18,14 +18,7 @@ from functools import partial
 from typing import cast
 
 import torch
-from gpytorch.kernels import (
-    ConstantKernel,
-    Kernel,
-    LinearKernel,
-    PeriodicKernel,
-    RBFKernel,
-    ScaleKernel,
-)
+from gpytorch.kernels import ConstantKernel, Kernel, LinearKernel, PeriodicKernel, RBFKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 

@@ -29,7 +29,7 @@ from forcegp.inference.deflation import whiten
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import scaled_gradients
 from forcegp.inference.memory import require_memory
-from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
+from forcegp.inference.posterior import FactorizedPosterior
 from forcegp.inference.terms import Terms
 
 REMEDY = "use fewer points (windows), or fewer nodes in each"
@@ -130,7 +130,7 @@ class _NormalNLL(torch.autograd.Function):
 
 
 @dataclass(frozen=True, eq=False)
-class FunctionalPosterior(LatentPosterior):
+class FunctionalPosterior(FactorizedPosterior):
     """The exact posterior given functionals; the centres of every latent are all N n states."""
 
     kernels: LatentKernels
@@ -155,30 +155,14 @@ class FunctionalPosterior(LatentPosterior):
     def weights(self) -> tuple[Float[Tensor, " Nn"], ...]:
         return tuple(self.functionals.back(index, self.alpha[:, None])[:, 0] for index in range(len(self.features)))
 
+    @property
     @override
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        latents, points = len(self.features), features[0].shape[0]
-        height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.features[0])))
-        blocks = [
-            self._covariance_block([z[start : start + height] for z in features]) for start in range(0, points, height)
-        ]
-        return torch.cat(blocks) if blocks else self.alpha.new_zeros(0, latents, latents)
-
-    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 G_c k_c(Z, z) (Rasmussen & Williams 2006, eq. 2.26)
-        V = torch.stack([self.seen(index, z) for index, z in enumerate(features)], dim=-1).transpose(0, 1)
-        prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
-        return torch.diag_embed(prior) - V.mT @ V
+    def data_factor(self) -> CholeskyFactor:
+        return self.factor
 
     @override
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
-
-    @override
-    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        # L^-1 G_c k_c(Z, z)
-        cross = self.kernels.dense[index].cross(self.features[index], z)
-        return self.factor.solve_lower(self.functionals.through(index, cross))
+    def data_covariance(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        return self.functionals.through(index, self.kernels.dense[index].cross(self.features[index], z))
 
     @override
     def function_weights(

@@ -19,6 +19,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
+from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.deflation import deflate, whiten
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
@@ -83,7 +84,9 @@ class LatentPosterior(ABC):
 
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
-        height = max(1, BLOCK_BYTES // max(1, 8 * len(centers)))
+        if not len(centers):
+            return z.new_zeros(len(z))
+        height = max(1, BLOCK_BYTES // (8 * len(centers)))
         blocks = []
         for i in range(0, len(z), height):
             K = kernel.cross(z[i : i + height], centers)
@@ -97,8 +100,43 @@ class LatentPosterior(ABC):
         return tuple(math.fsum(weights.tolist()) for weights in self.weights)
 
 
+class FactorizedPosterior(LatentPosterior):
+    """A posterior from the factorised covariance L L^T of the (whitened) data."""
+
+    @property
+    @abstractmethod
+    def data_factor(self) -> CholeskyFactor:
+        """L."""
+
+    @abstractmethod
+    def data_covariance(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        """Cov(data, f(z)) of one latent."""
+
+    @override
+    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        return self.data_factor.solve_lower(self.data_covariance(index, z))
+
+    @override
+    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
+        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
+
+    @override
+    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+        # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 Cov(data, f_c(z)) (Rasmussen & Williams 2006, eq. 2.26)
+        latents, points = len(self.features), len(features[0])
+        height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.data_factor.lower)))
+        blocks = []
+        for start in range(0, points, height):
+            block = [z[start : start + height] for z in features]
+            C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(block)], dim=1)
+            V = self.data_factor.solve_lower(C).unflatten(1, (latents, -1)).permute(2, 1, 0)
+            prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, block, strict=True)], dim=-1)
+            blocks.append(torch.diag_embed(prior) - V @ V.mT)
+        return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
+
+
 @dataclass(frozen=True, eq=False)
-class ExactPosterior(LatentPosterior):
+class ExactPosterior(FactorizedPosterior):
     """The posterior from the factorised covariance of all training points."""
 
     kernels: LatentKernels
@@ -125,51 +163,21 @@ class ExactPosterior(LatentPosterior):
     def weights(self) -> tuple[Float[Tensor, " N"], ...]:
         return self.system.beta.unbind(-1)
 
+    @property
     @override
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 [k_c(z, z_j) C_jac] (Rasmussen & Williams 2006, eq. 2.26)
-        C = self.system.deflation.C
-        count, rank, latents = C.shape
-        points = features[0].shape[0]
-        height = max(1, BLOCK_BYTES // max(1, 8 * count * rank * latents))
-        blocks = [
-            self._covariance_block([z[start : start + height] for z in features]) for start in range(0, points, height)
-        ]
-        return torch.cat(blocks) if blocks else C.new_zeros(0, latents, latents)
+    def data_factor(self) -> CholeskyFactor:
+        return self.system.factor
 
     @override
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
-
-    @override
-    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        cross = self.kernels.dense[index].cross(z, self.features[index])
-        V = (cross.mT[:, None, :] * self.system.deflation.C[:, :, index, None]).flatten(0, 1)
-        return self.system.factor.solve_lower(V)
+    def data_covariance(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
+        return self.system.deflation.columns(index, self.kernels.dense[index].cross(z, self.features[index]))
 
     @override
     def function_weights(
         self, prior: Sequence[Float[Tensor, "S N"]], generator: torch.Generator
     ) -> tuple[Float[Tensor, "S N"], ...]:
-        # beta_s = C^T T^-1 (t - C g_s(Z) - eps_s) with eps_s ~ N(0, I)
-        C, t = self.system.deflation.C, self.system.deflation.t
-        residual = t - torch.einsum("jac,csj->sja", C, torch.stack(list(prior)))
-        noise = torch.randn(residual.shape, generator=generator, dtype=C.dtype, device=C.device)
-        residual = residual - math.sqrt(1.0 + self.system.factor.jitter) * noise
-        alpha = self.system.factor.solve(residual.flatten(1).mT.contiguous()).mT.reshape(residual.shape)
-        return torch.einsum("jac,sja->csj", C, alpha).unbind(0)
-
-    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        C = self.system.deflation.C
-        count, rank, latents = C.shape
-        cross = torch.stack(
-            [k.cross(z, at) for k, z, at in zip(self.kernels.dense, features, self.features, strict=True)]
-        )
-        points = cross.shape[1]
-        V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, latents * points)
-        V = self.system.factor.solve_lower(V).reshape(count * rank, latents, points).permute(2, 1, 0)
-        prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
-        return torch.diag_embed(prior) - V @ V.mT
+        factor = self.system.factor
+        return self.system.deflation.drawn_weights(prior, generator, factor.solve, factor.jitter)
 
 
 def exact(latent: LatentPosterior, what: str) -> ExactPosterior:

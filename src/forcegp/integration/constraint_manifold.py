@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 from forcegp.mechanics import MechanicalSystem
-from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
+from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
 from forcegp.robots import Kinematics
 
 POSITION_TOLERANCE = 1e-12
@@ -57,7 +57,7 @@ class ConstraintManifold:
         given_finite = torch.isfinite(q).all(-1)
         q = torch.where(given_finite[:, None], q, 0.0)
         kinematics = self.system.robot.kinematics(q)
-        inverse_lower = self._inverse_lower(kinematics)
+        _, inverse_lower = factors(self.system.mass_matrix(kinematics))
         iteration, differentiable = 0, torch.is_grad_enabled() and q.requires_grad
         while True:
             c, A, slope = self._constraint(kinematics)
@@ -117,17 +117,6 @@ class ConstraintManifold:
             rows.append((gradient[..., None, :] @ J)[..., 0, :])
             slopes.append(torch.linalg.vector_norm(gradient, dim=-1))
         return torch.stack(values, dim=-1), torch.stack(rows, dim=-2), torch.stack(slopes, dim=-1)
-
-    def _inverse_lower(self, kinematics: Kinematics) -> Tensor:
-        M = self.system.mass_matrix(kinematics)
-        try:
-            lower = torch.linalg.cholesky(M)
-        except torch.linalg.LinAlgError:
-            raise NumericalError(
-                "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
-            ) from None
-        identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
-        return torch.linalg.solve_triangular(lower, identity.expand_as(M), upper=False)
 
 
 def _pseudo_inverse(A_white: Tensor) -> Tensor:

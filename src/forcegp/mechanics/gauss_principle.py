@@ -73,14 +73,8 @@ class ConstrainedDynamics:
 
         Raises NumericalError when M is not positive definite or A is not finite.
         """
-        try:
-            lower = torch.linalg.cholesky(M)
-        except torch.linalg.LinAlgError:
-            raise NumericalError(
-                "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
-            ) from None
         identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
-        inverse_lower = torch.linalg.solve_triangular(lower, identity.expand_as(M), upper=False)
+        lower, inverse_lower = factors(M)
         A_white = A @ inverse_lower.mT
         if A.shape[-2]:
             try:
@@ -142,3 +136,15 @@ class ConstrainedDynamics:
     def _constrained_projector(self) -> Float[Tensor, "*batch nv nv"]:
         """A~^+ A~."""
         return self.pseudo_inverse @ (self.A @ self.inverse_lower.mT)
+
+
+def factors(M: Float[Tensor, "*batch nv nv"]) -> tuple[Float[Tensor, "*batch nv nv"], Float[Tensor, "*batch nv nv"]]:
+    """L and L^-1 of M = L L^T, lower triangular. Raises NumericalError where M is not positive definite."""
+    try:
+        lower = torch.linalg.cholesky(M)
+    except torch.linalg.LinAlgError:
+        raise NumericalError(
+            "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
+        ) from None
+    identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
+    return lower, torch.linalg.solve_triangular(lower, identity.expand_as(M), upper=False)

@@ -14,6 +14,9 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, UnknownRow
 from forcegp.summary import Summary, listed
 
+Rows = Float[Tensor, "rows nv"]
+"""One number per state and joint."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gaussian(Summary):

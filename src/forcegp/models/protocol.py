@@ -19,7 +19,7 @@ from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
-from forcegp.models.prediction import Prediction, join_predictions
+from forcegp.models.prediction import Prediction, Rows, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
@@ -81,9 +81,7 @@ class Posterior(Summary, ABC):
         """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
 
     @abstractmethod
-    def predict_rows(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
-    ) -> Prediction:
+    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
         """`predict` for one block of checked states."""
 
     @override
@@ -108,10 +106,8 @@ class Posterior(Summary, ABC):
         """What `result.history` holds, with its unit in brackets."""
         return "negative log likelihood with hyperpriors [nats]"
 
-    @property
-    def predicts_forces(self) -> bool:
-        """Whether predictions hold the forces behind the acceleration."""
-        return True
+    predicts_forces: ClassVar[bool] = True
+    """Whether predictions hold the forces behind the acceleration."""
 
     @property
     def carries_known_forces(self) -> bool:
@@ -154,12 +150,7 @@ class Posterior(Summary, ABC):
         raise InvalidInput(f"a {self.description} has no latent forces, so it has no curves; use a StructuredGP.")
 
     def predictor(
-        self,
-        *,
-        covariance: str = "auto",
-        tolerance: float = 0.01,
-        largest_rank: int = 512,
-        compile: bool = True,
+        self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 512, compile: bool = True
     ) -> Predictor:
         """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
 
@@ -183,7 +174,7 @@ class Posterior(Summary, ABC):
             "process."
         )
 
-    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Float[Tensor, "rows nv"]], torch.Size]:
+    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Rows], torch.Size]:
         """States as rows of float64 tensors on the model's device, and their batch dimensions.
 
         Raises InvalidInput for wrong shapes or values that are not finite.
@@ -297,7 +288,7 @@ class Posterior(Summary, ABC):
             "a StructuredGP with engine='exact'."
         )
 
-    def with_system(self, system: MechanicalSystem) -> Posterior:
+    def with_system(self: AnyPosterior, system: MechanicalSystem) -> AnyPosterior:
         """The same knowledge in another system (robot, contacts, known forces) with the same joints.
 
         Raises InvalidInput for systems that it cannot be carried to: for every model that learned accelerations.
@@ -307,12 +298,19 @@ class Posterior(Summary, ABC):
             "another; fit it to data from there, or use a structured model, which learns forces."
         )
 
-    def with_contacts(self, contacts: Sequence[Contact]) -> Posterior:
-        """The same knowledge under other contacts. Raises InvalidInput as `with_system`."""
+    def with_contacts(self: AnyPosterior, contacts: Sequence[Contact]) -> AnyPosterior:
+        """The same knowledge under other contacts, without another fit: another surface, or none at all, `[]`.
+
+        What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
+        are zero without it. Raises InvalidInput as `with_system`.
+        """
         return self.with_system(self.system.with_contacts(contacts))
 
-    def with_robot(self, robot: Robot) -> Posterior:
-        """The same knowledge on another robot with the same joints. Raises InvalidInput as `with_system`."""
+    def with_robot(self: AnyPosterior, robot: Robot) -> AnyPosterior:
+        """The same knowledge on another robot with the same joints, for example with another known tool.
+
+        Raises InvalidInput as `with_system`.
+        """
         return self.with_system(self.system.with_robot(robot))
 
     def to(self: AnyPosterior, device: torch.device | str) -> AnyPosterior:
@@ -352,12 +350,7 @@ class Model(ABC):
 
     @abstractmethod
     def fit(
-        self,
-        dataset: Dataset,
-        *,
-        points: int | None = None,
-        seed: int = 0,
-        progress: FitProgress | None = None,
+        self, dataset: Dataset, *, points: int | None = None, seed: int = 0, progress: FitProgress | None = None
     ) -> Posterior:
         """Learn from `points` rows that lie far apart in (q, v, u) (None: from all rows).
 

@@ -71,8 +71,7 @@ KINDS: dict[str, StoredKind] = {
     "forcegp independent posterior": _plain_kind(IndependentGP, "inputs"),
     "forcegp neural network": _plain_kind(NeuralNetwork, "width", "steps", "batch", "rate"),
     "forcegp network ensemble": _plain_kind(
-        NetworkEnsemble,
-        *("members", "width", "depth", "steps", "batch", "rate", "weight_decay", "beta", "held_out"),
+        NetworkEnsemble, *("members", "width", "depth", "steps", "batch", "rate", "weight_decay", "beta", "held_out")
     ),
 }
 """Name in `model.json` -> how a model of that kind is stored."""

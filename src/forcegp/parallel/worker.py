@@ -13,16 +13,7 @@ from typing import Any
 
 from forcegp.parallel.backend import unshared
 
-ONE_THREAD = {
-    name: "1"
-    for name in (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "NUMEXPR_NUM_THREADS",
-        "BLIS_NUM_THREADS",
-    )
-}
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "BLIS")}
 """Environment of a worker; the libraries read it when they are loaded."""
 
 RecordedWarning = tuple[str, type[Warning], str, int]

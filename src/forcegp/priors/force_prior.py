@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
@@ -28,7 +28,7 @@ the standard deviation; only divide by the root mean square, where zero means so
 class ForcePrior(ABC):
     """A prior on the joint force that nobody modelled.
 
-    A new prior is one subclass with the five abstract methods, and an entry in `forcegp.priors.PRIORS` so that models
+    A new prior is one subclass with the four abstract methods, and an entry in `forcegp.priors.PRIORS` so that models
     with it can be stored. All methods are pure: the same states give the same answer. Priors add up: `a + b` means that
     the unknown force is the sum of what the two describe.
     """
@@ -52,9 +52,9 @@ class ForcePrior(ABC):
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
         """Fresh kernels with start values, for prepared features of these numbers and latents of these variances."""
 
-    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
-        """The fields as plain JSON values."""
+        """The fields of a dataclass as plain JSON values."""
+        return asdict(self)  # type: ignore[call-overload]  # priors are dataclasses, or have their own
 
     def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...] | Scaling, ...]:
         """How the features of each latent are prepared for its kernel: one way for all of them, or one for each."""

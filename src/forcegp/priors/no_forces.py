@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from gpytorch.kernels import Kernel
 from jaxtyping import Float
@@ -41,7 +40,3 @@ class NoForces(ForcePrior):
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
         return ()
-
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        return {}

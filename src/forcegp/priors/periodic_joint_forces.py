@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from gpytorch.constraints import Positive
@@ -64,10 +64,6 @@ class PeriodicJointForces(PerJointPrior):
         base.lengthscale = torch.tensor(1.0, dtype=torch.float64)
         kernel.outputscale = variance
         return kernel
-
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def _period(given: float, spreads: Tensor) -> Tensor:

@@ -133,7 +133,6 @@ class DelimitedText(Source):
             raise
 
     def _read(self, names: Sequence[str], rows: int, *, threads: bool) -> Iterator[Columns]:
-
         stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns
         kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}

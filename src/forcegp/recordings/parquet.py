@@ -75,7 +75,6 @@ class ParquetFile(Source):
 
     @override
     def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-
         self.require(names)
         stored = list(dict.fromkeys(self._elements[name][0] if name in self._elements else name for name in names))
         row = 0
@@ -98,7 +97,6 @@ class ParquetFile(Source):
                 yield columns
 
     def _table(self, column: pyarrow.Array, name: str, row: int) -> np.ndarray:
-
         width = self._widths[name]
         lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
         wrong = np.flatnonzero(lengths != width)
@@ -116,10 +114,8 @@ def _plain(column: pyarrow.Array) -> np.ndarray:
 
 
 def _is_number(kind: pyarrow.DataType) -> bool:
-
     return types.is_floating(kind) or types.is_integer(kind)
 
 
 def _is_list(kind: pyarrow.DataType) -> bool:
-
     return types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)

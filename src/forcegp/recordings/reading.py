@@ -45,13 +45,7 @@ class RawRecording:
 
 
 def read_recording(
-    source: Source,
-    plan: SignalPlan,
-    spool: Spool,
-    label: str,
-    *,
-    unwrap: bool,
-    most_rows: int,
+    source: Source, plan: SignalPlan, spool: Spool, label: str, *, unwrap: bool, most_rows: int
 ) -> RawRecording:
     """Read a table once.
 

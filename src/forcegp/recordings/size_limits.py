@@ -27,7 +27,22 @@ def require_plausible_size(path: Path, what: str, declared: int, stored: int) ->
         )
 
 
-class CountedStream(io.RawIOBase):
+class Wrapper(io.RawIOBase):
+    """A stream that is read from another, and closes it."""
+
+    stream: io.BufferedIOBase
+
+    @override
+    def readable(self) -> bool:
+        return True
+
+    @override
+    def close(self) -> None:
+        self.stream.close()
+        super().close()
+
+
+class CountedStream(Wrapper):
     """What is read from a decompressor, refused as soon as it is implausibly more than the compressed file."""
 
     def __init__(self, path: Path, stream: io.BufferedIOBase) -> None:
@@ -37,21 +52,12 @@ class CountedStream(io.RawIOBase):
         self.expanded = 0
 
     @override
-    def readable(self) -> bool:
-        return True
-
-    @override
     def readinto(self, buffer) -> int:
         data = self.stream.read(len(buffer))
         buffer[: len(data)] = data
         self.expanded += len(data)
         require_plausible_size(self.path, "what is compressed", self.expanded, self.stored)
         return len(data)
-
-    @override
-    def close(self) -> None:
-        self.stream.close()
-        super().close()
 
 
 def gzip_stream(path: Path) -> CountedStream:

@@ -10,7 +10,7 @@ from typing import Any
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError
-from forcegp.recordings.size_limits import gzip_stream
+from forcegp.recordings.size_limits import Wrapper, gzip_stream
 
 FIRST_BYTES = 2**16
 """What is looked at to detect the header, the delimiter and whether there are comments."""
@@ -49,17 +49,13 @@ def _require_text(path: Path, first: bytes) -> None:
         ) from error
 
 
-class CleanLines(io.RawIOBase):
+class CleanLines(Wrapper):
     """A stream without comment lines and, if `blanks`, with one tab between the words of a line."""
 
     def __init__(self, stream: io.BufferedReader, *, blanks: bool) -> None:
         self.stream = stream
         self.blanks = blanks
         self._ready = b""
-
-    @override
-    def readable(self) -> bool:
-        return True
 
     @override
     def readinto(self, buffer) -> int:
@@ -74,11 +70,6 @@ class CleanLines(io.RawIOBase):
         buffer[:count] = self._ready[:count]
         self._ready = self._ready[count:]
         return count
-
-    @override
-    def close(self) -> None:
-        self.stream.close()
-        super().close()
 
     def _clean(self, raw: bytes) -> bytes:
         if COMMENT in raw:

@@ -27,6 +27,13 @@ from torch import Tensor
 from forcegp.errors import NumericalError
 from forcegp.robots.tree import Tree
 
+Bodies = Float[Tensor, "n 4 4 batch"]
+"""A 4x4 matrix of every body: its pose or its pseudo-inertia."""
+Twists = Float[Tensor, "n 3 4 batch"]
+"""A twist, or an acceleration, of every body."""
+Vectors = Float[Tensor, "n 6 batch"]
+"""A twist of every body as the vector [w; v]."""
+
 NOT_POSITIVE_DEFINITE = (
     "the mass matrix is not positive definite: either q or the inertial parameters hold NaN or infinity, or "
     "all mass that a joint moves lies on its axis; check the inputs, or give that joint armature."
@@ -45,7 +52,7 @@ def over_tree(matrix: Float[Tensor, "n n"], values: Float[Tensor, "n rows column
     return (matrix @ values.flatten(1)).view_as(values)
 
 
-def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Float[Tensor, "n 4 4 batch"]:
+def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Bodies:
     """Pose T of every body frame in the world."""
     local = torch.addcmul(tree.rest, tree.sine, q.sin()[:, None, None])
     local = torch.addcmul(local, tree.cosine, q.cos()[:, None, None])
@@ -61,9 +68,7 @@ def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Float[Tensor, "n 4 4 
     return poses if tree.order is None else poses[tree.order]
 
 
-def joint_twists(
-    tree: Tree, poses: Float[Tensor, "n 4 4 batch"]
-) -> tuple[Float[Tensor, "n 6 batch"], Float[Tensor, "n 3 4 batch"]]:
+def joint_twists(tree: Tree, poses: Bodies) -> tuple[Vectors, Twists]:
     """Twist of each body per unit velocity of its joint, as a vector [w; v] and as the matrix S = [[w]x, v]."""
     axis, point = poses[:, :3, 2], poses[:, :3, 3]
     moment = torch.linalg.cross(point, axis, dim=1)
@@ -75,11 +80,8 @@ def joint_twists(
 
 
 def body_accelerations(
-    tree: Tree,
-    twists: Float[Tensor, "n 3 4 batch"],
-    v: Float[Tensor, "n batch"],
-    a: Float[Tensor, "n batch"] | None = None,
-) -> Float[Tensor, "n 3 4 batch"]:
+    tree: Tree, twists: Twists, v: Float[Tensor, "n batch"], a: Float[Tensor, "n batch"] | None = None
+) -> Twists:
     """Accelerations ``A = T'' T^-1`` of all bodies, without gravity; ``a`` of None is zero.
 
     With V the body's and V_p its parent body's twist, ``A = A_p + (V_p + V) S v + S a``: differentiating ``T' = V T``
@@ -92,19 +94,12 @@ def body_accelerations(
     return over_tree(tree.ancestors, step)
 
 
-def world_inertias(
-    poses: Float[Tensor, "n 4 4 batch"], inertias: Float[Tensor, "n 4 4 #batch"]
-) -> Float[Tensor, "n 4 4 batch"]:
+def world_inertias(poses: Bodies, inertias: Float[Tensor, "n 4 4 #batch"]) -> Bodies:
     """Pseudo-inertias ``T P T^T``."""
     return product(product(poses, inertias), poses.transpose(1, 2))
 
 
-def mass_matrix(
-    tree: Tree,
-    vectors: Float[Tensor, "n 6 batch"],
-    twists: Float[Tensor, "n 3 4 batch"],
-    inertias: Float[Tensor, "n 4 4 batch"],
-) -> Float[Tensor, "batch n n"]:
+def mass_matrix(tree: Tree, vectors: Vectors, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch n n"]:
     """Joint-space inertia matrix, armature included on the diagonal."""
     momenta = product(twists, over_tree(tree.descendants, inertias))
     # <[[w]x, v], F> is the product of the vector [w; v] with these six combinations of the entries of F
@@ -119,23 +114,14 @@ def mass_matrix(
     return out.movedim(-1, 0).contiguous()
 
 
-def joint_forces(
-    tree: Tree,
-    twists: Float[Tensor, "n 3 4 batch"],
-    accelerations: Float[Tensor, "n 3 4 batch"],
-    inertias: Float[Tensor, "n 4 4 batch"],
-) -> Float[Tensor, "batch n"]:
+def joint_forces(tree: Tree, twists: Twists, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch n"]:
     """Joint forces under which the bodies accelerate so against gravity (without armature)."""
     wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
     return (twists * wrenches).sum((1, 2)).mT
 
 
 def torque_regressor(
-    tree: Tree,
-    twists: Float[Tensor, "n 3 4 batch"],
-    accelerations: Float[Tensor, "n 3 4 batch"],
-    frames: Float[Tensor, "n 4 4 batch"],
-    basis: Float[Tensor, "16 parameters"],
+    tree: Tree, twists: Twists, accelerations: Twists, frames: Bodies, basis: Float[Tensor, "16 parameters"]
 ) -> Float[Tensor, "batch n n parameters"]:
     """Joint force (first n) per unit of each parameter of each body (second n), without armature.
 
@@ -151,9 +137,7 @@ def torque_regressor(
     return torch.stack(columns, dim=2)
 
 
-def gravity_forces(
-    tree: Tree, twists: Float[Tensor, "n 3 4 batch"], inertias: Float[Tensor, "n 4 4 batch"]
-) -> Float[Tensor, "batch n"]:
+def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch n"]:
     """Joint forces that hold the robot still."""
     first_moments = over_tree(tree.descendants, inertias[..., 3:, :])
     return -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT

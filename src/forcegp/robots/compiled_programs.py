@@ -23,13 +23,15 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
     def write(unit: VectorUnit) -> str:
         return write_program(trace_dynamics(unrolled, request), unit.lanes)
 
-    constants: list[object] = [unrolled.joints, unrolled.gravity, unrolled.armature]
+    constants: list[object] = [(joint.parent, joint.revolute) for joint in unrolled.joints]
+    constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
+    constants += [unrolled.gravity.tolist(), unrolled.armature.tolist()]
     if request.links:
         tree = unrolled.robot.tree
         constants = [unrolled.robot.layout.moving]
         constants += [x.tolist() for x in (tree.link_inertias, tree.link_offsets, tree.carried)]
     elif not request.free_inertias:
-        constants.append(unrolled.inertias)
+        constants += [body.tolist() for body in unrolled.inertias]
     key = f"{constants!r}\0{request!r}"
     library, _ = load_library(f"{unrolled.robot.name[:40]}-{request.function}", key, write, folder, PURPOSE)
     sizes = request.sizes(unrolled.nv)

@@ -12,7 +12,9 @@ algorithms", RSS 2018).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,10 +23,9 @@ from forcegp.codegen.c_writer import Program
 from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import Expression, Graph, node_of
 from forcegp.codegen.tracing import trace
-from forcegp.robots.scalar_algebra import Matrix, Scalar, Vector, factorize, minus, negate, solve_factorized
 from forcegp.robots.tree import merged_inertias
-from forcegp.robots.unrolled import UnrolledRobot
-from forcegp.robots.unrolled_kinematics import UnrolledKinematics
+from forcegp.robots.unrolled import Scalars, UnrolledRobot, scalars
+from forcegp.robots.unrolled_kinematics import UnrolledKinematics, factorize, solve_factorized, symmetric
 
 # Arguments of each function, and the shapes of its results in joints.
 ARGUMENTS = {
@@ -105,8 +106,9 @@ def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
     graph = Graph()
     given = {name: graph.more_inputs(size) for name, size in inputs.items() if name in request.arguments}
     cotangents = [graph.more_inputs(inputs[name]) for name in request.results if not request.is_value]
-    positive: list[Scalar] = []
-    held: list[Vector] = []
+    positive = scalars([])
+    held: list[Scalars] = []
+    results: list[Scalars]
     if request.function == MERGED:
         results = differentiated = [_merged(unrolled, request, graph, given["parameters"])]
     else:
@@ -114,36 +116,32 @@ def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
         if request.free_inertias:
             inertias = [_symmetric(given["inertias"][10 * body : 10 * body + 10]) for body in range(n)]
         at = UnrolledKinematics(unrolled, given["q"], given.get("v"))
-        if request.function == "forward_dynamics":
-            results, held, differentiated = _forward_dynamics(at, given["tau"], inertias, positive, cotangents)
+        if request.function == "forward_dynamics":  # for derivatives [l, a] are held, and inverse dynamics taken at a
+            factor, positive = factorize(at.mass_matrix(inertias))
+            a = solve_factorized(factor, positive, scalars(given["tau"]) - at.bias_forces(inertias))
+            results, differentiated = [a], []
+            if cotangents:
+                held = [solve_factorized(factor, positive, scalars(cotangents[0])), a]
+                differentiated = [at.inverse_dynamics(a, inertias)]
         else:
             results = differentiated = _results(at, given, inertias, request.function)
 
-    def nodes(scalars: list[Scalar]) -> list[int]:
-        return [node_of(graph, scalar) for scalar in scalars]
+    def nodes(*arrays: Iterable[Any]) -> list[int]:
+        return [node_of(graph, scalar) for array in arrays for scalar in array]
 
     if request.is_value:
         outputs = {name: nodes(result) for name, result in zip(request.results, results, strict=True)}
         return Program(graph, inputs, outputs, nodes(positive))
-    if held:
-        cotangents = [[negate(x) for x in held[0]]]
     wanted = {name: nodes(given[name]) for name in request.wanted if name != "tau"}
-    found = iter(
-        gradients(
-            graph,
-            nodes([scalar for vector in differentiated for scalar in vector]),
-            nodes([scalar for vector in cotangents for scalar in vector]),
-            [node for vector in wanted.values() for node in vector],
-            nodes([scalar for vector in held for scalar in vector]),
-        )
-    )
+    after = nodes(-held[0]) if held else nodes(*cotangents)
+    found = iter(gradients(graph, nodes(*differentiated), after, [x for v in wanted.values() for x in v], nodes(*held)))
     outputs = {name: [next(found) for _ in vector] for name, vector in wanted.items()}
     if "tau" in request.wanted:
         outputs["tau"] = nodes(held[0])
     return Program(graph, inputs, {name: outputs[name] for name in request.wanted}, sums=("inertias",))
 
 
-def _merged(unrolled: UnrolledRobot, request: Request, graph: Graph, parameters: list[Expression]) -> list[Scalar]:
+def _merged(unrolled: UnrolledRobot, request: Request, graph: Graph, parameters: list[Expression]) -> Scalars:
     """The entries of the bodies' inertias, by the same code as the robot's own."""
     robot = unrolled.robot
 
@@ -153,48 +151,24 @@ def _merged(unrolled: UnrolledRobot, request: Request, graph: Graph, parameters:
 
     example = torch.zeros(len(request.links), 10, dtype=torch.float64)
     _, (found,) = trace(entries, [example], graph, parameters)
-    return [Expression(graph, node) for node in found.flatten().tolist()]
-
-
-def _forward_dynamics(
-    at: UnrolledKinematics,
-    tau: list[Expression],
-    inertias: list[Matrix] | None,
-    positive: Vector,
-    cotangents: list[list[Expression]],
-) -> tuple[list[Vector], list[Vector], list[Vector]]:
-    """The accelerations; for derivatives [l, a], and inverse dynamics at a."""
-    factor, pivots = factorize(at.mass_matrix(inertias))
-    a = solve_factorized(factor, pivots, minus(tau, at.bias_forces(inertias)))
-    positive.extend(pivots)
-    if not cotangents:
-        return [a], [], []
-    adjoint = solve_factorized(factor, pivots, cotangents[0])
-    return [a], [adjoint, a], [at.inverse_dynamics(a, inertias)]
+    return scalars([Expression(graph, node) for node in found.flatten().tolist()])
 
 
 def _results(
-    at: UnrolledKinematics, arguments: dict[str, list[Expression]], inertias: list[Matrix] | None, function: str
-) -> list[Vector]:
+    at: UnrolledKinematics, arguments: dict[str, list[Expression]], inertias: list[Scalars] | None, function: str
+) -> list[Scalars]:
     match function:
         case "mass_matrix":
-            return [_flat(at.mass_matrix(inertias))]
-        case "bias_forces":
-            return [at.bias_forces(inertias)]
+            return [at.mass_matrix(inertias).ravel()]
         case "mass_matrix_and_bias":
-            return [_flat(at.mass_matrix(inertias)), at.bias_forces(inertias)]
-        case "gravity_forces":
-            return [at.gravity_forces(inertias)]
+            return [at.mass_matrix(inertias).ravel(), at.bias_forces(inertias)]
+        case "inverse_dynamics":
+            return [at.inverse_dynamics(scalars(arguments["a"]), inertias)]
         case _:
-            return [at.inverse_dynamics(arguments["a"], inertias)]
+            return [getattr(at, function)(inertias)]
 
 
-def _flat(matrix: Matrix) -> Vector:
-    return [scalar for row in matrix for scalar in row]
-
-
-def _symmetric(entries: list[Expression]) -> Matrix:
-    P: list[list[Scalar]] = [[0.0] * 4 for _ in range(4)]
-    for (row, column), entry in zip(INERTIA_ENTRIES, entries, strict=True):
-        P[row][column] = P[column][row] = entry
-    return P
+def _symmetric(entries: list[Expression]) -> Scalars:
+    P = scalars([[0.0] * 4 for _ in range(4)])
+    P[COLUMNS, ROWS] = entries
+    return symmetric(P)

@@ -140,11 +140,7 @@ class BulletArm:
         if not np.isfinite(torques).all():
             raise SimulationError("the torques are not finite; the simulated motion has diverged.")
         self.bullet.setJointMotorControlArray(
-            self.body,
-            self.joints,
-            self.bullet.TORQUE_CONTROL,
-            forces=torques.tolist(),
-            physicsClientId=self.client,
+            self.body, self.joints, self.bullet.TORQUE_CONTROL, forces=torques.tolist(), physicsClientId=self.client
         )
         self.bullet.stepSimulation(physicsClientId=self.client)
 

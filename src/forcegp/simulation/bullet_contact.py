@@ -10,15 +10,15 @@ from jaxtyping import Float
 
 from forcegp.errors import InvalidInput
 from forcegp.simulation.bullet import BulletArm
-from forcegp.simulation.contact_forces import ArmState, ContactForces, ToolContact
-from forcegp.simulation.tables import FlatTable, SphericalTable, Table
+from forcegp.simulation.contact_forces import ArmState, ContactForces
+from forcegp.simulation.tables import FlatTable, Table
 
 SPHERE_RADIUS = 1e-3
 """Of the sphere at the tool point [m]. The collision table lies as much lower, so that the sphere's centre, which is
 the tool point, is on the nominal surface when it touches; friction acts one radius below it."""
 
 
-class BulletContact(ToolContact):
+class BulletContact:
     """The table as a collision shape in the arm's simulation, with `coefficient` of friction and without restitution.
 
     The arm's URDF must come from `with_tool_sphere`.
@@ -30,11 +30,9 @@ class BulletContact(ToolContact):
         if isinstance(table, FlatTable):
             shape = bullet.createCollisionShape(bullet.GEOM_PLANE, planeNormal=table.upward.tolist(), **client)
             base = (table.offset - SPHERE_RADIUS) * table.upward
-        elif isinstance(table, SphericalTable):
+        else:
             shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=table.radius - SPHERE_RADIUS, **client)
             base = table.center
-        else:
-            raise InvalidInput(f"PyBullet has no collision shape for a {type(table).__name__}; use a plane or sphere.")
         self._body = bullet.createMultiBody(0.0, shape, basePosition=base.tolist(), **client)
         # Bullet multiplies the coefficients of the two bodies.
         surface = {"lateralFriction": coefficient, "restitution": 0.0, "rollingFriction": 0.0, "spinningFriction": 0.0}

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from typing_extensions import override
 
 from forcegp.errors import SimulationError
 from forcegp.simulation.bullet import BulletArm
@@ -45,24 +43,16 @@ class ContactForces:
     acts: bool
 
 
-class ToolContact(ABC):
-    """How the table acts on the tool."""
-
-    @abstractmethod
-    def step(self, arm: BulletArm, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
-        """Advance the arm by one step under the torques of actuators and joint friction [Nm] and those of the table."""
-
-
-class NoContact(ToolContact):
+class NoContact:
     """Free motion."""
 
-    @override
     def step(self, arm: BulletArm, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
+        """Advance the arm by one step under the torques of actuators and joint friction [Nm]."""
         arm.step(applied)
         return ContactForces(0.0, np.zeros(3), np.zeros_like(applied), False)
 
 
-class IdealContact(ToolContact):
+class IdealContact:
     """The tool point stays on the table from its first touch on: `A a = b` with Baumgarte's b, and friction there.
 
     `omega` [rad/s] and `zeta` stabilise the constraint; where a `patch` is given friction is scaled with the place.

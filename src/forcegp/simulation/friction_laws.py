@@ -2,46 +2,30 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from typing_extensions import override
-
-
-class PointFriction(ABC):
-    """Friction at a point that slides on a surface."""
-
-    load_dependent: ClassVar[bool]
-    """Whether `force` is meant per newton of normal force."""
-
-    @abstractmethod
-    def force(self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Force on the sliding point [N, or N per N of normal force] at its velocity [m/s]; `normal` is a unit vector.
-
-        It never does positive work: `force . velocity <= 0`.
-        """
 
 
 @dataclass(frozen=True)
-class ViscousFriction(PointFriction):
+class ViscousFriction:
     """`F = -coefficient p'` (Stokes; coefficient in N/(m/s)), whatever the normal force is.
 
     As in Rath, Geist, Trimpe 2021 it acts on the whole velocity, of which almost nothing is normal to the surface.
     """
 
-    load_dependent: ClassVar[bool] = False
+    load_dependent: ClassVar[bool] = False  # whether `force` is per newton of normal force
     coefficient: float
 
-    @override
     def force(self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Force on the sliding point [N] at its velocity [m/s]; never does positive work."""
         return -self.coefficient * velocity
 
 
 @dataclass(frozen=True)
-class DryFriction(PointFriction):
+class DryFriction:
     """Coulomb's law with the Stribeck effect, per newton of normal force, smooth at rest.
 
     With the tangential velocity `p't` and its length s, `F = -mu(s) |N| p't / sqrt(s^2 + smoothing^2)` and
@@ -64,12 +48,15 @@ class DryFriction(PointFriction):
         level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.stribeck_velocity) ** 2))
         return np.asarray(level * speed / np.sqrt(speed**2 + self.smoothing**2))
 
-    @override
     def force(self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """As of `ViscousFriction`, per newton of normal force; `normal` is a unit vector."""
         tangential = velocity - (normal @ velocity) * normal
         speed = np.sqrt(tangential @ tangential)
         level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.stribeck_velocity) ** 2))
         return -level / np.sqrt(speed**2 + self.smoothing**2) * tangential
+
+
+PointFriction = ViscousFriction | DryFriction
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from forcegp.errors import SimulationError
 from forcegp.simulation.bullet import BulletArm
 from forcegp.simulation.bullet_contact import BulletContact, with_tool_sphere
-from forcegp.simulation.contact_forces import ArmState, IdealContact, NoContact, ToolContact
+from forcegp.simulation.contact_forces import ArmState, IdealContact, NoContact
 from forcegp.simulation.friction_laws import (
     DryFriction,
     JointStribeckFriction,
@@ -144,7 +144,7 @@ def _controller(config: KukaSurfaceConfig) -> TaskSpaceController:
     )
 
 
-def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> ToolContact:
+def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> NoContact | IdealContact | BulletContact:
     if config.surface == "none":
         return NoContact()
     if config.contact == "bullet":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal, get_args
 
 from forcegp.errors import InvalidInput, usable_arguments
@@ -240,67 +240,32 @@ class KukaSurfaceConfig:
         return self.episodes * (self.settle_steps + self.rows_per_episode)
 
 
+_POSITIVE = (
+    *("tool_mass", "tool_inertia", "clearance", "stribeck_velocity", "friction_smoothing", "joint_stribeck_velocity"),
+    *("joint_smoothing", "torque_limits", "controller_omega", "least_acceleration"),
+)
+_NOT_NEGATIVE = (
+    *("noise", "joint_damping", "viscous_coefficient", "coulomb_coefficient", "static_coefficient", "patch_factor"),
+    *("press", "lift_height", "joint_coulomb", "joint_static", "joint_viscous", "baumgarte_omega", "baumgarte_zeta"),
+    *("controller_zeta", "null_space_stiffness", "null_space_damping", "waypoint_depth"),
+)
+_FINITE = (
+    *("gravity", "base_height", "tool_center_of_mass", "tool_point", "surface_height", "tilt_axis", "patch_x"),
+    *("start_degrees", "waypoint_x", "waypoint_y"),
+)
 _RANGES: dict[str, Range] = {
     "seconds": ("from 0.1 to 1e5 s", 0.1, 1e5),
-    "noise": NOT_NEGATIVE,
     "time_step": ("from 1e-5 to 0.01 s", 1e-5, 0.01),
     "settle_seconds": ("from 0.5 to 1000 s", 0.5, 1e3),
-    "gravity": FINITE,
-    "base_height": FINITE,
-    "tool_mass": POSITIVE,
-    "tool_center_of_mass": FINITE,
-    "tool_inertia": POSITIVE,
-    "tool_point": FINITE,
-    "joint_damping": NOT_NEGATIVE,
-    "surface_height": FINITE,
     "tilt_degrees": ("from -30 to 30", -30.0, 30.0),
-    "tilt_axis": FINITE,
     "sphere_radius": ("from 1 to 1e6 m", 1.0, 1e6),
-    "clearance": POSITIVE,
-    "viscous_coefficient": NOT_NEGATIVE,
-    "coulomb_coefficient": NOT_NEGATIVE,
-    "static_coefficient": NOT_NEGATIVE,
-    "stribeck_velocity": POSITIVE,
-    "friction_smoothing": POSITIVE,
-    "patch_factor": NOT_NEGATIVE,
-    "patch_x": FINITE,
-    "press": NOT_NEGATIVE,
     "lift_share": ("from 0 to 1", 0.0, 1.0),
-    "lift_height": NOT_NEGATIVE,
-    "joint_coulomb": NOT_NEGATIVE,
-    "joint_static": NOT_NEGATIVE,
-    "joint_viscous": NOT_NEGATIVE,
-    "joint_stribeck_velocity": POSITIVE,
-    "joint_smoothing": POSITIVE,
-    "baumgarte_omega": NOT_NEGATIVE,
-    "baumgarte_zeta": NOT_NEGATIVE,
-    "start_degrees": FINITE,
-    "torque_limits": POSITIVE,
-    "controller_omega": POSITIVE,
-    "controller_zeta": NOT_NEGATIVE,
-    "null_space_stiffness": NOT_NEGATIVE,
-    "null_space_damping": NOT_NEGATIVE,
-    "waypoint_x": FINITE,
-    "waypoint_y": FINITE,
-    "waypoint_depth": NOT_NEGATIVE,
     "segment_seconds": ("from 0.05 to 100 s", 0.05, 100.0),
-    "least_acceleration": POSITIVE,
+    **dict.fromkeys(_POSITIVE, POSITIVE),
+    **dict.fromkeys(_NOT_NEGATIVE, NOT_NEGATIVE),
+    **dict.fromkeys(_FINITE, FINITE),
 }
-_LENGTHS = {
-    "tool_center_of_mass": 3,
-    "tool_inertia": 3,
-    "tool_point": 3,
-    "start_degrees": 7,
-    "torque_limits": 7,
-    "joint_coulomb": 7,
-    "joint_static": 7,
-    "joint_viscous": 7,
-    "tilt_axis": 2,
-    "patch_x": 2,
-    "waypoint_x": 2,
-    "waypoint_y": 2,
-    "segment_seconds": 2,
-}
+_LENGTHS = {item.name: len(item.default) for item in fields(KukaSurfaceConfig) if isinstance(item.default, tuple)}
 _CHOICES: dict[str, tuple[str, ...]] = {
     "friction": get_args(Friction),
     "joint_friction": get_args(JointFriction),

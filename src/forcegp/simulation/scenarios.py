@@ -39,6 +39,6 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             summary="a KUKA iiwa slides its tool on a surface with friction that nobody models",
             config=KukaSurfaceConfig,
             function="forcegp.simulation.kuka_surface:simulate_kuka_surface",
-        ),
+        )
     }
 )

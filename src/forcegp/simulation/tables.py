@@ -2,45 +2,17 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from typing_extensions import override
 
 import forcegp.mechanics
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 
 
-class Table(ABC):
-    """A surface above which the robot moves: a signed distance, positive above it, whose gradient is a unit normal."""
-
-    @abstractmethod
-    def distance(self, p: Float[np.ndarray, "3"]) -> float:
-        """Signed distance of a point [m]."""
-
-    @abstractmethod
-    def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Outward unit normal."""
-
-    @abstractmethod
-    def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
-        """`p'^T s_pp p'` [m/s^2], the part of the distance's second derivative that is due to curvature."""
-
-    @abstractmethod
-    def height(
-        self, xy: Float[np.ndarray, "times 2"]
-    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
-        """Height [m] above the surface's middle, its gradient and its Hessian [1/m] in x and y."""
-
-    @abstractmethod
-    def surface(self) -> forcegp.mechanics.Surface:
-        """The same for a `Contact`."""
-
-
 @dataclass(frozen=True, eq=False)
-class FlatTable(Table):
+class FlatTable:
     """The plane through `middle` (3,) [m] with unit `upward` (3,), which is not horizontal."""
 
     upward: Float[np.ndarray, "3"]
@@ -51,54 +23,51 @@ class FlatTable(Table):
         """`n . p` on the plane [m]."""
         return float(self.upward @ self.middle)
 
-    @override
     def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        """Signed distance of a point [m], positive above the table; its gradient is the normal."""
         return float(self.upward @ p - self.offset)
 
-    @override
     def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Outward unit normal."""
         return self.upward
 
-    @override
     def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
+        """`p'^T s_pp p'` [m/s^2], the part of the distance's second derivative that is due to curvature."""
         return 0.0
 
-    @override
     def height(
         self, xy: Float[np.ndarray, "times 2"]
     ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+        """Height [m] above the surface's middle, its gradient and its Hessian [1/m] in x and y."""
         slope = -self.upward[:2] / self.upward[2]
         return (xy - self.middle[:2]) @ slope, np.broadcast_to(slope, xy.shape), np.zeros((len(xy), 2, 2))
 
-    @override
     def surface(self) -> forcegp.mechanics.Surface:
-
+        """The same for a `Contact`."""
         x, y, z = self.upward.tolist()
         return forcegp.mechanics.Plane((x, y, z), self.offset)
 
 
 @dataclass(frozen=True, eq=False)
-class SphericalTable(Table):
+class SphericalTable:
     """The top of a sphere with `center` (3,) and `radius` [m]."""
 
     center: Float[np.ndarray, "3"]
     radius: float
 
-    @override
     def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        """As of a plane."""
         return float(np.linalg.norm(p - self.center) - self.radius)
 
-    @override
     def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """As of a plane."""
         ray = p - self.center
         return ray / np.linalg.norm(ray)
 
-    @override
     def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
         """`(|p'|^2 - (n . p')^2) / |p - center|`."""
         return float((velocity @ velocity - (self.normal(p) @ velocity) ** 2) / np.linalg.norm(p - self.center))
 
-    @override
     def height(
         self, xy: Float[np.ndarray, "times 2"]
     ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
@@ -109,11 +78,13 @@ class SphericalTable(Table):
         hessian = -(np.eye(2) + gradient[:, :, None] * gradient[:, None, :]) / rise[:, None, None]
         return rise - self.radius, gradient, hessian
 
-    @override
     def surface(self) -> forcegp.mechanics.Surface:
-
+        """As of a plane."""
         x, y, z = self.center.tolist()
         return forcegp.mechanics.Sphere((x, y, z), self.radius)
+
+
+Table = FlatTable | SphericalTable
 
 
 def table_of(config: KukaSurfaceConfig) -> Table:

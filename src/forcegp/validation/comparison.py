@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,7 @@ from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise
 from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions
-from forcegp.validation.identified_systems import (
-    DEFAULT_IDENTIFICATION,
-    FRICTION,
-    IDENTIFICATIONS,
-)
+from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, FRICTION, IDENTIFICATIONS
 from forcegp.validation.splits import Split
 from forcegp.validation.training_subsets import training_subset
 
@@ -93,24 +89,13 @@ class Comparison:
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the numbers, as plain JSON values."""
-        options = (
-            "points",
-            "starts",
-            "integrator",
-            "identification",
-            "restarts",
-            "iterations",
-            "force_noise",
-            "measured_torque",
-            "friction",
-        )
-        given = {name: getattr(self, name) for name in options}
+        digested = ("rows", "recording", "system", "splits")
+        given = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in digested}
         return {
             "rows_sha256": fingerprint(self.rows),
             "recording_sha256": fingerprint(self.recording),
             "system_sha256": hashlib.sha256(self.system.to_json().encode()).hexdigest(),
             "splits": [split.to_dict() for split in self.splits],
-            "horizons": list(self.horizons),
             **{name: list(value) if isinstance(value, tuple) else value for name, value in given.items()},
         }
 

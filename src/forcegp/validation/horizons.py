@@ -35,10 +35,7 @@ class HeldOutMotions:
 
 
 def held_out_motions(
-    recording: Dataset,
-    held_out: Bool[np.ndarray, " rows"],
-    horizons: Sequence[float] = HORIZONS,
-    starts: int = STARTS,
+    recording: Dataset, held_out: Bool[np.ndarray, " rows"], horizons: Sequence[float] = HORIZONS, starts: int = STARTS
 ) -> HeldOutMotions:
     """`starts` motions in every held-out stretch without gaps that lasts as long as the longest horizon.
 

@@ -185,10 +185,7 @@ def compared(
 
 
 def _ahead(
-    score: str,
-    runs: Sequence[tuple[str, int]],
-    one: Sequence[Mapping[str, Any]],
-    other: Sequence[Mapping[str, Any]],
+    score: str, runs: Sequence[tuple[str, int]], one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]
 ) -> Bool[np.ndarray, " stretches"]:
     """In which held-out stretches of time the median over seeds of the first model is lower."""
     out = []

@@ -17,6 +17,9 @@ from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
 
+Rows = Float[np.ndarray, "rows nv"]
+Matrices = Float[np.ndarray, "rows nv nv"]
+
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Of the central intervals whose coverage is reported."""
 
@@ -36,9 +39,7 @@ def mass_matrices(dataset: Dataset, system: MechanicalSystem) -> Float[np.ndarra
     return np.concatenate(blocks)
 
 
-def normalized_error(
-    predicted: Float[np.ndarray, "rows nv"], target: Float[np.ndarray, "rows nv"]
-) -> Float[np.ndarray, " nv"]:
+def normalized_error(predicted: Rows, target: Rows) -> Float[np.ndarray, " nv"]:
     """Root mean square error over the standard deviation of the target, per joint; NaN where the target is constant.
 
     1 is what predicting the mean of the held-out rows would give.
@@ -48,18 +49,12 @@ def normalized_error(
     return np.where(spread > 0.0, error / np.where(spread > 0.0, spread, 1.0), np.nan)
 
 
-def force_errors(
-    predicted: Float[np.ndarray, "rows nv"],
-    target: Float[np.ndarray, "rows nv"],
-    mass: Float[np.ndarray, "rows nv nv"],
-) -> Float[np.ndarray, "rows nv"]:
+def force_errors(predicted: Rows, target: Rows, mass: Matrices) -> Rows:
     """M (predicted - target): the joint forces [Nm or N] that the errors of the acceleration amount to."""
     return (mass @ (predicted - target)[..., None])[..., 0]
 
 
-def acceleration_scores(
-    posterior: Posterior, test: Dataset, mass: Float[np.ndarray, "rows nv nv"]
-) -> tuple[dict[str, Any], tuple[str, ...]]:
+def acceleration_scores(posterior: Posterior, test: Dataset, mass: Matrices) -> tuple[dict[str, Any], tuple[str, ...]]:
     """All scores of the held-out rows, and what a reader has to know beside them (`evaluation.doubts`).
 
     `mass` is the same for every model (`mass_matrices`).
@@ -95,9 +90,7 @@ def acceleration_scores(
     return scores, doubts(posterior, test, shared)
 
 
-def _by_stretch(
-    predicted: PredictedRows, test: Dataset, forces: Float[np.ndarray, "rows nv"]
-) -> dict[str, list[float | None] | float]:
+def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[str, list[float | None] | float]:
     """The same in each of about `STRETCHES` stretches of time, over all joints, where lower is better.
 
     "nrmse" with the standard deviations of all held-out rows, "force_rms" and "nlpd"; "seconds" is their length.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from forcegp.inference import (
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.mechanics import Baumgarte
 from forcegp.models.noise import ACCELERATION
-from forcegp.models.prediction import Prediction
+from forcegp.models.prediction import Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
@@ -59,9 +59,7 @@ class IndependentLikelihood:
         """From the inputs of the training states."""
         return Standardization.of([self._columns(self.training.q, self.training.v, self.training.u)])
 
-    def features(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"]
-    ) -> Float[Tensor, "rows d"]:
+    def features(self, q: Rows, v: Rows, u: Rows) -> Float[Tensor, "rows d"]:
         """Standardised inputs, the same for every joint."""
         return self.standardization([self._columns(q, v, u)])[0]
 
@@ -133,6 +131,7 @@ class IndependentPosterior(Posterior):
     settings: Mapping[str, Any]
     latents: tuple[ExactPosterior, ...]
     """The posterior of every joint's function."""
+    predicts_forces: ClassVar[bool] = False
 
     @property
     @override
@@ -168,11 +167,6 @@ class IndependentPosterior(Posterior):
 
     @property
     @override
-    def predicts_forces(self) -> bool:
-        return False
-
-    @property
-    @override
     def noise_std(self) -> Float[Tensor, "nv"]:
         return self.parameters[ACCELERATION].exp()
 
@@ -196,9 +190,7 @@ class IndependentPosterior(Posterior):
         return LeaveOut.of_independent_outputs(parts)
 
     @override
-    def predict_rows(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
-    ) -> Prediction:
+    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
         z = [self.likelihood.features(q, v, u)]
         mean = torch.cat([latent.mean(z) for latent in self.latents], dim=-1)
         variance = None

@@ -21,6 +21,7 @@ from forcegp.models.baselines.network_layers import ResidualLayers, check_number
 from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, fit_settings, inputs
 from forcegp.models.baselines.network_training import Batches, held_out_rows
 from forcegp.models.noise import Noise
+from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
 from forcegp.models.training_data import Standardization, TrainingData
 
@@ -123,9 +124,7 @@ class NetworkEnsemble(NetworkModel):
         return self.layers.shapes(self.members, 3 * nv, nv)
 
     @override
-    def moments(
-        self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]
-    ) -> tuple[Float[Tensor, "rows nv"], Float[Tensor, "rows nv"], Float[Tensor, "rows nv"]]:
+    def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
         means, variances = self.layers(posterior.parameters, x[None])
         shift, scale = posterior.standardization.shift[1], posterior.standardization.scale[1]
         mean = means.mean(0)

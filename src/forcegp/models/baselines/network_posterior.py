@@ -25,7 +25,7 @@ from forcegp.models.fit_arguments import (
     training_rows,
 )
 from forcegp.models.noise import ACCELERATION, Noise
-from forcegp.models.prediction import Prediction
+from forcegp.models.prediction import Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.training_data import Standardization, TrainingData
 
@@ -49,9 +49,7 @@ class NetworkModel(Model):
             )
 
     @abstractmethod
-    def moments(
-        self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]
-    ) -> tuple[Float[Tensor, "rows nv"], Float[Tensor, "rows nv"], Float[Tensor, "rows nv"]]:
+    def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
         """Mean, its variance, and the variance of data about it, at standardised inputs."""
 
     @override
@@ -94,6 +92,7 @@ class NetworkPosterior(Posterior):
     parameters: Mapping[str, Tensor]
     result: OptimizationResult
     settings: Mapping[str, Any]
+    predicts_forces: ClassVar[bool] = False
 
     @property
     @override
@@ -130,11 +129,6 @@ class NetworkPosterior(Posterior):
 
     @property
     @override
-    def predicts_forces(self) -> bool:
-        return False
-
-    @property
-    @override
     def noise_std(self) -> Float[Tensor, "nv"]:
         return self._estimated_noise if self._known_variance is None else self._known_variance.sqrt()
 
@@ -148,9 +142,7 @@ class NetworkPosterior(Posterior):
         return float(0.5 * (squared / variance + variance.log() + math.log(2.0 * math.pi)).sum())
 
     @override
-    def predict_rows(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
-    ) -> Prediction:
+    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
         mean, variance, scatter = self._moments(q, v, u)
         noise = scatter
         if self._known_variance is not None:
@@ -163,9 +155,7 @@ class NetworkPosterior(Posterior):
         return self.model.moments(self, (inputs(q, v, u) - shift) / scale)
 
 
-def inputs(
-    q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"]
-) -> Float[Tensor, "rows d"]:
+def inputs(q: Rows, v: Rows, u: Rows) -> Float[Tensor, "rows d"]:
     """What a network sees of a state."""
     return torch.cat([q, v, u], dim=-1)
 

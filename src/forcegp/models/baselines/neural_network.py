@@ -20,6 +20,7 @@ from forcegp.models.baselines.network_layers import SigmoidLayer, check_numbers,
 from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, fit_settings, inputs
 from forcegp.models.baselines.network_training import Batches
 from forcegp.models.noise import Noise
+from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
 from forcegp.models.training_data import Standardization, TrainingData
 
@@ -94,12 +95,7 @@ class NeuralNetwork(NetworkModel):
         )
 
     def _descend(
-        self,
-        weights: dict[str, Tensor],
-        x: Tensor,
-        a: Tensor,
-        generator: torch.Generator,
-        progress: FitProgress | None,
+        self, weights: dict[str, Tensor], x: Tensor, a: Tensor, generator: torch.Generator, progress: FitProgress | None
     ) -> tuple[float, ...]:
         """Adam in place; the mean loss between any two reports."""
         layer = SigmoidLayer(self.width)
@@ -129,9 +125,7 @@ class NeuralNetwork(NetworkModel):
         return SigmoidLayer(self.width).shapes(1, 3 * nv, nv) | {RESIDUAL: (nv,)}
 
     @override
-    def moments(
-        self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]
-    ) -> tuple[Float[Tensor, "rows nv"], Float[Tensor, "rows nv"], Float[Tensor, "rows nv"]]:
+    def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
         mean = SigmoidLayer(self.width)(posterior.parameters, x[None])[0]
         return mean, torch.zeros_like(mean), posterior.parameters[RESIDUAL].square().expand_as(mean)
 

@@ -172,20 +172,13 @@ class MarginalLikelihood:
         *,
         start: Tensor | None = None,
         report: Iteration | None = None,
+        at_parameters: bool = False,
     ) -> LatentPosterior:
-        """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`."""
-        return self.condition_kernels(kernels.at(parameters), parameters, engine, start=start, report=report)
+        """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`.
 
-    def condition_kernels(
-        self,
-        kernels: LatentKernels,
-        parameters: Mapping[str, Tensor],
-        engine: Engine | None = None,
-        *,
-        start: Tensor | None = None,
-        report: Iteration | None = None,
-    ) -> LatentPosterior:
-        """`condition` with kernels that hold the parameters already; they are not copied."""
+        Kernels that are `at_parameters` hold them already, and are not copied.
+        """
+        kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
             terms = self.terms(parameters)
             if self.training.weights is not None:

@@ -29,12 +29,12 @@ from forcegp.inference.cholesky_update import rows_to_keep
 from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import PreparedKernels
-from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
+from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
-from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
@@ -48,7 +48,6 @@ from forcegp.models.structured.predictor_preparation import PredictorPhysics, pr
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
-from forcegp.robots import Robot
 from forcegp.robots.real_numbers import real_tensor
 
 
@@ -114,9 +113,7 @@ class StructuredPosterior(Posterior):
         return self.system.dynamics(q, v, u, inertials_of(self.parameters) or None)
 
     @override
-    def predict_rows(
-        self, q: Float[Tensor, "rows nv"], v: Float[Tensor, "rows nv"], u: Float[Tensor, "rows nv"], covariance: bool
-    ) -> Prediction:
+    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
@@ -241,28 +238,12 @@ class StructuredPosterior(Posterior):
         return self.likelihood.standardization.scale
 
     @override
-    def with_contacts(self, contacts: Sequence[Contact]) -> StructuredPosterior:
-        """The same forces under other contacts, without another fit: another surface, or none at all, `[]`.
-
-        What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
-        are zero without it.
-        """
-        return self.with_system(self.system.with_contacts(contacts))
-
-    @override
-    def with_robot(self, robot: Robot) -> StructuredPosterior:
-        """The same forces on another robot with the same joints, for example with another known tool.
-
-        Raises InvalidInput for other joints, and for a model without analytical mean, whose processes hold the weight
-        and inertia of the robot that it was trained on.
-        """
-        return self.with_system(self.system.with_robot(robot))
-
-    @override
     def with_system(self, system: MechanicalSystem) -> StructuredPosterior:
         """The same forces in another system (robot, contacts, known forces, stabilisation) with the same joints.
 
-        Raises InvalidInput as `with_robot`, and UnknownFrame where a force acts on a frame that the robot lacks.
+        Raises InvalidInput for other joints, and, without an analytical mean, for another robot: the processes hold
+        the weight and inertia of the one that they were trained on; UnknownFrame where a force acts on a frame that the
+        robot lacks.
         """
         require_type("system", system, MechanicalSystem)
         trained = self.model.system

@@ -115,7 +115,7 @@ class _States:
             for sign in (1.0, -1.0):
                 moved = _moved(free, names, sign * step) | fixed
                 try:
-                    other = self._moments(likelihood.condition_kernels(scratch.moved_to(moved), moved))
+                    other = self._moments(likelihood.condition(scratch.moved_to(moved), moved, at_parameters=True))
                 except (NumericalError, torch.linalg.LinAlgError):
                     continue  # no posterior there: nothing that the data leave open
                 more += 0.5 * ((other[0] - mean).square() + other[1] - variance)
