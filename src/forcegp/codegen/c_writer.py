@@ -113,7 +113,9 @@ def write_function(
                 elif operation == "look up":
                     table = f"{name}_table{looked_up.setdefault(rest[0], len(looked_up))}"
                     text.append(f"  real x{node}; for (int k = 0; k < LANES; k++)")
-                    text.append(f"    AT(x{node}, k) = {table}[(int)AT({operand(rest[1])}, k)];")
+                    place = f"AT({operand(rest[1])}, k)"  # NaN where a state has overflowed
+                    inside = f"{place} >= 0.0 && {place} < {len(rest[0])}.0"
+                    text.append(f"    AT(x{node}, k) = {inside} ? {table}[(int){place}] : NAN;")
                     made = ""
                 else:
                     made = c_value(graph, node, operand, lambda x, of=operand: _as_real(graph, x, of), lanes)

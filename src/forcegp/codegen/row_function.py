@@ -69,6 +69,21 @@ class RowFunction:
         return found
 
 
+def are_plain(given: Sequence[object], size: int) -> bool:
+    """Whether these are tensors (size,) or (n, size), all of one shape, that need neither conversion nor a graph."""
+    return all(
+        type(x) is Tensor
+        and x.shape == given[0].shape  # type: ignore[attr-defined]  # of a tensor, or they differ
+        and x.shape[-1:] == (size,)
+        and x.dim() <= 2
+        and x.dtype is torch.float64
+        and not x.requires_grad
+        and x.is_cpu
+        and x.is_contiguous()
+        for x in given
+    )
+
+
 def aligned(values: np.ndarray) -> Tensor:
     """The numbers at an address that is a multiple of 64 bytes."""
     held = torch.empty(values.size + 8, dtype=torch.float64)

@@ -17,7 +17,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.codegen.native_code import require_plain
-from forcegp.codegen.row_function import NOT_FINITE, RowFunction
+from forcegp.codegen.row_function import NOT_FINITE, RowFunction, are_plain
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
@@ -115,7 +115,7 @@ class Predictor(Summary):
 
     def mean(self, q: Any, v: Any, u: Any) -> Tensor:
         """The mean acceleration (nv,) or (n, nv) in rad/s^2 or m/s^2."""
-        if self.code is not None and all(_is_plain(x, self.nv) for x in (q, v, u)):
+        if self.code is not None and _is_one_state((q, v, u), self.nv):
             return self._at_one("mean", q, v, u)[0]
         states, single = self._states(q, v, u)
         if self.code is None:
@@ -132,7 +132,7 @@ class Predictor(Summary):
         if self.kind == "none":
             raise InvalidInput("this predictor has no covariance; make it with covariance='compressed' or 'exact'.")
         nv, compiled = self.nv, self.code is not None and self.kind == "compressed" and bool(self.code.sums)
-        if compiled and all(_is_plain(x, nv) for x in (q, v, u)):
+        if compiled and _is_one_state((q, v, u), nv):
             a, covariance = self._at_one("covariance", q, v, u)
             return a, covariance.view(nv, nv)
         states, single = self._states(q, v, u)
@@ -149,7 +149,7 @@ class Predictor(Summary):
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
         """The mean acceleration and its Jacobians in q, v and u, without a graph."""
         nv = self.nv
-        if self.code is not None and all(_is_plain(x, nv) for x in (q, v, u)):
+        if self.code is not None and _is_one_state((q, v, u), nv):
             a, jacobian = self._at_one("linearize", q, v, u)
             return Linearization(a, *jacobian.view(nv, 3 * nv).split(nv, dim=-1))
         states, single = self._states(q, v, u)
@@ -368,16 +368,8 @@ class _Mean(torch.autograd.Function):
         return None, *(grad_outputs[0][:, None] @ jacobian)[:, 0].split(nv, dim=-1)
 
 
-def _is_plain(x: object, nv: int) -> bool:
-    """Whether x is one state that needs neither conversion nor a graph."""
-    return (
-        type(x) is Tensor
-        and x.shape == (nv,)
-        and x.dtype is torch.float64
-        and not x.requires_grad
-        and x.is_cpu
-        and x.is_contiguous()
-    )
+def _is_one_state(given: Sequence[object], nv: int) -> bool:
+    return are_plain(given, nv) and given[0].dim() == 1  # type: ignore[attr-defined]  # they are tensors then
 
 
 def _single(values: Tensor, single: bool) -> Tensor:

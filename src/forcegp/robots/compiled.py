@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.codegen.library import default_folder
 from forcegp.codegen.native_code import require_plain
-from forcegp.codegen.row_function import NOT_POSITIVE, RowFunction
+from forcegp.codegen.row_function import NOT_POSITIVE, RowFunction, are_plain
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
 from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, check_mapping
@@ -123,8 +123,11 @@ class CompiledRobot:
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
         nv, given = self.robot.nv, tuple(arguments.values())
-        if not inertials and all(_is_single(x, nv) for x in given):
+        if not inertials and are_plain(given, nv):
             require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
+            batch = given[0].shape[:-1]
+            if batch:
+                return _shaped(run(self, Request(function), len(given[0]), given), batch, function, nv)
             bits, found = self.program(Request(function)).single(*given)
             if bits & NOT_POSITIVE:
                 raise NumericalError(NOT_POSITIVE_DEFINITE)
@@ -165,24 +168,12 @@ class CompiledRobot:
         return run(self, request, count, flat)
 
 
-def _is_single(x: object, nv: int) -> bool:
-    """Whether x is one state that needs neither checks nor a graph."""
-    return (
-        type(x) is Tensor
-        and x.shape == (nv,)
-        and x.dtype is torch.float64
-        and not x.requires_grad
-        and x.is_cpu
-        and x.is_contiguous()
-    )
-
-
 def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:
     dimensions = DIMENSIONS.get(function, (1,))
     return tuple(x.reshape(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True))
 
 
-def run(owner: CompiledRobot, request: Request, count: int, tensors: list[Tensor]) -> tuple[Tensor, ...]:
+def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Results of a request, (count, size) each, from its inputs in order."""
     program = owner.program(request)
     if request.is_value:
