@@ -326,7 +326,7 @@ def test_other_models_are_refused(tmp_path):
         options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
         other = IndependentGP(arm_system()).fit(arm_data(20, 0), **options)
     with pytest.raises(InvalidInput, match="a IndependentPosterior cannot be exported as C"):
-        export_c(other, tmp_path / "arm")
+        export_c(other, tmp_path / "arm")  # type: ignore[arg-type]  # refused
     measured = fitted(noise=Noise(force=0.1, measured_torque=True))
     with pytest.raises(InvalidInput, match="a predictor is for commanded torques"):
         export_c(measured, tmp_path / "arm")
