@@ -46,6 +46,21 @@ def test_a_model_becomes_a_program(forcegp, folder):
     assert "arm_mean" not in shown.stdout  # nothing was compared
 
 
+def test_a_model_becomes_casadi_functions(forcegp, folder):
+    casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
+    words = ("export", "run", "--to", "casadi", "--out", "planner", "--steps", 0.02, "--integrator", "rk4")
+    done = forcegp(*words, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    differences = json.loads(done.stdout)["differences"]
+    assert differences["arm.casadi"] < 1e-11
+    assert differences["arm_step.casadi"] < 1e-8
+    loaded = casadi.Function.load(str(folder / "planner" / "arm_step.casadi"))
+    assert loaded.name_out() == ["q_next", "v_next"]
+    refused = forcegp("export", "run", "--to", "casadi", "--out", "never", "--jacobian", folder=folder)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "--jacobian is for --to c" in refused.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

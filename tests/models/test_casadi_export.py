@@ -65,6 +65,19 @@ def test_second_derivatives_are_differences_of_first_ones(posterior, states):
     np.testing.assert_allclose(hessian, np.stack(columns, axis=1), rtol=1e-4, atol=1e-5 * abs(hessian).max())
 
 
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
+def test_steps_are_those_of_a_predictor(posterior, states, integrator):
+    function = casadi_function(posterior, steps=0.01, integrator=integrator)
+    expected = posterior.predictor(covariance="none").step(*states, 0.01, integrator)
+    for k in range(len(states[0])):
+        found = function(*(x[k].numpy() for x in states))
+        for ours, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(np.array(ours).ravel(), theirs[k], rtol=1e-9, atol=1e-9)
+    for wrong, message in (({"steps": 0.0}, "dt is 0.0"), ({"steps": 0.1, "integrator": "projected"}, "'projected'")):
+        with pytest.raises(InvalidInput, match=message):
+            casadi_function(posterior, **wrong)
+
+
 def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     function = casadi_function(posterior, name="arm")

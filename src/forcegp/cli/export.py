@@ -25,15 +25,17 @@ class Export(Command):
 
     c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
     for CasADi's external and acados' generic functions. It is compiled and compared with the model before it is there.
+    casadi: CasADi functions with all derivatives, for casadi.Function.load (pip install 'forcegp[casadi]').
 
     For instance:
       forcegp export run --to c --out deployed --covariance
+      forcegp export run --to casadi --out planner --steps 0.02
       forcegp export run --to c --out mpc --jacobian --steps 0.02 --integrator implicit-midpoint
     """
 
     run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote."""
-    to: Literal["c"]
+    to: Literal["c", "casadi"]
     """What to write."""
     out: Annotated[Path, arg(metavar="DIR")]
     """The folder to write."""
@@ -84,5 +86,16 @@ def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dic
     return {"name": made.name, "files": made.files, "differences": made.differences, "inflation": made.inflation}
 
 
-TARGETS: dict[str, Callable[[Export, Terminal, Any, Path], dict[str, Any]]] = {"c": _c}
+def _casadi(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
+    for name in ("covariance", "jacobian", "unchecked"):
+        if getattr(options, name):
+            raise InvalidInput(f"--{name} is for --to c; CasADi functions have all derivatives, and no covariance.")
+    given = {"steps": options.steps, "integrator": options.integrator or "symplectic-euler"}
+    differences = forcegp.models.export_casadi(posterior, folder, **given)
+    rows = [[file, f"{apart:.1e}"] for file, apart in differences.items()]
+    terminal.show(columns(str(options.out), ["file", "largest difference / largest value"], rows))
+    return {"differences": differences}
+
+
+TARGETS: dict[str, Callable[[Export, Terminal, Any, Path], dict[str, Any]]] = {"c": _c, "casadi": _casadi}
 """What writes each target to a folder; a new one is a function here and a name in `Export.to`."""

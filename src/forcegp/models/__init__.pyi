@@ -4,7 +4,7 @@ from .baselines.network_ensemble import NetworkEnsemble as NetworkEnsemble
 from .baselines.network_posterior import NetworkPosterior as NetworkPosterior
 from .baselines.neural_network import NeuralNetwork as NeuralNetwork
 from .c_export import CExport as CExport, export_c as export_c
-from .casadi_export import casadi_function as casadi_function
+from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .discrete_steps import StepLinearization as StepLinearization
 from .identification.identification import Identification as Identification
 from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned

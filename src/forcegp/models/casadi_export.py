@@ -8,25 +8,41 @@ and only here.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from forcegp.codegen.graph import Graph
-from forcegp.errors import InvalidInput, MissingExtra
+from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
+from forcegp.integration.integrators import check_time_step, integrator_named
+from forcegp.models.c_export import identifier
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.models.structured.predictor_preparation import sample_states
+
+STATES = 100
+TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
+"""Largest difference from `predict`, relative to the largest value; implicit steps end at 1e-9."""
 
 NAMES = {"absolute": "fabs"}
 
 
-def casadi_function(posterior: Posterior, *, name: str = "acceleration") -> Any:
+def casadi_function(
+    posterior: Posterior, *, steps: float | None = None, integrator: str = "symplectic-euler", name: str | None = None
+) -> Any:
     """The mean acceleration as a `casadi.Function` (q, v, u) -> a, each (nv,) in the units of `predict`.
 
+    With `steps` instead (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`:
+    "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method.
+
     Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed.
-    Raises MissingExtra without CasADi, InvalidInput for other models than a StructuredGP and for operations that no
-    graph holds.
+    Raises MissingExtra without CasADi, InvalidInput for other models than a StructuredGP, for operations that no
+    graph holds, steps that are no positive number, and other integrators.
     """
     try:
         import casadi
@@ -39,7 +55,82 @@ def casadi_function(posterior: Posterior, *, name: str = "acceleration") -> Any:
     code = posterior.code()
     x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
-    return casadi.Function(name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"])
+    acceleration = casadi.Function(
+        "acceleration" if name is None else name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"]
+    )
+    if steps is None:
+        return acceleration
+    check_time_step(steps)
+    integrator_named(integrator, posterior.system)
+    if integrator == "projected":
+        raise InvalidInput(
+            "a step in CasADi is not 'projected'; give 'symplectic-euler', 'rk4' or 'implicit-midpoint'."
+        )
+    there = _stepped(casadi, acceleration, x, float(steps), integrator)
+    return casadi.Function("step" if name is None else name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
+
+
+def export_casadi(
+    posterior: StructuredPosterior,
+    folder: str | Path,
+    *,
+    steps: float | None = None,
+    integrator: str = "symplectic-euler",
+    name: str | None = None,
+) -> dict[str, float]:
+    """Write NAME.casadi, and with `steps` NAME_step.casadi, to a folder, for `casadi.Function.load`.
+
+    Returns the largest difference from `predict` (a predictor's `step`) at states around the training data, relative to
+    the largest value, by file. Raises as `casadi_function`, and NumericalError where they differ.
+    """
+    called = identifier(name or posterior.system.robot.name)
+    functions = {called: casadi_function(posterior, name=called)}
+    q, v, u = sample_states(posterior.training, STATES, 2)
+    expected = {called: posterior.predict(q, v, u, covariance=False).mean}
+    if steps is not None:
+        step = f"{called}_step"
+        functions[step] = casadi_function(posterior, steps=steps, integrator=integrator, name=step)
+        predictor = posterior.predictor(covariance="none", compile=False)
+        expected[step] = torch.cat(predictor.step(q, v, u, steps, integrator), dim=-1)
+    found = {}
+    for file, function in functions.items():
+        given = [x.numpy().T for x in (q, v, u)]
+        worst = float(np.abs(_evaluated(function, given) - expected[file].numpy()).max() / expected[file].abs().max())
+        if not worst <= (STEP_TOLERANCE if file != called else TOLERANCE):
+            raise NumericalError(
+                f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
+                "to C, or fit with fewer points, which cancel less."
+            )
+        found[f"{file}.casadi"] = worst
+    for file, function in functions.items():
+        function.save(str(Path(folder) / f"{file}.casadi"))
+    return found
+
+
+def _evaluated(function: Any, given: Sequence[np.ndarray]) -> np.ndarray:
+    """All outputs (n, size) side by side at columns of states."""
+    found = function.map(given[0].shape[1])(*given)
+    return np.concatenate([np.array(part) for part in (found if isinstance(found, tuple) else (found,))]).T
+
+
+def _stepped(casadi: Any, acceleration: Any, x: Sequence[Any], dt: float, integrator: str) -> list[Any]:
+    """The formulas of `integration.integrators`."""
+    q, v, u = x
+    if integrator == "symplectic-euler":
+        v = v + dt * acceleration(q, v, u)
+        return [q + dt * v, v]
+    if integrator == "rk4":
+        k = [(v, acceleration(q, v, u))]
+        for share in (0.5 * dt, 0.5 * dt, dt):
+            at = v + share * k[-1][1]
+            k.append((at, acceleration(q + share * k[-1][0], at, u)))
+        weights = (dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0)
+        return [y + sum(w * slope[part] for w, slope in zip(weights, k, strict=True)) for part, y in enumerate((q, v))]
+    middle, half = casadi.MX.sym("middle", v.numel()), 0.5 * dt
+    rest = middle - v - half * acceleration(q + half * middle, middle, u)
+    solve = casadi.rootfinder("solve", "newton", {"x": middle, "p": casadi.vertcat(q, v, u), "g": rest})
+    middle = solve(v, casadi.vertcat(q, v, u))
+    return [q + dt * middle, 2.0 * middle - v]
 
 
 def _physics(casadi: Any, code: PredictorCode) -> Any:
