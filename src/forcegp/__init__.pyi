@@ -51,7 +51,8 @@ from .models import NeuralNetwork as NeuralNetwork
 from .models import NetworkEnsemble as NetworkEnsemble
 from .models import save_posterior as save_posterior
 from .models import load_posterior as load_posterior
-from .models import casadi_function as casadi_function, export_c as export_c
+from .models import casadi_function as casadi_function
+from .models import export_c as export_c
 
 # the same without Gaussian processes
 from .analytical import identify_analytical as identify_analytical
