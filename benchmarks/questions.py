@@ -9,6 +9,7 @@ TITLES = {
     "learning": "Learning from 100 points",
     "incremental": "Learning while the robot works",
     "prediction": "Predictions at control rates",
+    "programs": "Models as programs",
     "searches": "Searches for hyper-parameters",
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
@@ -97,6 +98,34 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "predict_cov_inflation_p99": ("<= 0.02", "the same: 99th percentile"),
         "predict_rank": ("", "combinations of the data that the compressed covariance uses, of 6000"),
         "predict_prepare_s": ("", "making the predictor: tracing, compiling, compressing [s, wall-clock]"),
+    },
+    "programs": {
+        "friction_predict_mean_ms": (
+            "<= 0.10",
+            "predictor, one state, prior joint-friction+load-friction, N = 100 and 400, the slower: mean [ms, wall-clock]",
+        ),
+        "friction_predict_cov_ms": ("<= 0.30", "the same with covariance [ms]"),
+        "friction_linearize_ms": ("<= 0.40", "the same: mean and its derivatives in q, v and u [ms]"),
+        "rollout_ms": (
+            "",
+            "512 motions of 25 steps, prior joint-friction, N = 100: predictor.rollouts, one thread [ms]",
+        ),
+        "rollout_vs_predictor_loop": (">= 100", "the same, calls of the predictor one by one: times as long"),
+        "rollout_vs_predictor_batches": ("", "the same, calls of the predictor with all 512 states"),
+        "rollout_vs_posterior_rollout": (">= 500", "the same, rollouts by torch one by one"),
+        "rollout_vs_posterior_rollout_batches": ("", "the same, rollouts by torch with all 512 motions"),
+        "rollout_functions_cost": (
+            "<= 1.5",
+            "the same under eight drawn functions, each: times as long as under the mean",
+        ),
+        "rollout_two_threads": (">= 1.7", "the same: one thread / two"),
+        "c_mean_us": ("<= 20", "exported C, joint prior, N = 100, gcc -O2, through ctypes: mean [us]"),
+        "c_cov_us": ("<= 40", "the same with covariance [us]"),
+        "c_compile_cpu_s": ("<= 10", "compiling that file [CPU s]"),
+        "c_parity": ("<= 5e-12", "the same against predict at 10,000 states, relative to the largest value"),
+        "c_parity_n1000": ("<= 1e-11", "the same, N = 1000"),
+        "casadi_parity": ("<= 1e-12", "CasADi function of the first prior against predict"),
+        "casadi_jacobian_parity": ("<= 1e-12", "its Jacobian against the predictor's"),
     },
     "searches": {
         "search_evaluations_n100": (
