@@ -102,13 +102,13 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
     "programs": {
         "friction_predict_mean_ms": (
             "<= 0.10",
-            "predictor, one state, prior joint-friction+load-friction, N = 100 and 400, the slower: mean [ms, wall-clock]",
+            "predictor, prior joint-friction+load-friction, one state, N = 100 or 400, the slower: mean [ms, wall-clock]",
         ),
         "friction_predict_cov_ms": ("<= 0.30", "the same with covariance [ms]"),
         "friction_linearize_ms": ("<= 0.40", "the same: mean and its derivatives in q, v and u [ms]"),
         "rollout_ms": (
             "",
-            "512 motions of 25 steps, prior joint-friction, N = 100: predictor.rollouts, one thread [ms]",
+            "512 motions of 25 steps, joint-friction, N = 100: predictor.rollouts, one thread [ms]",
         ),
         "rollout_vs_predictor_loop": (">= 100", "the same, calls of the predictor one by one: times as long"),
         "rollout_vs_predictor_batches": ("", "the same, calls of the predictor with all 512 states"),
@@ -116,7 +116,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "rollout_vs_posterior_rollout_batches": ("", "the same, rollouts by torch with all 512 motions"),
         "rollout_functions_cost": (
             "<= 1.5",
-            "the same under eight drawn functions, each: times as long as under the mean",
+            "the same under eight drawn functions, each: times as long as the mean",
         ),
         "rollout_two_threads": (">= 1.7", "the same: one thread / two"),
         "c_mean_us": ("<= 20", "exported C, joint prior, N = 100, gcc -O2, through ctypes: mean [us]"),
