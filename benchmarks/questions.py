@@ -102,7 +102,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
     "programs": {
         "friction_predict_mean_ms": (
             "<= 0.10",
-            "predictor, prior joint-friction+load-friction, one state, N = 100 or 400, the slower: mean [ms, wall-clock]",
+            "predictor, joint-friction+load-friction, one state, N = 100 or 400, the slower: mean [ms, wall-clock]",
         ),
         "friction_predict_cov_ms": ("<= 0.30", "the same with covariance [ms]"),
         "friction_linearize_ms": ("<= 0.40", "the same: mean and its derivatives in q, v and u [ms]"),

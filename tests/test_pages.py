@@ -112,8 +112,8 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     files, agree = run_example(example, tmp_path).splitlines()
     assert "lbr_iiwa_acados.c" in files
     assert agree == "True"
-    commands, build = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-    for command in commands.splitlines():
+    commands, build, planner = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    for command in (commands + planner).splitlines():
         done = run_here(*shlex.split(command)[1:], folder=tmp_path)
         assert done.returncode == 0, done.stderr
     for command in build.splitlines():
@@ -122,4 +122,5 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
         )
         assert done.returncode == 0, command + done.stdout + done.stderr
     assert "lbr_iiwa_acceleration" in page
+    assert {"lbr_iiwa.casadi", "lbr_iiwa_step.casadi"} <= {file.name for file in (tmp_path / "planner").iterdir()}
     assert "lbr_iiwa_acceleration(" in (tmp_path / "controller" / "lbr_iiwa_external.c").read_text()
