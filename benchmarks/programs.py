@@ -89,10 +89,7 @@ def motions(posterior: StructuredPosterior, apart: Dataset) -> dict[str, float]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of drawn functions some motions diverge
         drawn = seconds(lambda: predictor.rollouts(q0, v0, u, DT, functions=FUNCTIONS), 10)
-    torch.set_num_threads(2)
-    with threadpool_limits(2):
-        two = seconds(lambda: predictor.rollouts(q0, v0, u, DT, threads=2), 20)
-    torch.set_num_threads(1)
+    two = seconds(lambda: predictor.rollouts(q0, v0, u, DT, threads=2), 20)
     acceleration = posterior.accelerations(posterior.system.baumgarte).mean()
     euler = INTEGRATORS["symplectic-euler"](posterior.system)
 
