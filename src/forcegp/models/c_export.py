@@ -211,7 +211,7 @@ class _Writer:
     def checks(self) -> list[_Check]:
         """Every function at states; derivatives, which may jump at training rows, and steps between these only."""
         training, made = self.posterior.training, self.reference
-        sampled = torch.cat(sample_states(training, STATES, 0), dim=-1)
+        sampled = torch.cat(sample_states(training, STATES, 0, STATES // 3), dim=-1)
         finite = self.posterior.predict(*sampled.chunk(3, dim=-1), covariance=False).mean.isfinite().all(-1)
         rows = min(STATES // 3, len(training.q))  # of the data themselves; then as many moved ones
         away = torch.randn(len(sampled), 1, generator=torch.Generator().manual_seed(0)).double()

@@ -85,7 +85,7 @@ def export_casadi(
     """
     called = identifier(name or posterior.system.robot.name)
     functions = {called: casadi_function(posterior, name=called)}
-    q, v, u = sample_states(posterior.training, STATES, 2)
+    q, v, u = sample_states(posterior.training, STATES, 2, STATES // 3)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}
     if steps is not None:
         step = f"{called}_step"
