@@ -160,7 +160,9 @@ class CompiledRobot:
 
 def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:
     dimensions = DIMENSIONS.get(function, (1,))
-    return tuple(x.view(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True))
+    return tuple(
+        x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True)
+    )
 
 
 class _Call(NamedTuple):
@@ -199,7 +201,7 @@ def derivatives_of(
     """Derivatives in the states and the parameters of links, None for those not asked for; `tensors` as in `_Value`."""
     states, (*parameters,) = _split(call, tensors[: len(ARGUMENTS[call.function]) + len(call.links)])
     cotangents = tensors[len(states) + len(parameters) :]
-    found: list[Tensor | None] = list(run(owner, request, call.batch.numel(), [*states, *held, *cotangents]))
+    found: list[Tensor | None] = [*run(owner, request, call.batch.numel(), [*states, *held, *cotangents])]
     if not request.states:
         found = [*[None] * len(states), *found]
     if not request.inertias:
@@ -218,14 +220,12 @@ def _split(call: _Call, tensors: Sequence[Tensor]) -> tuple[Sequence[Tensor], Se
     return tensors[:count], tensors[count:]
 
 
-def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> list[Tensor]:
     """Results of a request, (count, size) each, from its inputs in order."""
     program = owner.program(request)
-    one = not request.is_value and request.inertias and tensors[request.inputs.index("inertias")].shape[0]
-    outputs = tuple(
-        torch.empty(one if name == "inertias" else count, size, dtype=torch.float64)
-        for name, size in zip(request.outputs, program.outputs, strict=True)
-    )
+    outputs = [torch.empty(count, size, dtype=torch.float64) for size in program.outputs]
+    if request.inertias:  # the last; one set of inertias receives the sum over all states
+        outputs[-1] = torch.empty_like(tensors[len(request.arguments) - 1])
     if program.rows(count, tensors, outputs) & NOT_POSITIVE:
         raise NumericalError(NOT_POSITIVE_DEFINITE)
     return outputs
@@ -239,7 +239,7 @@ class _Value(torch.autograd.Function):
         ctx.owner, ctx.call = owner, call
         results, ctx.held = values_of(owner, call, tensors, keeps=True)
         ctx.save_for_backward(*tensors)
-        return results
+        return tuple(results)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:

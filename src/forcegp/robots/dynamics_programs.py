@@ -13,8 +13,7 @@ algorithms", RSS 2018). The factor and the accelerations are "kept" by the progr
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,8 +52,7 @@ INERTIA_ENTRIES = tuple((row, column) for row in range(4) for column in range(ro
 ROWS, COLUMNS = (list(entries) for entries in zip(*INERTIA_ENTRIES, strict=True))
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """Which program: a function of the robot, with the inertias as inputs or as constants, its value or derivatives.
 
     ``states`` and ``inertias`` choose the derivatives: those in all arguments, those in the inertias, both; the value
