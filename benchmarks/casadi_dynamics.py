@@ -1,10 +1,10 @@
 """The dynamics of a robot by CasADi: scalar C that it generates, compiled with `gcc -O3 -march=native`, a loop in C.
 
-Two forms of each quantity, of which a comparison takes the faster: "direct" is recursive Newton-Euler, composite rigid
-bodies and LDL' written with CasADi's own operations, "graph" what forcegp traces for its own code, as CasADi
-expressions. Both go through `casadi.cse`. The gradient of sum(w * a) with respect to the ten standard parameters of
-every body comes with the accelerations from one function, and takes the implicit derivative (`-l' ID(q, v, a)`, with
-``l = M^-1 w`` and a held), which is cheaper than CasADi's through the factorisation.
+Recursive Newton-Euler, composite rigid bodies and LDL' in CasADi's scalar expressions (SX) and operations, with
+`casadi.cse`. (What forcegp traces for its own code, as CasADi expressions, takes as long: 0.9 to 1.03 times.) The
+gradient of sum(w * a) with respect to the ten standard parameters of every body comes with the accelerations from one
+function, and takes the implicit derivative, ``-d <l, ID(q, v, a)>`` with ``l = M^-1 w`` and a held, which is cheaper than
+CasADi's through the factorisation. Serial chains of revolute joints only.
 """
 
 from __future__ import annotations
@@ -18,105 +18,72 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from forcegp.models.casadi_export import expressed
 from forcegp.robots import Robot
-from forcegp.robots.dynamics_programs import Request, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 QUANTITIES = ("mass_bias", "fd", "inertial_gradient")
-SUMMED = "inertial_gradient"
+LOOP = """
+void loop(long n, const double *const *a, double *const *o) {
+  static double w[1 + SZ_W], sum[1024];
+  const double *arg[1 + SZ_ARG];
+  double *res[1 + SZ_RES];
+  casadi_int iw[1 + SZ_IW];
+  if (SUMMED) for (int j = 0; j < SUMMED; j++) o[1][j] = 0.0;
+  for (long i = 0; i < n; i++) {
+    ROWS
+    f(arg, res, iw, w, 0);
+    if (SUMMED) for (int j = 0; j < SUMMED; j++) o[1][j] += sum[j];
+  }
+}
+"""
 
 
-class Rivals:
-    """Loops over states, by quantity and form; results in the array ``out`` of a call."""
+class CasadiLoops:
+    """Loops over given states (count, nv); a call returns the results, the gradient (nv, 10) summed over the states."""
 
-    def __init__(self, robot: Robot, folder: Path) -> None:
+    def __init__(
+        self, robot: Robot, folder: Path, q: np.ndarray, v: np.ndarray, tau: np.ndarray, w: np.ndarray
+    ) -> None:
         self.unrolled, self.folder, self.nv = UnrolledRobot(robot), folder, robot.nv
         self.standard = standard_parameters(self.unrolled)
-        self.functions = {
-            (quantity, form): self._compiled(quantity, form)
-            for quantity in QUANTITIES
-            for form in ("direct", "graph")
-        }
+        given = {"mass_bias": (q, v), "fd": (q, v, tau), "inertial_gradient": (q, v, tau, w, self.standard)}
+        self.mass_bias, self.fd, self.inertial_gradient = (self._loop(name, *given[name]) for name in QUANTITIES)
 
-    def loops(self, quantity: str, q: np.ndarray, v: np.ndarray, *more: np.ndarray) -> dict[str, Callable[[], Any]]:
-        """By form: a function that fills and returns the results, two arrays; those of a gradient are summed up."""
-        count = len(q)
-        found = {}
-        for form in ("direct", "graph"):
-            loop, sizes = self.functions[quantity, form]
-            given = [np.ascontiguousarray(x) for x in (q, v, *more)]
-            if quantity == SUMMED:
-                given.insert(3, self.standard[form])
-            results = [np.zeros((count, size)) for size in sizes]
-            if quantity == SUMMED:
-                results[1] = np.zeros(sizes[1])
-            pointers = [x.ctypes.data_as(ctypes.c_void_p) for x in (*given, *results)]
-
-            def call(loop: Any = loop, pointers: list = pointers, held: list = given, results: list = results) -> list:
-                loop(ctypes.c_long(count), *pointers)
-                return results
-
-            found[form] = call
-        return found
-
-    def _compiled(self, quantity: str, form: str) -> tuple[Any, list[int]]:
-        inputs, outputs = getattr(self, f"_{form}")(quantity)
-        name = f"{quantity}_{form}"
+    def _loop(self, quantity: str, *given: np.ndarray) -> Callable[[], list[np.ndarray]]:
+        inputs, outputs = self._expressions(quantity)
+        summed = outputs[1].numel() if quantity == "inertial_gradient" else 0
         function = ca.Function("f", inputs, ca.cse(outputs))
-        source = self.folder / f"{name}.c"
-        code = ca.CodeGenerator(f"{name}.c")
+        code = ca.CodeGenerator(f"{quantity}.c")
         code.add(function)
         code.generate(f"{self.folder}/")
-        ins = [x.numel() for x in inputs]
-        outs = [x.numel() for x in outputs]
-        steps = [0 if quantity == SUMMED and k == 3 else size for k, size in enumerate(ins)]
-        arguments = [f"const double *a{k}" for k in range(len(ins))] + [f"double *o{k}" for k in range(len(outs))]
-        rows = [f"arg[{k}] = a{k} + i * {step};" for k, step in enumerate(steps)]
-        summed = quantity == SUMMED
-        rows += [
-            f"res[{k}] = {'sum' if summed and k == 1 else f'o{k} + i * {size}'};" for k, size in enumerate(outs)
-        ]
-        add = f"for (int j = 0; j < {outs[1]}; j++) o1[j] += sum[j];" if summed else ""
-        clear = f"for (int j = 0; j < {outs[1]}; j++) o1[j] = 0.0;" if summed else ""
-        source.write_text(
-            source.read_text()
-            + f"""
-void loop(long n, {", ".join(arguments)}) {{
-  static double w[{max(function.sz_w(), 1)}], sum[1024];
-  const double *arg[{max(function.sz_arg(), 1)}];
-  double *res[{max(function.sz_res(), 1)}];
-  casadi_int iw[{max(function.sz_iw(), 1)}];
-  {clear}
-  for (long i = 0; i < n; i++) {{ {" ".join(rows)} f(arg, res, iw, w, 0); {add} }}
-}}
-"""
-        )
+        rows = [f"arg[{k}] = a[{k}] + i * {x.numel() if x.is_vector() else 0};" for k, x in enumerate(inputs)]
+        rows += [f"res[{k}] = {'sum' if summed and k else f'o[{k}] + i * {x.numel()}'};" for k, x in enumerate(outputs)]
+        text = LOOP.replace("ROWS", "\n    ".join(rows)).replace("SUMMED", str(summed))
+        for size in ("sz_w", "sz_arg", "sz_res", "sz_iw"):
+            text = text.replace(f"+ {size.upper()}]", f"+ {getattr(function, size)()}]")
+        source = self.folder / f"{quantity}.c"
+        source.write_text(source.read_text() + text)
         library = source.with_suffix(".so")
         command = ["gcc", "-O3", "-march=native", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"]
         subprocess.run(command, check=True, capture_output=True)
-        return ctypes.CDLL(str(library)).loop, outs
+        loop, count = ctypes.CDLL(str(library)).loop, len(given[0])
+        held = [np.ascontiguousarray(x) for x in given]
+        results = [np.zeros((count, x.numel())) for x in outputs]
+        if summed:
+            results[1] = np.zeros((self.nv, 10))
+        a, o = ((ctypes.c_void_p * len(x))(*(y.ctypes.data for y in x)) for x in (held, results))
 
-    def _graph(self, quantity: str) -> tuple[list, list]:
-        requests = {
-            "mass_bias": [Request("mass_matrix_and_bias")],
-            "fd": [Request("forward_dynamics")],
-            SUMMED: [Request("forward_dynamics", True), Request("forward_dynamics", True, False, True)],
-        }[quantity]
-        programs = [trace_dynamics(self.unrolled, request) for request in requests]
-        inputs = [ca.SX.sym(name, size) for name, size in programs[-1].inputs.items()]
-        given = ca.vertsplit(ca.vertcat(*inputs))
-        return inputs, [
-            ca.vertcat(*expressed(ca, program.graph, list(nodes), given))
-            for program in programs
-            for nodes in program.outputs.values()
-        ]
+        def call(held: list[np.ndarray] = held) -> list[np.ndarray]:  # which keeps the inputs alive
+            loop(ctypes.c_long(count), a, o)
+            return results
 
-    def _direct(self, quantity: str) -> tuple[list, list]:
+        return call
+
+    def _expressions(self, quantity: str) -> tuple[list, list]:
         q, v, tau, w = (ca.SX.sym(name, self.nv) for name in ("q", "v", "tau", "w"))
         standard = ca.SX.sym("standard", 10, self.nv)
-        known = ca.SX(ca.sparsify(ca.DM(self.standard["direct"].T)))
-        parameters = standard if quantity == SUMMED else known
+        known = ca.SX(ca.sparsify(ca.DM(self.standard.T)))
+        parameters = standard if quantity == "inertial_gradient" else known
         M, bias = self._mass_matrix(q, parameters), self._inverse_dynamics(q, v, None, parameters)
         if quantity == "mass_bias":
             return [q, v], [ca.densify(ca.vec(M)), bias]
@@ -124,10 +91,11 @@ void loop(long n, {", ".join(arguments)}) {{
         a = ca.ldl_solve(tau - bias, D, LT, permutation)
         if quantity == "fd":
             return [q, v, tau], [a]
-        multiplier, there = ca.ldl_solve(w, D, LT, permutation), ca.SX.sym("there", 2 * self.nv)
-        power = ca.dot(there[: self.nv], self._inverse_dynamics(q, v, there[self.nv :], parameters))
-        slope = ca.substitute(-ca.gradient(power, standard), there, ca.vertcat(multiplier, a))
-        return [q, v, tau, ca.vec(standard), w], [a, ca.vec(slope)]
+        held = ca.SX.sym("held", 2 * self.nv)
+        power = ca.dot(held[: self.nv], self._inverse_dynamics(q, v, held[self.nv :], parameters))
+        multiplier = ca.ldl_solve(w, D, LT, permutation)
+        slope = ca.substitute(-ca.gradient(power, standard), held, ca.vertcat(multiplier, a))
+        return [q, v, tau, w, standard], [a, ca.vec(slope)]
 
     def _poses(self, q: Any) -> list[tuple[Any, Any]]:
         """Body axes to the parent's, and the body's origin there."""
@@ -175,7 +143,7 @@ void loop(long n, {", ".join(arguments)}) {{
                 moment = poses[i][0] @ moment + ca.cross(poses[i][1], force)
             M[k, k] += float(self.unrolled.armature[k])
             R, p = poses[k]
-            turned, arm = R @ first, None
+            turned = R @ first
             arm = turned + 0.5 * mass * p
             inertia = R @ inertia @ R.T + 2 * ca.dot(arm, p) * ca.SX.eye(3) - arm @ p.T - p @ arm.T
             first = turned + mass * p
@@ -188,11 +156,10 @@ def _body(p: Any) -> tuple[Any, Any, Any]:
     return p[0], p[1:4], ca.vertcat(*rows)
 
 
-def standard_parameters(unrolled: UnrolledRobot) -> dict[str, np.ndarray]:
-    """Of all bodies, by form: [m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz], and the pseudo-inertia's upper triangle."""
+def standard_parameters(unrolled: UnrolledRobot) -> np.ndarray:
+    """Of all bodies (nv, 10): [m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz], about the joint, as Pinocchio orders them."""
     pseudo = np.stack([body.astype(float) for body in unrolled.inertias])
     second = pseudo[:, :3, :3]
     inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
     rows, columns = [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]
-    direct = np.hstack([pseudo[:, 3, 3, None], pseudo[:, :3, 3], inertia[:, rows, columns]])
-    return {"direct": np.ascontiguousarray(direct), "graph": np.ascontiguousarray(pseudo[:, *np.triu_indices(4)])}
+    return np.hstack([pseudo[:, 3, 3, None], pseudo[:, :3, 3], inertia[:, rows, columns]])

@@ -112,7 +112,11 @@ class Request(NamedTuple):
         )
         given = {"inertias": len(INERTIA_ENTRIES) * nv, "parameters": 10 * len(self.links)}
         kept = dict.fromkeys(KEPT, len(unrolled.pairs) + 2 * nv)
-        return {name: given.get(name, nv) for name in self.arguments} | kept | dict(zip(self.results, results, strict=True))
+        return (
+            {name: given.get(name, nv) for name in self.arguments}
+            | kept
+            | dict(zip(self.results, results, strict=True))
+        )
 
 
 def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
