@@ -3,8 +3,8 @@
 Recursive Newton-Euler, composite rigid bodies and LDL' in CasADi's scalar expressions (SX) and operations, with
 `casadi.cse`. (What forcegp traces for its own code, as CasADi expressions, takes as long: 0.9 to 1.03 times.) The
 gradient of sum(w * a) with respect to the ten standard parameters of every body comes with the accelerations from one
-function, and takes the implicit derivative, ``-d <l, ID(q, v, a)>`` with ``l = M^-1 w`` and a held, which is cheaper than
-CasADi's through the factorisation. Serial chains of revolute joints only.
+function, and takes the implicit derivative, ``-d <l, ID(q, v, a)>`` with ``l = M^-1 w`` and a held, which is cheaper
+than CasADi's through the factorisation. Serial chains of revolute joints only.
 """
 
 from __future__ import annotations

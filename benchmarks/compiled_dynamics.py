@@ -63,7 +63,7 @@ extern "C" void inertial_gradient(PyObject* m, PyObject* d, PyObject* o, int cou
   Out sum(gradient, 10 * n);
   sum.setZero();
   for (int i = 0; i < count; i++) {
-    const Vector qi = row(q, i, n), vi = row(v, i, n), ti = row(tau, i, n);
+    const Row qi = row(q, i, n), vi = row(v, i, n), ti = row(tau, i, n);
     const Vector a = aba(model, data, In(qi), In(vi), In(ti));
     crba(model, data, In(qi), Convention::WORLD);
     cholesky::decompose(model, data);
@@ -161,9 +161,8 @@ def against_casadi(states: States, weights: np.ndarray, mine: Ours, folder: Path
             ours, getattr(loops, quantity), repetitions=20 * REPETITIONS if count < BATCH else REPETITIONS
         )
         found[f"compiled_{quantity}_vs_casadi_b{count}"] = own / theirs
-        print(
-            f"{quantity:20s}{count:7d} states: {1e6 * own:8.0f} us, CasADi's C {1e6 * theirs:8.0f} us, {own / theirs:.2f}"
-        )
+        times = f"{1e6 * own:8.0f} us, CasADi's C {1e6 * theirs:8.0f} us, {own / theirs:.2f}"
+        print(f"{quantity:20s}{count:7d} states: {times}")
     return found
 
 

@@ -45,7 +45,8 @@ typedef long long quad_bits __attribute__((vector_size(32)));
 #define MIX(x, y, ...) __builtin_shuffle(x, y, (quad_bits){__VA_ARGS__})
 #endif
 /* transposes; the last four columns may overlap those before */
-#define EACH_TILE for (int k = 0; k < LANES; k += 4) for (int j = 0, c = 0; j < size; j += 4, c = j + 4 < size ? j : size - 4)
+#define EACH_TILE for (int k = 0; k < LANES; k += 4) \\
+  for (int j = 0, c = 0; j < size; j += 4, c = j + 4 < size ? j : size - 4)
 INLINE quad_bits turn(const double *from, long above, double *to, long below) { /* true where finite */
 #define ROW(l) (*(const quad *)(from + l * above))
   const quad a = MIX(ROW(0), ROW(1), 0, 4, 2, 6), b = MIX(ROW(0), ROW(1), 1, 5, 3, 7);

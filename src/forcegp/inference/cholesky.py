@@ -70,7 +70,9 @@ class CholeskyFactor:
         # copy.
         inverse, info = function(self.lower.numpy().T, lower=0, overwrite_c=1)
         if info != 0:
-            raise NumericalError(f"inverting the covariance from its Cholesky factor failed (LAPACK {name} info={info})")
+            raise NumericalError(
+                f"inverting the covariance from its Cholesky factor failed (LAPACK {name} info={info})"
+            )
         return torch.from_numpy(inverse.T)
 
 

@@ -172,7 +172,7 @@ def _factor_contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tu
     ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii``.
     """
     C, beta = system.deflation.C, system.beta
-    count, rank, latents = C.shape
+    count, rank, _ = C.shape
     inverse = system.factor.into_inverse_factor()
     K_gradients = [torch.outer(beta[:, c], -0.5 * beta[:, c]) if need else None for c, need in enumerate(K_needed)]
     diagonal = torch.zeros(count, rank, rank, dtype=C.dtype, device=C.device)

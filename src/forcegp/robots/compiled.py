@@ -180,7 +180,7 @@ class _Call(NamedTuple):
 
 def values_of(
     owner: CompiledRobot, call: _Call, tensors: Sequence[Tensor], keeps: bool = False
-) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+) -> tuple[list[Tensor], list[Tensor]]:
     """Results (count, size), and what derivatives take beside states and cotangents: the inertias and what was kept."""
     states, parameters = (list(part) for part in _split(call, tensors))
     if parameters:

@@ -78,7 +78,7 @@ class Request(NamedTuple):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """What the program takes: the arguments, for derivatives also what was kept and the cotangents of the results."""
+        """What the program takes: the arguments, for derivatives also what was kept and the results' cotangents."""
         if self.is_value:
             return self.arguments
         return self.arguments + (KEPT if self.function == KEEPING else ()) + self.results
