@@ -175,6 +175,10 @@ def test_batches_broadcast_as_those_of_the_robot(robot, compiled):
     assert ours.shape == (4, 2, 3)
     torch.testing.assert_close(ours, theirs)
     assert compiled.mass_matrix(q).shape == (3, 3)
+    inertials = {"cart": 0.3 * random(5, 10), "tool": 0.3 * random(10)}
+    for states in (random(3, 3), random(3, 1, 3), random(3, 0, 1, 3)):  # every state serves all sets of inertias
+        ours, theirs = (of.forward_dynamics(*states, inertials) for of in (compiled, robot))
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_large_batches_by_several_threads(robot, compiled):

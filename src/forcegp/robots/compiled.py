@@ -135,14 +135,15 @@ class CompiledRobot:
             if bits & NOT_POSITIVE:
                 raise NumericalError(NOT_POSITIVE_DEFINITE)
             return _shaped(found, (), function, nv)
-        if not plain or any(x.dim() > 1 for x in parameters):
+        simple = plain and all(x.dim() == 1 for x in parameters)
+        if not simple:
             named = zip(inertials or (), parameters, strict=True)
             own = broadcast_batch({f"inertials[{name!r}]": values.shape[:-1] for name, values in named})
             parameters = [values.expand(*own, 10) for values in parameters]
             shapes = {name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)}
             batch = broadcast_batch(shapes | ({"inertials": own} if parameters else {}))
             given = [value.expand(*batch, nv) for value in given]
-        if len(batch) != 1 or not plain:
+        if not simple or len(batch) != 1:
             given = [value.reshape(batch.numel(), nv).contiguous() for value in given]
         call, tensors = _Call(function, tuple(inertials or ()), batch, own), (*given, *parameters)
         if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
@@ -187,7 +188,8 @@ def values_of(
         rows = call.joined(parameters)
         (inertias,) = run(owner, Request(MERGED, links=call.links), len(rows), [rows])
         if call.own:
-            inertias = inertias.view(*call.own, -1).expand(*call.batch, -1).reshape(call.batch.numel(), -1)
+            size = inertias.shape[1]
+            inertias = inertias.view(*call.own, size).expand(*call.batch, size).reshape(-1, size)
         states.append(inertias)
     request = Request(call.function, bool(parameters), keeps=keeps and call.function == KEEPING)
     made = run(owner, request, call.batch.numel(), states)
@@ -209,7 +211,8 @@ def derivatives_of(
     inertias, rows = found.pop(), call.joined(parameters)
     assert inertias is not None  # the last that was asked for
     if call.own:
-        inertias = inertias.view(*call.batch, -1).sum_to_size(*call.own, inertias.shape[-1]).reshape(len(rows), -1)
+        size = inertias.shape[1]
+        inertias = inertias.view(*call.batch, size).sum_to_size(*call.own, size).reshape(-1, size)
     merging = Request(MERGED, states=True, links=call.links)
     (gradient,) = run(owner, merging, len(rows), [rows, inertias])
     return [*found, *gradient.view(*call.own, len(parameters), 10).unbind(-2)]
