@@ -16,8 +16,8 @@ from forcegp import export_c
 from forcegp.codegen.c_writer import write_function
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.inference import OptimizerOptions
-from forcegp.models import IndependentGP, Noise, StructuredGP, StructuredPosterior, c_export
-from forcegp.models.c_export import identifier
+from forcegp.models import IndependentGP, Noise, StructuredGP, StructuredPosterior, c_files
+from forcegp.models.c_files import identifier
 from forcegp.priors import ContactFriction, JointForces, JointFriction, NoForces
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
@@ -186,6 +186,20 @@ def test_what_is_not_finite_is_reported(library, states):
     assert bits == 4
 
 
+def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states, tmp_path):
+    export_c(friction, tmp_path / "arm", steps=DT, integrator="implicit-midpoint", unchecked=True)
+    source = tmp_path / "arm" / "arm.c"
+    text = source.read_text()
+    assert "ROUNDS = 60" in text
+    source.write_text(text.replace("ROUNDS = 60", "ROUNDS = 1"))  # Newton's method needs more
+    step = compiled(tmp_path / "arm", "arm.c").arm_step
+    bits, (_, v) = call(step, [3, 3], *(x[0] for x in states))
+    assert bits == 8
+    assert np.isnan(v).any()
+    assert "arm_STEP_NOT_FOUND = 8" in (tmp_path / "arm" / "arm.h").read_text()
+    assert call(step, [3, 3], states[0][0], [1e200, 0.0, 0.0], states[2][0])[0] == 4
+
+
 def test_casadi_loads_it_with_derivatives(complete, library, posterior, states):
     casadi = pytest.importorskip("casadi")
     reference = posterior.predictor(covariance="none", compile=False)
@@ -255,7 +269,7 @@ def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch)
     def spoiled(*arguments):
         return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
 
-    monkeypatch.setattr(c_export, "write_function", spoiled)
+    monkeypatch.setattr(c_files, "write_function", spoiled)
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []

@@ -19,7 +19,7 @@ from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.c_export import identifier
+from forcegp.models.c_files import identifier
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.posterior import StructuredPosterior
