@@ -137,7 +137,15 @@ def _code(posterior: StructuredPosterior, made: Predictor) -> PredictorCode:
         calls = latent_calls(made.latent, made.prepared, made.compressed)
         return PredictorCode.of(physics, states, calls, made.compressed, made.widening)
     except InvalidInput as error:
-        why = str(error).partition(", which the model's")[0].partition(";")[0]
+        raise named_refusal(posterior, error) from None
+
+
+def named_refusal(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
+    """The error of a graph that cannot be made, with the term of the prior that is the cause; others as they are."""
+    why, traced, _ = str(error).partition(", which the model's")
+    if not traced:
+        return error
+    states = [x[:1] for x in (posterior.training.q, posterior.training.v, posterior.training.u)]
 
     def holds(*terms: Any) -> bool:
         def function(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
@@ -153,7 +161,7 @@ def _code(posterior: StructuredPosterior, made: Predictor) -> PredictorCode:
     terms = term_slices(posterior.model.prior, posterior.system.robot)
     found = [f"the prior's term {title!r}" for title, term, _ in terms if not holds(term)]
     what = "a kernel of the prior" if holds() else "a contact or known force of the system"
-    raise InvalidInput(
+    return InvalidInput(
         f"{found[0] if found and holds() else what} cannot be exported: {why}; write it with other operations and "
         "without branches on values, or fit without it."
     )

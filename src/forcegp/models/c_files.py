@@ -21,13 +21,13 @@ from forcegp.models.structured.posterior import StructuredPosterior
 STORED = 10
 """States of the self-test."""
 ALIKE = ("CMakeLists.txt", "example.c", "self_test.c", "README.txt")
-TAKEN = ("math", "string", "stdio", "example", "self_test")
-"""Names of other files."""
+TAKEN = ("math", "string", "stdio", "stddef", "stdarg", "features", "example", "self_test", "jac", "hess", "null")
+"""Names of other files, and those that CasADi does not take."""
 
 
 def identifier(name: str) -> str:
     """A name for C and for files, of any text."""
-    plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "robot"
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", name)[:60].strip("_").lower() or "robot"
     plain = plain if plain[0].isalpha() else f"robot_{plain}"
     return f"{plain}_model" if plain in TAKEN else plain
 

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import Graph
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration.integrators import check_time_step, integrator_named
+from forcegp.models.c_export import named_refusal
 from forcegp.models.c_files import identifier
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
@@ -40,7 +42,8 @@ def casadi_function(
     With `steps` instead (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`:
     "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method.
 
-    Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed.
+    Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed. In
+    `name`, that of the function, what CasADi does not take is replaced.
     Raises MissingExtra without CasADi, InvalidInput for other models than a StructuredGP, for operations that no
     graph holds, steps that are no positive number, and other integrators.
     """
@@ -52,12 +55,14 @@ def casadi_function(
         ) from None
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(f"no program can be written of a {posterior.description}; export a StructuredGP.")
-    code = posterior.code()
+    try:
+        code = posterior.code()
+    except InvalidInput as error:
+        raise named_refusal(posterior, error) from None
+    name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
-    acceleration = casadi.Function(
-        "acceleration" if name is None else name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"]
-    )
+    acceleration = casadi.Function(name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"])
     if steps is None:
         return acceleration
     check_time_step(steps)
@@ -67,7 +72,7 @@ def casadi_function(
             "a step in CasADi is not 'projected'; give 'symplectic-euler', 'rk4' or 'implicit-midpoint'."
         )
     there = _stepped(casadi, acceleration, x, float(steps), integrator)
-    return casadi.Function("step" if name is None else name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
+    return casadi.Function(name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
 
 
 def export_casadi(
@@ -85,6 +90,8 @@ def export_casadi(
     """
     called = identifier(name or posterior.system.robot.name)
     functions = {called: casadi_function(posterior, name=called)}
+    import casadi  # it is there, or the line above has raised
+
     q, v, u = sample_states(posterior.training, STATES, 2)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}
     if steps is not None:
@@ -103,7 +110,9 @@ def export_casadi(
             )
         found[f"{file}.casadi"] = worst
     for file, function in functions.items():
-        function.save(str(Path(folder) / f"{file}.casadi"))
+        text = casadi.StringSerializer()
+        text.pack(function)
+        write_text(Path(folder) / f"{file}.casadi", text.encode())  # `save` is silent where the disk is full
     return found
 
 
