@@ -12,7 +12,7 @@ import torch
 from tests.models.arm import arm_data, arm_system
 
 from forcegp.codegen.native_code import Purpose, compile_library
-from forcegp.errors import InvalidInput, MissingExtra
+from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference import OptimizerOptions
 from forcegp.models import IndependentGP, StructuredGP, StructuredPosterior, casadi_function, export_casadi
 from forcegp.priors import ContactFriction, JointForces, JointFriction, NoForces
@@ -113,6 +113,30 @@ def test_a_full_disk_is_an_error(posterior, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     assert set(export_casadi(posterior, tmp_path)) == {"arm.casadi"}
     casadi.Function.load(str(tmp_path / "arm.casadi"))
+
+
+def test_a_kernel_that_is_the_same_for_all_centres(states):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = StructuredGP(arm_system(), JointForces(kernel="constant", inputs=("q",))).fit(
+            arm_data(12, 0), **options
+        )
+    expected = model.predict(*states).mean[0].numpy()
+    found = np.array(casadi_function(model)(*(x[0].numpy() for x in states))).ravel()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())  # weights that cancel
+
+
+def test_a_step_that_newtons_method_does_not_find_is_one_line(friction, tmp_path, monkeypatch):
+    def never(*given):
+        return rootfinder(*given, {"max_iter": 1})
+
+    rootfinder = casadi.rootfinder
+    monkeypatch.setattr(casadi, "rootfinder", never)
+    message = r"^CasADi's Newton method finds no step of 0\.05 s by implicit-midpoint .*; give shorter steps, or .*$"
+    with pytest.raises(NumericalError, match=message):
+        export_casadi(friction, tmp_path, steps=0.05, integrator="implicit-midpoint")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("given", "made"), [("my arm", "my_arm"), ("jac", "jac1"), ("", "step"), (None, "step")])

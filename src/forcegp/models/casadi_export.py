@@ -7,6 +7,7 @@ and only here.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -101,8 +102,14 @@ def export_casadi(
         expected[step] = torch.cat(predictor.step(q, v, u, steps, integrator), dim=-1)
     found = {}
     for file, function in functions.items():
-        given = [x.numpy().T for x in (q, v, u)]
-        worst = float(np.abs(_evaluated(function, given) - expected[file].numpy()).max() / expected[file].abs().max())
+        try:
+            made = _evaluated(function, [x.numpy().T for x in (q, v, u)])
+        except RuntimeError:  # many lines
+            raise NumericalError(
+                f"CasADi's Newton method finds no step of {steps:g} s by {integrator} somewhere near the training "
+                "data, so nothing is written; give shorter steps, or export to C, whose method shortens what overshoots."
+            ) from None
+        worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
         if not worst <= (STEP_TOLERANCE if file != called else TOLERANCE):
             raise NumericalError(
                 f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
@@ -171,9 +178,10 @@ def _sum(casadi: Any, part: KernelSum, z: Sequence[Any]) -> list[Any]:
     known: dict[int, Any] = dict(zip(part.operands, z, strict=True))
     known |= {node: casadi.DM(row).T for node, row in zip(part.rows, part.row_values(), strict=True)}
     kernels = expressed(casadi, part.pair, list(part.kernels), [], known)
+    rows = [casadi.MX(k) for k in kernels]  # one number where a kernel is the same for all centres
     return [
-        casadi.mtimes(k, casadi.DM(weights.tolist())) + constant
-        for k, weights, constant in zip(kernels, part.weights, part.constants, strict=True)
+        (k * math.fsum(weights.tolist()) if k.is_scalar() else casadi.mtimes(k, casadi.DM(weights.tolist()))) + constant
+        for k, weights, constant in zip(rows, part.weights, part.constants, strict=True)
     ]
 
 
