@@ -106,6 +106,37 @@ def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+@pytest.mark.parametrize(
+    ("program", "lines"),
+    [
+        (
+            "swing_up",
+            r"planned without friction: .*, (\S+) rad off.*\nplanned with learned friction: .*, (\S+) rad off",
+        ),
+        ("shooting", r"cosines .*: (\S+), (\S+)\nmedian \S+ ms of CPU, of 20 ms, for 512 x 25 steps"),
+    ],
+)
+def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: Path, monkeypatch, program, lines):
+    """A model, 15 s of CPU each: what the page promises of both."""
+    pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
+    monkeypatch.syspath_prepend(repository / "examples")
+    source = (repository / "examples" / f"{program}.py").read_text(encoding="utf-8")
+    printed = run_example(source, tmp_path)
+    first, second = (float(number) for number in re.match(lines, printed).groups())
+    if program == "swing_up":
+        assert first > 2.0
+        assert second < 0.2
+        assert (tmp_path / "swing-up.png").stat().st_size > 10_000
+    else:
+        assert min(first, second) > 0.9
+    page = (repository / "docs" / "deploy.md").read_text(encoding="utf-8")
+    shown = page.partition(f"[examples/{program}.py]")[2].partition("```py\n")[2].partition("```")[0]
+    assert len(shown.splitlines()) >= 3
+    for line in shown.splitlines():
+        assert line in source
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "deploy.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -1,8 +1,11 @@
 """`forcegp export` from end to end, and whatever can be asked wrongly."""
 
+import errno
 import json
+import os
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 from tests.models.arm import arm_data
@@ -65,6 +68,8 @@ def test_a_model_becomes_casadi_functions(forcegp, folder):
     ("words", "message"),
     [
         (("run", "--steps", 0), "dt is 0.0; give the time step as a positive number of seconds"),
+        (("run", "--steps", "nan"), "dt is nan; give the time step as a positive number of seconds"),
+        (("run", "--steps", -0.1), "dt is -0.1; give the time step as a positive number of seconds"),
         (("run", "--integrator", "rk4"), "--integrator was given without --steps"),
         (("run", "--steps", 0.1, "--integrator", "projected"), "an exported step is not 'projected'"),
         (("run", "--steps", 0.1, "--integrator", "rk"), "integrator 'rk'"),
@@ -78,6 +83,44 @@ def test_what_cannot_be_exported_is_one_line(forcegp, folder, words, message):
     assert message in done.stderr
     assert not (folder / "never").exists()
     assert not list(folder.glob(".*"))
+
+
+@pytest.mark.parametrize("target", ["c", "casadi"])
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [("arm.h5/deployed", "arm.h5"), ("/proc/deployed", "/proc"), ("black", "was not written by `forcegp export`")],
+)
+def test_a_folder_that_cannot_be_written_is_one_line(forcegp, folder, target, out, message):
+    before = sorted(folder.rglob("*"))
+    done = forcegp("export", "run", "--to", target, "--out", out, "--overwrite", folder=folder)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert message in done.stderr
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("target", "file"), [("c", "arm.h"), ("casadi", "arm.casadi")])
+def test_a_full_disk_is_one_line_and_leaves_the_old_program(forcegp, folder, monkeypatch, target, file):
+    if target == "casadi":
+        pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
+    words = ("export", "run", "--to", target, "--out", f"kept-{target}", *(("--unchecked",) if target == "c" else ()))
+    assert forcegp(*words, folder=folder).returncode == 0
+    before = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    write = Path.write_bytes
+
+    def full(path, *given, **more):
+        if path.name == file:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        return write(path, *given, **more)
+
+    def full_text(path, text, **_):
+        return full(path, text.encode())
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_text", full_text)
+    done = forcegp(*words, "--overwrite", folder=folder)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "No space left on device" in done.stderr
+    assert {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()} == before
 
 
 def test_another_target_is_refused(forcegp, folder):

@@ -1,6 +1,8 @@
 """Exported C: against `predict`, as C99 without warnings, in CasADi, by acados' form, and what cannot be exported."""
 
 import ctypes
+import errno
+import os
 import shutil
 import subprocess
 import warnings
@@ -13,11 +15,12 @@ import torch
 from tests.models.arm import arm_data, arm_system
 
 from forcegp import export_c
+from forcegp.codegen import native_code
 from forcegp.codegen.c_writer import write_function
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.inference import OptimizerOptions
-from forcegp.models import IndependentGP, Noise, StructuredGP, StructuredPosterior, c_export
-from forcegp.models.c_export import identifier
+from forcegp.models import IndependentGP, Noise, StructuredGP, StructuredPosterior, c_files, casadi_function
+from forcegp.models.c_files import identifier
 from forcegp.priors import ContactFriction, JointForces, JointFriction, NoForces
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
@@ -186,6 +189,20 @@ def test_what_is_not_finite_is_reported(library, states):
     assert bits == 4
 
 
+def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states, tmp_path):
+    export_c(friction, tmp_path / "arm", steps=DT, integrator="implicit-midpoint", unchecked=True)
+    source = tmp_path / "arm" / "arm.c"
+    text = source.read_text()
+    assert "ROUNDS = 60" in text
+    source.write_text(text.replace("ROUNDS = 60", "ROUNDS = 1"))  # Newton's method needs more
+    step = compiled(tmp_path / "arm", "arm.c").arm_step
+    bits, (_, v) = call(step, [3, 3], *(x[0] for x in states))
+    assert bits == 8
+    assert np.isnan(v).any()
+    assert "arm_STEP_NOT_FOUND = 8" in (tmp_path / "arm" / "arm.h").read_text()
+    assert call(step, [3, 3], states[0][0], [1e200, 0.0, 0.0], states[2][0])[0] == 4
+
+
 def test_casadi_loads_it_with_derivatives(complete, library, posterior, states):
     casadi = pytest.importorskip("casadi")
     reference = posterior.predictor(covariance="none", compile=False)
@@ -255,7 +272,7 @@ def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch)
     def spoiled(*arguments):
         return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
 
-    monkeypatch.setattr(c_export, "write_function", spoiled)
+    monkeypatch.setattr(c_files, "write_function", spoiled)
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []
@@ -304,9 +321,69 @@ def test_what_cannot_be_exported_is_named(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@dataclass(frozen=True)
+class Deciding(JointFriction):
+    """With a branch on values, in one of the ways in which Python can take one."""
+
+    how: str = "if"
+
+    def features(self, dynamics):
+        ways = {"if": lambda z: bool(z[0, 0] > 0.0), "numpy": lambda z: z.detach().numpy().min() > 0.0}
+        return tuple(z if ways[self.how](z) else -z for z in super().features(dynamics))
+
+
+@pytest.mark.parametrize("how", ["if", "numpy"])
+def test_a_branch_on_values_is_an_error_everywhere(how, tmp_path, states):
+    model = fitted(JointForces() + Deciding(how=how))
+    branch = "compiled code cannot hold a branch on the values of a tensor"
+    with pytest.raises(InvalidInput, match=rf"^{branch}, or .*give compile=False, whose results are the same.$"):
+        model.predictor(covariance="none")
+    term = rf"^the prior's term 'deciding' cannot be exported: {branch}.*; write it with other operations and without"
+    with pytest.raises(InvalidInput, match=term):
+        export_c(model, tmp_path / "arm")
+    pytest.importorskip("casadi")
+    with pytest.raises(InvalidInput, match=term):
+        casadi_function(model)
+    assert list(tmp_path.iterdir()) == []
+    found = model.predictor(covariance="none", compile=False).mean(*states)
+    torch.testing.assert_close(found, model.predict(*states).mean)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_leaves_nothing(posterior, tmp_path, monkeypatch, number):
+    written = []
+
+    def full(path, text, **more):
+        written.append(path)
+        if len(written) == 12:  # after the files were compared, halfway through the second time
+            raise OSError(number, os.strerror(number), str(path))
+        return write(path, text, **more)
+
+    write = Path.write_text
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match=os.strerror(number)):
+        export_c(posterior, tmp_path / "arm", unchecked=True)
+    assert len(written) == 12
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compiler_that_hangs_leaves_nothing(posterior, tmp_path, monkeypatch):
+    hangs, folder = tmp_path / "hangs", tmp_path / "deployed"
+    hangs.write_text("#!/bin/sh\nexec sleep 60\n")
+    hangs.chmod(0o700)
+    folder.mkdir()
+    monkeypatch.setenv("CC", str(hangs))
+    monkeypatch.setattr(native_code, "LONGEST", 0.5)
+    with pytest.raises(CompilerError, match=r"hangs: it did not end within 0\.5 s; .*`unchecked=True`"):
+        export_c(posterior, folder / "arm")
+    assert list(folder.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"steps": float("nan")}, "dt is nan; give the time step as a positive number"),
+        ({"steps": -0.1}, "dt is -0.1; give the time step as a positive number"),
         ({"steps": 0.0}, "dt is 0.0; give the time step as a positive number"),
         ({"steps": DT, "integrator": "rk5"}, "integrator 'rk5'"),
         (
@@ -340,7 +417,16 @@ def test_a_folder_with_files_stays(posterior, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "found"), [("LBR-iiwa 7", "lbr_iiwa_7"), ("7dof", "robot_7dof"), ("", "robot"), ("math", "math_model")]
+    ("given", "found"),
+    [
+        ("LBR-iiwa 7", "lbr_iiwa_7"),
+        ("7dof", "robot_7dof"),
+        ("", "robot"),
+        ("math", "math_model"),
+        ("Jac", "jac_model"),
+        ("über-Arm 2", "ber_arm_2"),
+        ("a" * 300, "a" * 60),
+    ],
 )
 def test_names_for_c(given, found):
     assert identifier(given) == found

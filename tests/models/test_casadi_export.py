@@ -1,7 +1,10 @@
 """A posterior as a CasADi function: `predict`, its derivatives, and what CasADi makes of it."""
 
+import errno
+import os
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +12,9 @@ import torch
 from tests.models.arm import arm_data, arm_system
 
 from forcegp.codegen.native_code import Purpose, compile_library
-from forcegp.errors import InvalidInput, MissingExtra
+from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference import OptimizerOptions
-from forcegp.models import IndependentGP, StructuredGP, StructuredPosterior, casadi_function
+from forcegp.models import IndependentGP, StructuredGP, StructuredPosterior, casadi_function, export_casadi
 from forcegp.priors import ContactFriction, JointForces, JointFriction, NoForces
 
 casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
@@ -30,6 +33,14 @@ def posterior(request) -> StructuredPosterior:
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
         return StructuredGP(arm_system(), PRIORS[request.param]).fit(arm_data(30, 0), **options)
+
+
+@pytest.fixture(scope="module")
+def friction() -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        return StructuredGP(arm_system(), JointFriction()).fit(arm_data(12, 0), **options)
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +98,50 @@ def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypa
     external = casadi.external("arm", str(library))
     state = [x[2].numpy() for x in states]
     np.testing.assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
+
+
+def test_a_full_disk_is_an_error(posterior, tmp_path, monkeypatch):
+    """`casadi.Function.save` writes half of a file without a word."""
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        with pytest.raises(OSError, match="No space left"):
+            export_casadi(posterior, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert set(export_casadi(posterior, tmp_path)) == {"arm.casadi"}
+    casadi.Function.load(str(tmp_path / "arm.casadi"))
+
+
+def test_a_kernel_that_is_the_same_for_all_centres(states):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = StructuredGP(arm_system(), JointForces(kernel="constant", inputs=("q",))).fit(
+            arm_data(12, 0), **options
+        )
+    expected = model.predict(*states).mean[0].numpy()
+    found = np.array(casadi_function(model)(*(x[0].numpy() for x in states))).ravel()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())  # weights that cancel
+
+
+def test_a_step_that_newtons_method_does_not_find_is_one_line(friction, tmp_path, monkeypatch):
+    def never(*given):
+        return rootfinder(*given, {"max_iter": 1})
+
+    rootfinder = casadi.rootfinder
+    monkeypatch.setattr(casadi, "rootfinder", never)
+    message = r"^CasADi's Newton method finds no step of 0\.05 s by implicit-midpoint .*; give shorter steps, or .*$"
+    with pytest.raises(NumericalError, match=message):
+        export_casadi(friction, tmp_path, steps=0.05, integrator="implicit-midpoint")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("given", "made"), [("my arm", "my_arm"), ("jac", "jac1"), ("", "step"), (None, "step")])
+def test_any_name_becomes_one_of_casadi(friction, given, made):
+    assert casadi_function(friction, steps=0.1, name=given).name() == made
 
 
 def test_without_casadi_and_without_a_program(states, monkeypatch):

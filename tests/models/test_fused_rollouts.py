@@ -132,6 +132,8 @@ def test_rollouts_of_a_posterior_are_compiled_where_they_are_long(friction, star
     ("changed", "message"),
     [
         ({"dt": 0.0}, "dt is 0.0"),
+        ({"dt": float("nan")}, "dt is nan"),
+        ({"threads": 1.5}, "`threads=1.5` must be an integer of at least 1"),
         ({"threads": 0}, "`threads=0` must be an integer of at least 1"),
         ({"functions": -1}, "`functions=-1` must be"),
         ({"integrator": "euler"}, "no integrator 'euler'"),
@@ -146,6 +148,8 @@ def test_bad_states(predictor, starts):
     q, v, u = starts
     with pytest.raises(InvalidInput, match=r"u has shape \(11, 12, 2\); it must be \(\.\.\., T, 3\)"):
         predictor.rollouts(q, v, u[..., :2], DT)
+    with pytest.raises(InvalidInput, match=r"do not broadcast: q0 \(11, 3\), v0 \(11, 3\), u \(4, 12, 3\)"):
+        predictor.rollouts(q, v, u[:4], DT)
     with pytest.raises(InvalidInput, match="u has no rows"):
         predictor.rollouts(q, v, u[:, :0], DT)
     with pytest.raises(InvalidInput, match=r"q0 requires a gradient.*rollout\(\.\.\., grad=True\)"):

@@ -108,6 +108,25 @@ def test_wrong_arguments_of_a_step_are_named(smooth, states, changed, message):
             ask(**arguments)
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float16, torch.int64])
+def test_other_numbers_are_converted_exactly_as_predict_does(smooth, states, kind):
+    """The machine code reads float64: other bits would be nonsense."""
+    predictor = smooth.predictor(covariance="none")
+    for given in ([x.to(kind) for x in states], [x.to(kind).numpy() for x in states]):
+        exact = [torch.as_tensor(x).double() for x in given]
+        torch.testing.assert_close(predictor.mean(*given), smooth.predict(*given).mean, rtol=1e-10, atol=1e-10)
+        for name, more in (("mean", ()), ("linearize", ()), ("step", (DT,)), ("linearize_step", (DT,))):
+            pairs = [(x[0] for x in given), (x[0] for x in exact)]
+            for found, expected in ((given, exact), pairs):
+                torch.testing.assert_close(
+                    getattr(predictor, name)(*found, *more), getattr(predictor, name)(*expected, *more), rtol=0, atol=0
+                )
+        u = given[2][:, None]
+        assert torch.equal(predictor.rollouts(*given[:2], u, DT).q, predictor.rollouts(*exact[:2], u, DT).q)
+    with pytest.raises(InvalidInput, match=r"q must be a tensor of real numbers; given: torch\.complex128"):
+        predictor.mean(*(x.to(torch.complex128) for x in states))
+
+
 def test_forces_are_the_components_of_the_posterior(posterior, states):
     predictor = posterior.predictor(covariance="none", compile=False)
     found, expected = predictor.forces(*states), posterior.predict(*states)

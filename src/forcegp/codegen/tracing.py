@@ -42,6 +42,9 @@ CREATION = ("dtype", "layout", "device", "pin_memory", "memory_format")
 INDEXED = ("index", "index_select", "gather")
 """Those whose further tensors are indices, which must be known."""
 
+OUTWARDS = (Tensor.numpy, Tensor.tolist, Tensor.__array__)
+BRANCH = "a branch on the values of a tensor, or numbers taken out of it"
+
 NAMES = {"neg": "negate", "abs": "absolute", "add": "add", "sub": "subtract", "mul": "multiply", "div": "divide"}
 
 
@@ -62,9 +65,23 @@ def trace(
     recorded = _Recording(graph)
     for x, part in zip(examples, nodes, strict=True):
         recorded.note(x, _Numbers(part.view(x.shape)))
-    with torch.no_grad(), StraightLineAlgebra(), recorded:
+    with torch.no_grad(), _InsideTorch(recorded), recorded:
         results = list(function(*examples))
     return graph, [_numbers(graph, recorded.numbers_of(x)).nodes for x in results]
+
+
+class _InsideTorch(StraightLineAlgebra):
+    """Refuses what takes recorded numbers out of torch, where they would be constants without a word."""
+
+    def __init__(self, recorded: _Recording) -> None:
+        super().__init__()
+        self.recorded = recorded
+
+    @override
+    def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
+        if func in OUTWARDS and self.recorded.numbers_of(args[0]) is not args[0]:
+            raise _refused(BRANCH)
+        return super().__torch_function__(func, types, args, kwargs)
 
 
 class _Recording(TorchDispatchMode):
@@ -147,9 +164,13 @@ def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> An
         return HANDLERS[name](graph, *args, **{k: v for k, v in kwargs.items() if k not in CREATION})
     if NAMES.get(name, name) in UNARY:
         return _elementwise(graph, lambda x: graph.apply(NAMES.get(name, name), x), args[0])
-    raise InvalidInput(
-        f"compiled code cannot hold the operation {target} of torch, which the model's surface, known force or "
-        "prior uses; write it with other operations, or give compile=False, whose results are the same."
+    raise _refused(BRANCH if name == "_local_scalar_dense" else f"the operation {target} of torch")
+
+
+def _refused(what: str) -> InvalidInput:
+    return InvalidInput(
+        f"compiled code cannot hold {what}, which the model's surface, known force or prior uses; write it with other "
+        "operations, or give compile=False, whose results are the same."
     )
 
 

@@ -7,6 +7,7 @@ and only here.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import Graph
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.c_export import identifier
+from forcegp.models.c_export import named_refusal
+from forcegp.models.c_files import identifier
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -40,7 +43,8 @@ def casadi_function(
     With `steps` instead (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`:
     "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method.
 
-    Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed.
+    Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed. In
+    `name`, that of the function, what CasADi does not take is replaced.
     Raises MissingExtra without CasADi, InvalidInput for other models than a StructuredGP, for operations that no
     graph holds, steps that are no positive number, and other integrators.
     """
@@ -52,12 +56,14 @@ def casadi_function(
         ) from None
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(f"no program can be written of a {posterior.description}; export a StructuredGP.")
-    code = posterior.code()
+    try:
+        code = posterior.code()
+    except InvalidInput as error:
+        raise named_refusal(posterior, error) from None
+    name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
-    acceleration = casadi.Function(
-        "acceleration" if name is None else name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"]
-    )
+    acceleration = casadi.Function(name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"])
     if steps is None:
         return acceleration
     check_time_step(steps)
@@ -67,7 +73,7 @@ def casadi_function(
             "a step in CasADi is not 'projected'; give 'symplectic-euler', 'rk4' or 'implicit-midpoint'."
         )
     there = _stepped(casadi, acceleration, x, float(steps), integrator)
-    return casadi.Function("step" if name is None else name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
+    return casadi.Function(name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
 
 
 def export_casadi(
@@ -85,6 +91,8 @@ def export_casadi(
     """
     called = identifier(name or posterior.system.robot.name)
     functions = {called: casadi_function(posterior, name=called)}
+    import casadi  # it is there, or the line above has raised
+
     q, v, u = sample_states(posterior.training, STATES, 2, STATES // 3)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}
     if steps is not None:
@@ -94,8 +102,14 @@ def export_casadi(
         expected[step] = torch.cat(predictor.step(q, v, u, steps, integrator), dim=-1)
     found = {}
     for file, function in functions.items():
-        given = [x.numpy().T for x in (q, v, u)]
-        worst = float(np.abs(_evaluated(function, given) - expected[file].numpy()).max() / expected[file].abs().max())
+        try:
+            made = _evaluated(function, [x.numpy().T for x in (q, v, u)])
+        except RuntimeError:  # many lines
+            raise NumericalError(
+                f"CasADi's Newton method finds no step of {steps:g} s by {integrator} somewhere near the training "
+                "data, so nothing is written; give shorter steps, or export to C, whose method shortens what overshoots."
+            ) from None
+        worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
         if not worst <= (STEP_TOLERANCE if file != called else TOLERANCE):
             raise NumericalError(
                 f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
@@ -103,7 +117,9 @@ def export_casadi(
             )
         found[f"{file}.casadi"] = worst
     for file, function in functions.items():
-        function.save(str(Path(folder) / f"{file}.casadi"))
+        text = casadi.StringSerializer()
+        text.pack(function)
+        write_text(Path(folder) / f"{file}.casadi", text.encode())  # `save` is silent where the disk is full
     return found
 
 
@@ -162,9 +178,10 @@ def _sum(casadi: Any, part: KernelSum, z: Sequence[Any]) -> list[Any]:
     known: dict[int, Any] = dict(zip(part.operands, z, strict=True))
     known |= {node: casadi.DM(row).T for node, row in zip(part.rows, part.row_values(), strict=True)}
     kernels = expressed(casadi, part.pair, list(part.kernels), [], known)
+    rows = [casadi.MX(k) for k in kernels]  # one number where a kernel is the same for all centres
     return [
-        casadi.mtimes(k, casadi.DM(weights.tolist())) + constant
-        for k, weights, constant in zip(kernels, part.weights, part.constants, strict=True)
+        (k * math.fsum(weights.tolist()) if k.is_scalar() else casadi.mtimes(k, casadi.DM(weights.tolist()))) + constant
+        for k, weights, constant in zip(rows, part.weights, part.constants, strict=True)
     ]
 
 

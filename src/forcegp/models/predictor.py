@@ -7,7 +7,8 @@ uses few combinations of the data (`inference.compressed_covariance`). `structur
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -18,7 +19,7 @@ from typing_extensions import override
 
 from forcegp.codegen.native_code import require_plain
 from forcegp.codegen.row_function import NOT_FINITE, RowFunction, are_plain
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
@@ -38,6 +39,7 @@ INSTEAD_OF_TRANSFORMS = (
     "take derivatives by linearize or a backward pass, give many states as rows (n, nv), or make the predictor with "
     "compile=False"
 )
+BY_TORCH = "predictions are computed by torch, some hundred times slower"
 BLOCK_NUMBERS = 2**18
 """Kernel values that torch works on at once: 2 MiB, so that they stay in the processor's cache."""
 
@@ -76,7 +78,8 @@ class Predictor(Summary):
     compressed; `prepare_seconds` is what preparing took, the C compiler included where its work is not kept yet.
 
     Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
-    NumericalError where the result is not finite.
+    NumericalError where the result is not finite. Where nothing can be compiled, torch computes the same, and one
+    NumericalWarning says how much slower that is.
     """
 
     __no_type_check__: ClassVar[bool] = True
@@ -92,11 +95,13 @@ class Predictor(Summary):
     widening: float
     prepare_seconds: float
     posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
-    _functions: dict[str, RowFunction] = field(default_factory=dict)
+    _functions: dict[str, RowFunction | None] = field(default_factory=dict)
+    _failed: list[CompilerError] = field(default_factory=list)
     _loops: dict[tuple[str, int, int], list[FusedLoop] | None] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_functions": {}, "_loops": {}}  # loaded code means nothing in another process
+        own = {"_functions": {}, "_failed": [], "_loops": {}}  # loaded code means nothing in another process
+        return self.__dict__ | own
 
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
@@ -115,10 +120,11 @@ class Predictor(Summary):
 
     def mean(self, q: Any, v: Any, u: Any) -> Tensor:
         """The mean acceleration (nv,) or (n, nv) in rad/s^2 or m/s^2."""
-        if self.code is not None and _is_one_state((q, v, u), self.nv):
-            return self._at_one("mean", q, v, u)[0]
+        compiled = self.compiled("mean")
+        if compiled and _is_one_state((q, v, u), self.nv):
+            return self._at_one("mean", compiled, q, v, u)[0]
         states, single = self._states(q, v, u)
-        if self.code is None:
+        if not compiled:
             return _finished([self._mean(*part)[0] for part in self._blocks(states)], single)
         if torch.is_grad_enabled() and any(x.requires_grad for x in states):
             return _finished([_Mean.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
@@ -131,9 +137,9 @@ class Predictor(Summary):
         """
         if self.kind == "none":
             raise InvalidInput("this predictor has no covariance; make it with covariance='compressed' or 'exact'.")
-        nv, compiled = self.nv, self.code is not None and self.kind == "compressed" and bool(self.code.sums)
+        nv, compiled = self.nv, self.compiled("covariance") if self.compressed is not None else None
         if compiled and _is_one_state((q, v, u), nv):
-            a, covariance = self._at_one("covariance", q, v, u)
+            a, covariance = self._at_one("covariance", compiled, q, v, u)
             return a, covariance.view(nv, nv)
         states, single = self._states(q, v, u)
         if compiled and not (torch.is_grad_enabled() and any(x.requires_grad for x in states)):
@@ -148,20 +154,15 @@ class Predictor(Summary):
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
         """The mean acceleration and its Jacobians in q, v and u, without a graph."""
-        nv = self.nv
-        if self.code is not None and _is_one_state((q, v, u), nv):
-            a, jacobian = self._at_one("linearize", q, v, u)
+        nv, compiled = self.nv, self.compiled("linearize")
+        if compiled and _is_one_state((q, v, u), nv):
+            a, jacobian = self._at_one("linearize", compiled, q, v, u)
             return Linearization(a, *jacobian.view(nv, 3 * nv).split(nv, dim=-1))
         states, single = self._states(q, v, u)
         require_plain(states, "linearize", "take derivatives of `mean` instead, of a predictor with compile=False")
-        states = [x.detach() for x in states]
-        if self.code is not None:
-            a, jacobian = self.run("linearize", states)
-            jacobian = _single(jacobian.view(-1, nv, 3 * nv), single)
-            return Linearization(_single(a, single), *jacobian.split(nv, dim=-1))
-        parts = [self._linearize(part) for part in self._blocks(states)]
-        a, jacobian = (_finished([part[k] for part in parts], single) for k in (0, 1))
-        return Linearization(a, *jacobian.split(nv, dim=-1))
+        a, jacobian = self.run("linearize", states)
+        jacobian = _single(jacobian.view(-1, nv, 3 * nv), single)
+        return Linearization(_single(a, single), *jacobian.split(nv, dim=-1))
 
     def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
         """The state (q, v) `dt` seconds later under constant u, each (nv,) or (n, nv); differentiable as `mean`.
@@ -212,8 +213,8 @@ class Predictor(Summary):
         check_time_step(dt)
         how = integrator, functions, seed
         loops, acceleration = self._loops.get(how), self.mean
-        if loops is None and self.code is not None and integrator in STEPS:
-            loops = self._loops[how] = self.code.loops(integrator, self.latent, functions, seed)
+        if loops is None and integrator in STEPS:
+            loops = self._loops[how] = self._made(lambda code: code.loops(integrator, self.latent, functions, seed))
         if functions:
             model = self.posterior.accelerations(self.posterior.system.baumgarte)
 
@@ -249,42 +250,59 @@ class Predictor(Summary):
         return found[0] if single else found
 
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
-        """The outputs (n, size) of a compiled program at states (n, nv) that were checked."""
-        function, count = self._function(kind), len(states[0])
-        states = [x.detach().contiguous() for x in states]
-        outputs = [torch.empty(count, size, dtype=torch.float64) for size in function.outputs]
-        if function.rows(count, states, outputs):
+        """The outputs (n, size) of a program at states (n, nv) that were checked, without a graph."""
+        states, count = [x.detach().contiguous() for x in states], len(states[0])
+        compiled = self.compiled(kind)
+        if compiled is None:
+            return self._by_torch(kind, states)
+        outputs = [torch.empty(count, size, dtype=torch.float64) for size in compiled.outputs]
+        if compiled.rows(count, states, outputs):
             self._repair(kind, states, outputs)
         return outputs
 
     def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
         """By torch what a program leaves NaN: states outside of a table."""
         bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
-        given = [x[bad] for x in states]
-        if kind == "linearize":
-            found = self._linearize(given)
-        else:
-            mean, W, *latents = self._mean(*given)
-            found = (mean,) if kind == "mean" else (mean, W @ self._covariance(W, *latents) @ W.mT)
-        for output, rows in zip(outputs, found, strict=True):
-            output[bad] = _finished([rows], False).reshape(len(bad), -1)
+        for output, rows in zip(outputs, self._by_torch(kind, [x[bad] for x in states]), strict=True):
+            output[bad] = rows
 
-    def _at_one(self, kind: str, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+    def _by_torch(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
+        """What the program gives."""
+        parts = []
+        for part in self._blocks(states):
+            if kind == "linearize":
+                parts.append(self._linearize(part))
+            else:
+                mean, W, *latents = self._mean(*part)
+                parts.append((mean, W @ self._covariance(W, *latents) @ W.mT) if kind == "covariance" else (mean,))
+        return [_finished(list(rows), False).flatten(1) for rows in zip(*parts, strict=True)]
+
+    def _at_one(self, kind: str, program: RowFunction, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
         """The same at one state that needs no conversion, whose numbers are checked on the way."""
         require_plain((q, v, u), "a compiled predictor", INSTEAD_OF_TRANSFORMS)
-        bits, outputs = self._function(kind).single(q, v, u)
+        bits, outputs = program.single(q, v, u)
         if bits & NOT_FINITE:
             raise InvalidInput("q, v or u has values that are not finite; drop or repair those rows.")
         if bits:
             self._repair(kind, [q[None], v[None], u[None]], [x[None] for x in outputs])
         return outputs
 
-    def _function(self, kind: str) -> RowFunction:
-        found = self._functions.get(kind)
-        if found is None:
-            assert self.code is not None, "asked for by callers that have checked it"
-            found = self._functions[kind] = self.code.function(kind)
-        return found
+    def compiled(self, kind: str) -> RowFunction | None:
+        """The program "mean", "linearize" or "covariance", made now if it is not there; None where torch computes."""
+        if self.code is not None and kind not in self._functions:
+            self._functions[kind] = self._made(lambda code: code.function(kind))
+        return self._functions.get(kind)
+
+    def _made(self, make: Callable[[PredictorCode], Any]) -> Any:
+        """What is made of the code, None once that has failed; one warning says so."""
+        if self.code is None or self._failed:
+            return None
+        try:
+            return make(self.code)
+        except CompilerError as error:
+            self._failed.append(error)  # a compiler that hangs is not waited for again
+            warnings.warn(f"{BY_TORCH}: {error}", NumericalWarning, stacklevel=4)
+            return None
 
     def _mean(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], list[Tensor]]:
         """By torch: the mean, W, what the kernels need, the features, and the kernel functions."""

@@ -162,12 +162,12 @@ class Posterior(Summary, ABC):
             inference, and "exact" after another engine, which lacks what compression needs.
         tolerance, largest_rank: the rank is the smallest that keeps the tolerance, and at most `largest_rank`; a
             NumericalWarning is given where that does not suffice.
-        compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device.
+        compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device. Where
+            no C compiler works, torch does, too, and a NumericalWarning says so.
 
         Raises
         ------
         InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
-        CompilerError: there is no C compiler, or it fails.
         """
         raise InvalidInput(
             f"a {self.description} has no predictor for control rates; call predict, or use a structured Gaussian "

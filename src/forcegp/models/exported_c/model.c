@@ -63,7 +63,8 @@ int @NAME@_step(const double q[@NV@], const double v[@NV@], const double u[@NV@]
   (void)ROUNDS; (void)a; (void)q0; (void)v0; (void)m; (void)d;
   if (refused(q, v, u, x, q_next, N) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
   { @STEP@ }
-  return stored(q1, q_next, N) | stored(v1, v_next, N);
+  if (!(stored(q1, q_next, N) | stored(v1, v_next, N))) return @NAME@_OK;
+  return @IMPLICIT@ && !stored(y, a, N) ? @NAME@_STEP_NOT_FOUND : @NAME@_RESULT_NOT_FINITE;
 }
 
 //// step_jacobian

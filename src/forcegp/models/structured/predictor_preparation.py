@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -97,9 +97,9 @@ def prepared_predictor(
         code = PredictorCode.of(
             physics.traced, example, latent_calls(latent, prepared, compressed), compressed, widening
         )
-        code.function("mean" if compressed is None else "covariance")
-    seconds = time.perf_counter() - begin
-    return Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, seconds)
+    made = Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, 0.0)
+    made.compiled("mean" if compressed is None else "covariance")
+    return replace(made, prepare_seconds=time.perf_counter() - begin)
 
 
 def _compressed(

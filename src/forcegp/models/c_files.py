@@ -1,0 +1,192 @@
+"""The files of a model as C99: its program, the header, and what is written beside them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from forcegp.codegen.c_writer import head, write_function
+from forcegp.data import units_for
+from forcegp.inference.one_input_calls import OneInputCall
+from forcegp.models.fused_rollouts import STEPS
+from forcegp.models.predictor import Predictor
+from forcegp.models.predictor_code import PredictorCode
+from forcegp.models.structured.posterior import StructuredPosterior
+
+STORED = 10
+"""States of the self-test."""
+ALIKE = ("CMakeLists.txt", "example.c", "self_test.c", "README.txt")
+TAKEN = ("math", "string", "stdio", "stddef", "stdarg", "features", "example", "self_test", "jac", "hess", "null")
+"""Names of other files, and those that CasADi does not take."""
+
+
+def identifier(name: str) -> str:
+    """A name for C and for files, of any text."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", name)[:60].strip("_").lower() or "robot"
+    plain = plain if plain[0].isalpha() else f"robot_{plain}"
+    return f"{plain}_model" if plain in TAKEN else plain
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a function of the program gives at states (n, 3 nv), and how far it may be from that, relative."""
+
+    function: str
+    states: np.ndarray
+    wanted: list[np.ndarray]
+    tolerance: float
+    left_out: set[int]
+    """Rows that the self-test does not hold."""
+
+    @property
+    def scales(self) -> list[float]:
+        """The largest value of every output."""
+        return [float(np.abs(x).max()) or 1.0 for x in self.wanted]
+
+
+@dataclass(frozen=True, eq=False)
+class CFiles:
+    """The texts of all files of a program; `reference` computes by torch what it does."""
+
+    posterior: StructuredPosterior
+    reference: Predictor
+    code: PredictorCode
+    name: str
+    jacobian: bool
+    dt: float | None
+    integrator: str
+
+    @property
+    def kinds(self) -> list[str]:
+        """The functions of the program."""
+        chosen = {"covariance": self.reference.kind == "compressed", "linearize": self.jacobian}
+        chosen |= {"step": self.dt is not None, "step_jacobian": self.dt is not None and self.jacobian}
+        return ["mean", *(kind for kind, wanted in chosen.items() if wanted)]
+
+    def write(self, folder: Path, source: str | None, said: str, checks: Sequence[Check]) -> None:
+        """All files; `said` is how good the program is."""
+        start = [", ".join(map(repr, x.tolist())) for x in np.split(checks[0].states[0], 3)]
+        program, stepped = _sections("model.c"), STEPS[self.integrator].replace("PROGRAM", self._stepped)
+        words: dict[str, object] = {"NAME": self.name, "NV": self.code.nv, "DT": self.dt, "TITLE": self._title}
+        words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
+        words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
+        words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
+        words |= {"COMMENT": self._comment(said), "GIVEN": 0, "IMPLICIT": int(self.integrator == "implicit-midpoint")}
+        words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
+        if "covariance" in self.kinds:
+            words["GIVEN"] = len(self.code.program("covariance").nodes)
+        words = {word: _filled(str(value), words) for word, value in words.items()}
+        functions = _filled("".join(program[kind] for kind in self.kinds), words)
+        prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
+        words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
+        parts = [_filled(program["head"], words), *self._program(), _filled(program["calls"], words), functions]
+        files = {f"{self.name}.c": "\n".join(parts), f"{self.name}.h": _filled(_template("model.h"), words)}
+        for form in ("external", "acados") if self.dt is not None else ("external",):
+            found = _sections(f"{form}.c")
+            chosen = "".join(found[kind] for kind in ("head", *self.kinds) if kind in found)
+            files[f"{self.name}_{form}.c"] = _filled(chosen, words)
+        files |= {file: _filled(_template(file), words) for file in ALIKE}
+        for file, content in files.items():
+            (folder / file).write_text(content, encoding="ascii")
+
+    @property
+    def _stepped(self) -> str:
+        return "slopes" if self.integrator == "implicit-midpoint" else "mean"
+
+    def _program(self) -> Iterator[str]:
+        """Tables and static functions."""
+        names, code = [], self.code
+        wanted = {"covariance": "mean_and_terms"} if "covariance" in self.kinds else {}
+        slopes = self.jacobian or (self.dt is not None and self._stepped == "slopes")
+        wanted |= {"mean": "mean"} | ({"linearize": "slopes"} if slopes else {})
+        yield head(1)
+        for k, table in enumerate(code.tables if "covariance" in wanted else code.tables[: len(code.sums)]):
+            names.append(f"table{k}")
+            yield f"static const double table{k}[] = {{\n{_numbers(table.tolist())}}};"
+        yield f"static const double *const tables[] = {{{', '.join(names) or '0'}}};"
+        for kind in (False, True) if slopes else (False,):
+            yield from (part.c_source(1, kind) for part in code.sums)
+        if "covariance" in wanted:
+            yield from (part.roots_source(1, code.rank) for part in code.sums)
+            yield code._covariance_source().replace("void covariance(", "void covariance_of(")
+        for kind, function in wanted.items():
+            program = code.program(kind)
+            called = [part.name + ("_slopes" if kind == "linearize" else "") for part in code.sums]
+            yield write_function(function, program.graph, program.nodes, 1, called)
+
+    @property
+    def _title(self) -> str:
+        points = f"{len(self.posterior.training.q)} training points"
+        return _plain(f"(q, v, u) -> a of {self.posterior.system.robot.name}, {self.posterior.description}, {points}")
+
+    def _comment(self, said: str) -> str:
+        robot, units = self.posterior.system.robot, units_for(self.posterior.system.robot)
+        lines = [self._title, f"contacts: {len(self.posterior.system.contacts)}"]
+        for k, name in enumerate(robot.joint_names):
+            own = (f"{key} in {units[key] if isinstance(units[key], str) else units[key][k]}" for key in "qvua")
+            lines.append(f"joint {k}: {name}, {', '.join(own)}")
+        if self.reference.inflation is not None:
+            wider = float(self.reference.inflation.max())
+            lines.append(f"standard deviations: never below those of predict, at most {wider:.1%} above at its checks")
+        if self.table_error:
+            lines.append(f"tables of one input, relative error {self.table_error:.1e}, NaN outside their range")
+        lines += [f"a step lasts {self.dt!r} s, by {self.integrator}"] if self.dt is not None else []
+        return "\n".join(f"   {_plain(line)}" for line in [*lines, said])
+
+    @property
+    def table_error(self) -> float:
+        """The largest relative one; 0 without tables."""
+        return max((part.functions.error for part in self.code.sums if isinstance(part, OneInputCall)), default=0.0)
+
+    def _stored(self, checks: Sequence[Check]) -> tuple[str, str]:
+        """Arrays and calls of the self-test."""
+        arrays, calls = [], []
+        for check in checks:
+            rows = [k for k in range(min(len(check.states), 100)) if k not in check.left_out]
+            rows = rows[:: max(1, len(rows) // STORED)]
+            states, what = check.states[rows], check.function.removeprefix(f"{self.name}_")
+            arrays.append(_array(f"{what}_states", states))
+            given = [f"{what}_states[k]{f' + {j * self.code.nv}' if j else ''}" for j in range(3)]
+            made = [f"r{j}" for j in range(len(check.wanted))]
+            lines = [f"double {r}[{wanted.shape[1]}];" for r, wanted in zip(made, check.wanted, strict=True)]
+            lines.append(f"if ({check.function}({', '.join(given + made)})) failures++;")
+            for j, (wanted, scale) in enumerate(zip(check.wanted, check.scales, strict=True)):
+                arrays.append(_array(f"{what}_{j}", wanted[rows]))
+                bound = 10.0 * check.tolerance * scale
+                lines.append(f'compare("{check.function}", r{j}, {what}_{j}[k], {wanted.shape[1]}, {bound!r});')
+            calls.append(f"  for (int k = 0; k < {len(states)}; k++) {{\n    " + "\n    ".join(lines) + "\n  }")
+        return "\n".join(arrays), "\n".join(calls)
+
+
+def _template(file: str) -> str:
+    return (Path(__file__).parent / "exported_c" / file).read_text(encoding="ascii")
+
+
+def _sections(file: str) -> dict[str, str]:
+    """The parts of a template, by the names above them."""
+    return dict(re.findall(r"^//// (\S+)\n(.*?)(?=^////|\Z)", _template(file), re.MULTILINE | re.DOTALL))
+
+
+def _filled(text: str, words: Mapping[str, object]) -> str:
+    """The text with what stands for every `@WORD@`."""
+    return re.sub("@([A-Z_]+)@", lambda found: str(words[found[1]]), text)
+
+
+def _numbers(values: Sequence[float]) -> str:
+    lines = (values[k : k + 6] for k in range(0, len(values), 6))
+    return "".join(f"  {', '.join(value.hex() for value in line)},\n" for line in lines)
+
+
+def _array(name: str, rows: np.ndarray) -> str:
+    text = ",\n  ".join(f"{{{', '.join(value.hex() for value in row)}}}" for row in rows.tolist())
+    return f"static const double {name}[{len(rows)}][{rows.shape[1]}] = {{\n  {text}}};"
+
+
+def _plain(line: str) -> str:
+    """Text that cannot end a comment, whatever a robot file calls its joints."""
+    return re.sub(r"[^\x20-\x7e]|[@*?\\]", "_", line)
