@@ -72,7 +72,12 @@ def load_library(
     path = own_folder(folder, purpose) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
     if not path.exists():
         _compile(write(unit), unit.options, path, purpose)
-    _require_own(path, purpose)
+    return opened_library(path, purpose), path
+
+
+def opened_library(path: Path, purpose: Purpose) -> ctypes.CDLL:
+    """The library of a file that nobody else may write to. Raises CompilerError where it cannot be loaded."""
+    own_file(path, purpose)
     try:
         library = ctypes.CDLL(str(path))
         library.evaluate.restype = ctypes.c_int
@@ -81,7 +86,7 @@ def load_library(
             f"{path} cannot be loaded ({error}); delete it, and it is compiled anew. If that does not help, choose "
             f"a folder from which programs may be run: {purpose.elsewhere}."
         ) from error
-    return library, path
+    return library
 
 
 @cache
@@ -100,7 +105,7 @@ def own_folder(folder: Path, purpose: Purpose) -> Path:
         for part in (*reversed(folder.parents), folder):
             if not part.is_dir():
                 part.mkdir(mode=0o700, exist_ok=True)  # another process may make it meanwhile
-            _require_own(part, purpose, parent=part != folder)
+            own_file(part, purpose, parent=part != folder)
     except OSError as error:
         raise CompilerError(
             f"the folder {folder} for {purpose.what} cannot be made ({error.strerror}); choose another: "
@@ -109,7 +114,7 @@ def own_folder(folder: Path, purpose: Purpose) -> Path:
     return folder
 
 
-def _require_own(path: Path, purpose: Purpose, *, parent: bool = False) -> None:
+def own_file(path: Path, purpose: Purpose, *, parent: bool = False) -> None:
     """Nobody but the user and root may exchange the file or what is in the folder.
 
     In a parent folder with the sticky bit, such as /tmp, everybody may make files, but exchange only their own.

@@ -107,7 +107,7 @@ def export_casadi(
         except RuntimeError:  # many lines
             raise NumericalError(
                 f"CasADi's Newton method finds no step of {steps:g} s by {integrator} somewhere near the training "
-                "data, so nothing is written; give shorter steps, or export to C, whose method shortens what overshoots."
+                "data, so nothing is written; give shorter steps, or export to C, whose steps are shortened."
             ) from None
         worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
         if not worst <= (STEP_TOLERANCE if file != called else TOLERANCE):

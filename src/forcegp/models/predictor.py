@@ -27,8 +27,9 @@ from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
+from forcegp.models.kept_code import KeptCode
 from forcegp.models.prediction import Gaussian
-from forcegp.models.predictor_code import PredictorCode, TermsFunction
+from forcegp.models.predictor_code import TermsFunction
 from forcegp.models.rollout import by_sample, checked_start
 from forcegp.models.structured.components import Components
 from forcegp.models.structured.inverse_dynamics import inverse_dynamics
@@ -89,7 +90,7 @@ class Predictor(Summary):
     latent: LatentPosterior
     prepared: PreparedKernels
     terms: TermsFunction
-    code: PredictorCode | None
+    code: KeptCode | None
     kind: str
     compressed: CompressedCovariance | None
     widening: float
@@ -293,7 +294,7 @@ class Predictor(Summary):
             self._functions[kind] = self._made(lambda code: code.function(kind))
         return self._functions.get(kind)
 
-    def _made(self, make: Callable[[PredictorCode], Any]) -> Any:
+    def _made(self, make: Callable[[KeptCode], Any]) -> Any:
         """What is made of the code, None once that has failed; one warning says so."""
         if self.code is None or self._failed:
             return None

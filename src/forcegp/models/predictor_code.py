@@ -20,7 +20,7 @@ from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Graph
 from forcegp.codegen.library import VectorUnit, default_folder, load_library
 from forcegp.codegen.native_code import Purpose
-from forcegp.codegen.row_function import RowFunction, aligned
+from forcegp.codegen.row_function import aligned
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.inference.compressed_covariance import CompressedCovariance
@@ -170,11 +170,6 @@ class PredictorCode:
             found += [part.root_table() for part in self.sums]
         return [aligned(table) for table in found]
 
-    def function(self, kind: str) -> RowFunction:
-        """A program, compiled or found. Raises CompilerError where that cannot be."""
-        sizes = {"mean": [], "linearize": [3 * self.nv**2], "covariance": [self.nv**2]}[kind]
-        return RowFunction(self._library(kind), [self.nv] * 3, [self.nv, *sizes], self.tables)
-
     def loops(
         self, integrator: str, latent: LatentPosterior, samples: int = 0, seed: int = 0
     ) -> list[FusedLoop] | None:
@@ -183,14 +178,15 @@ class PredictorCode:
         None where a drawn function has no form in pieces. Raises CompilerError where loops cannot be compiled.
         """
         if not samples or not self.sums:
-            return [FusedLoop(self._library(integrator), self.tables)] * max(1, samples)
+            return [FusedLoop(self.library(integrator), self.tables)] * max(1, samples)
         drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)
         if drawn is None:
             return None
         codes = [replace(self, sums=calls, compressed=None) for calls in drawn]
-        library = codes[0]._library(integrator)
+        library = codes[0].library(integrator)
         return [FusedLoop(library, code.tables) for code in codes]
 
-    def _library(self, kind: str) -> ctypes.CDLL:
+    def library(self, kind: str) -> ctypes.CDLL:
+        """A program, compiled or found, or a loop by its integrator. Raises CompilerError where that cannot be."""
         text = self.c_source(kind, VectorUnit.of_this_processor().lanes)
         return load_library(f"predictor-{kind}", text, lambda _: text, default_folder(), PURPOSE)[0]

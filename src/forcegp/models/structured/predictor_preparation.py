@@ -7,6 +7,8 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,14 +20,17 @@ from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import PreparedKernels
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode, TermsFunction
 from forcegp.models.training_data import Standardization, TrainingData
-from forcegp.priors import ForcePrior
+from forcegp.priors import ForcePrior, prior_to_dict
 
 COVARIANCES = ("auto", "compressed", "exact", "none")
 SAMPLES, CHECKS = 300, 150
 """States that choose the compressed covariance, and others that show how good it is."""
+UNCHANGED = 1e-7
+"""Relative difference from torch that rounding and tables explain."""
 STEP = 0.3
 """Length of a step away from a training state, in differences of two others."""
 
@@ -39,6 +44,10 @@ class PredictorPhysics:
     analytical: bool
     inertials: Mapping[str, Tensor] | None
     standardization: Standardization
+
+    def description(self) -> list[Any]:
+        """Its parts as JSON values. Raises ForceGPError where they hold code."""
+        return [self.system.to_dict(), prior_to_dict(self.prior), self.analytical, *(self.inertials or {})]
 
     def terms(self, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
         """[offset, W, features of every process ...] with a = offset + W f."""
@@ -82,6 +91,8 @@ def prepared_predictor(
     if covariance == "auto":
         covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
     prepared = PreparedKernels.of(latent)
+    options = [covariance, tolerance, largest_rank, widening]
+    key = record_key(lambda: [physics.description(), options], _numbers(latent, training, physics))
     compressed = None
     if covariance == "compressed" and prepared.groups:
         if not isinstance(latent, ExactPosterior):
@@ -90,16 +101,56 @@ def prepared_predictor(
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        compressed = _compressed(latent, training, prepared, physics.terms, tolerance, largest_rank)
+        compressed = kept_covariance(
+            key, lambda: _compressed(latent, training, prepared, physics.terms, tolerance, largest_rank)
+        )
+        reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
+        if reached > tolerance:
+            warnings.warn(
+                f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large, more than "
+                f"the tolerance {tolerance:.2g}; give a larger largest_rank or tolerance, or covariance='exact'.",
+                NumericalWarning,
+                stacklevel=3,
+            )
     code = None
     if compile:
         example = [x[:1] for x in (training.q, training.v, training.u)]
-        code = PredictorCode.of(
-            physics.traced, example, latent_calls(latent, prepared, compressed), compressed, widening
-        )
+        code = KeptCode(nv, partial(_traced, physics, example, latent, prepared, compressed, widening), key)
     made = Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, 0.0)
-    made.compiled("mean" if compressed is None else "covariance")
+    first = "mean" if compressed is None else "covariance"
+    if made.compiled(first) and code is not None and not code.is_traced:
+        some = [x[:: 1 + len(x) // 3] for x in (training.q, training.v, training.u)]
+        found, expected = made.run(first, some)[0], replace(made, code=None, _functions={}).mean(*some)
+        if float((found - expected).abs().max()) > UNCHANGED * float(expected.abs().max()):
+            made = replace(made, code=replace(code, key=None), _functions={})  # a prior's code changed: no key shows it
+            made.compiled(first)
     return replace(made, prepare_seconds=time.perf_counter() - begin)
+
+
+def _traced(
+    physics: PredictorPhysics,
+    example: list[Tensor],
+    latent: LatentPosterior,
+    prepared: PreparedKernels,
+    compressed: CompressedCovariance | None,
+    widening: float,
+) -> PredictorCode:
+    calls = latent_calls(latent, prepared, compressed)
+    return PredictorCode.of(physics.traced, example, calls, compressed, widening)
+
+
+def _numbers(latent: LatentPosterior, training: TrainingData, physics: PredictorPhysics) -> list[Tensor]:
+    """All that decide a predictor of a described system and prior."""
+    found = [
+        training.q,
+        training.v,
+        training.u,
+        *latent.features,
+        *latent.weights,
+        *latent.kernels.state_dict().values(),
+    ]
+    found += [*physics.standardization.shift, *physics.standardization.scale, *(physics.inertials or {}).values()]
+    return [*found, latent.data_factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
 
 
 def _compressed(
@@ -121,16 +172,7 @@ def _compressed(
 
     latents = [group.latents for group in prepared.groups]
     chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
-    found = compress(latent, latents, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
-    reached = float(found.inflation.max()) if len(found.inflation) else 0.0
-    if reached > tolerance:
-        warnings.warn(
-            f"rank {found.rank} makes standard deviations up to {reached:.2g} (relative) too large, more than the "
-            f"tolerance {tolerance:.2g}; give a larger largest_rank or tolerance, or covariance='exact'.",
-            NumericalWarning,
-            stacklevel=4,
-        )
-    return found
+    return compress(latent, latents, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
 
 
 def sample_states(training: TrainingData, count: int, seed: int, rows: int) -> list[Float[Tensor, "_ nv"]]:
