@@ -19,7 +19,7 @@ import forcegp
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
 from forcegp.file_digests import write_digests
 from forcegp.mechanics import MechanicalSystem
-from forcegp.recordings.mapping_file import read_mapping
+from forcegp.recordings.mapping import read_mapping
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 

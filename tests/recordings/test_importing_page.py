@@ -9,7 +9,7 @@ from tests.examples import run_example
 from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.import_log import Import
 from forcegp.recordings import read_mapping
-from forcegp.recordings.signal_units import UNITS
+from forcegp.recordings.mapping import UNITS
 
 
 @pytest.fixture(scope="module")

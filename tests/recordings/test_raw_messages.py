@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from tests.recordings.log_files import EPOCH, joint_states, motion, write_bag2
 
-from forcegp.recordings import mcap_chunks as mcap_module
-from forcegp.recordings import open_source
-from forcegp.recordings.mcap_chunks import mcap_chunks
-from forcegp.recordings.raw_messages import _ordered_chunks, topic_messages
+from forcegp.recordings import open_source, raw_messages
+from forcegp.recordings.raw_messages import _ordered_chunks, mcap_chunks, topic_messages
 
 pytest.importorskip("rosbags")
 
@@ -83,9 +81,9 @@ def hidden(place: str, name: str):
 
 def other_offsets(monkeypatch):
     """Offsets that mean something else."""
-    own = mcap_module._begins_at
+    own = raw_messages._begins_at
     monkeypatch.setattr(
-        mcap_module,
+        raw_messages,
         "_begins_at",
         lambda info, file: own(info._replace(chunk_start_offset=info.chunk_start_offset + 9), file),
     )

@@ -13,11 +13,9 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput, MissingExtra
-from forcegp.recordings.mcap_chunks import mcap_chunks
 from forcegp.recordings.message_layout import MessageLayout, message_layout
-from forcegp.recordings.raw_messages import RawMessages, topic_messages
-from forcegp.recordings.size_limits import require_plausible_size
-from forcegp.recordings.source import Columns, Source, reading
+from forcegp.recordings.raw_messages import RawMessages, mcap_chunks, topic_messages
+from forcegp.recordings.source import Columns, Source, reading, require_plausible_size
 
 LOG_TIME = "log_time"
 STAMP = "header.stamp"

@@ -12,11 +12,9 @@ import forcegp.robots
 from forcegp.data import FrozenDict
 from forcegp.data.units import ROTATION, TRANSLATION, validated_units
 from forcegp.errors import InvalidInput
-from forcegp.recordings.column_guessing import guessed_columns, guessed_time
-from forcegp.recordings.column_names import expanded
+from forcegp.recordings.column_names import expanded, guessed_columns, guessed_time
 from forcegp.recordings.linear_expressions import LinearExpression, parse_expression
-from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.signal_units import LogUnit, log_unit
+from forcegp.recordings.mapping import SIGNALS, ColumnMapping, LogUnit, log_unit
 from forcegp.recordings.source import Columns, Source
 
 
