@@ -9,9 +9,9 @@ from benchmarks.force_pictures import PICTURES
 from tests.examples import run_example
 
 from forcegp import KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.main import parse_arguments
 from forcegp.experiments import published
-from forcegp.experiments.model_names import MODELS
+from forcegp.experiments.fits import MODELS
 from forcegp.priors import KERNELS, NAMED_PRIORS, named_prior
 
 

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.contacts import contact_findings
 from forcegp.checks.excitation import excitation_findings
 from forcegp.checks.findings import SEVERITIES, Finding, Severity, plain, worst
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings
 from forcegp.checks.noise import noise_findings, numbers_of, stated_noise_findings, torque_noise
 from forcegp.checks.parameters import parameter_findings
-from forcegp.checks.robot_model import robot_findings
+from forcegp.checks.robot_model import contact_findings, robot_findings
 from forcegp.checks.sampling import sampling_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings

@@ -1,10 +1,13 @@
-"""Is the URDF believable: links without inertia, placeholders, bodies larger than the robot."""
+"""What was stated of the robot: a URDF that is not believable, and contacts that the rows contradict."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.findings import Finding, listed, look
+from forcegp.data import contact_doubts
+from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 
 
@@ -56,3 +59,17 @@ def _reach(robot: Robot) -> float:
     origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.joints)
     centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
     return origins + max(centers, default=0.0) if origins > 0.0 else 0.0
+
+
+def contact_findings(inputs: CheckInput, system: MechanicalSystem | None) -> list[Finding]:
+    """Contacts beside which the motion runs, whose force acts elsewhere or not at all, or that are missing."""
+    return [
+        Finding(
+            severity="wrong" if doubt.kind == "off" else "look",
+            subject="contact",
+            seen=doubt.seen,
+            remedy=doubt.remedy,
+            numbers={"kind": doubt.kind, **doubt.numbers},
+        )
+        for doubt in contact_doubts(inputs.mended, system)
+    ]

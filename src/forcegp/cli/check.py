@@ -15,9 +15,8 @@ import forcegp
 import forcegp.evaluation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.input_options import CutoffOptions, RobotOptions
 from forcegp.cli.output_folders import plots_folder, require_free_folder
-from forcegp.cli.preparation_options import CutoffOptions
-from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import DatasetError

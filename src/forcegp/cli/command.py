@@ -1,4 +1,4 @@
-"""What every command shares: two flags, the check that its input files are there, and `run`."""
+"""What commands share: two flags, the check that input files are there, where to compute, and `run`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, get_type_hints
 
 from tyro.conf import arg
 
+import forcegp.parallel
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -96,3 +97,29 @@ def _same(one: Path, other: Path) -> bool:
 
 def _within(inner: Path, outer: Path) -> bool:
     return Path(os.path.realpath(inner)).is_relative_to(os.path.realpath(outer))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendOptions(Command):
+    """What every command asks that can compute in several processes, or on several machines."""
+
+    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="")] = None
+    backend: Annotated[str | None, arg(metavar="serial|joblib|ray", constructor=str, help_behavior_hint="")] = None
+    """serial: in this process. joblib: in processes of this machine. ray: on the machines of a Ray cluster; see
+    docs/clusters.md. (default: serial for one job, else joblib)"""
+    address: Annotated[str | None, unless_given("HOST:PORT", "that of this machine", str)] = None
+    """The head of the Ray cluster, for --backend ray."""
+
+    def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
+        """The backend that is asked for, or else the default: this process for one job, several for more.
+
+        Raises InvalidInput for options that contradict each other.
+        """
+        if self.backend is None and self.address is not None:
+            raise InvalidInput(f"--address is {self.address}, that of a cluster; add --backend ray.")
+        name = self.backend or default
+        return (
+            forcegp.parallel.backend_for(None, self.jobs)
+            if name is None
+            else forcegp.parallel.backend_of(name, self.jobs, self.address)
+        )

@@ -18,9 +18,8 @@ import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.fit_options import POINTS
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.model_choice import resolved_noise
+from forcegp.cli.model_choice import POINTS, resolved_noise
 from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal

@@ -14,9 +14,9 @@ import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
-from forcegp.cli.contact_syntax import parse_contacts
+from forcegp.cli.input_options import SystemChoice, carried_over
 from forcegp.cli.output_folders import plots_folder, require_free_folder
-from forcegp.cli.system_choice import SystemChoice, carried_over
+from forcegp.cli.syntax import parse_contacts
 from forcegp.cli.tables import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,

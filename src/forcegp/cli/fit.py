@@ -14,12 +14,10 @@ import forcegp.inference
 import forcegp.models
 import forcegp.robots
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.fit_options import ModelOptions
-from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
-from forcegp.cli.option_names import with_option_names
+from forcegp.cli.model_choice import ModelOptions, make_model, resolved, search_arguments, window_observation
 from forcegp.cli.output_folders import require_free_folder
 from forcegp.cli.tables import facts
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import Terminal, with_option_names
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp fit"

@@ -16,14 +16,12 @@ import forcegp.inference
 import forcegp.models
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.fit import fit_summary, fit_with_progress
-from forcegp.cli.identify_options import IdentifyOptions
-from forcegp.cli.identify_regression import INERTIAS, identify_by_regression
-from forcegp.cli.learn_syntax import parse_learn, with_learned_forces
+from forcegp.cli.identify_regression import INERTIAS, IdentifyOptions, identify_by_regression
 from forcegp.cli.model_choice import resolved_noise
-from forcegp.cli.option_names import with_option_names
 from forcegp.cli.output_folders import require_free_folder
+from forcegp.cli.syntax import parse_learn, with_learned_forces
 from forcegp.cli.tables import NONE, columns
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import Terminal, with_option_names
 from forcegp.errors import InvalidInput
 
 KIND = "forcegp identify"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,14 +14,70 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 import forcegp
 import forcegp.checks
-from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import DATASET, unless_given
-from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
-from forcegp.cli.contact_syntax import parse_contacts
-from forcegp.cli.findings_line import findings_in_one_line
-from forcegp.cli.robot_options import RobotOptions
+import forcegp.data
+from forcegp.cli.command import DATASET, BackendOptions, unless_given
+from forcegp.cli.input_options import RobotOptions
+from forcegp.cli.syntax import parse_contacts
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import ContactWarning
+from forcegp.errors import ContactError, ContactWarning
+
+RowsChoice = Literal["auto", "in-contact", "all"]
+
+NEARLY_ALL = 0.995
+"""Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
+HARDLY_ANY = 0.2
+"""Share below which something is wrong with the contact, rather than the tool in the air."""
+
+
+def rows_to_learn(
+    dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, choice: RowsChoice
+) -> tuple[forcegp.Dataset, str | None]:
+    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and a note on it.
+
+    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all, with a note.
+    The note is printed after the fit, so that an error before it stands alone. Raises ContactError with "in-contact" if
+    there are none.
+    """
+    if choice == "all" or not system.contacts:
+        return dataset, None
+    try:
+        touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
+    except ContactError:
+        if choice == "in-contact":
+            raise
+        return dataset, None  # the fit raises a clearer error
+    share = len(touching) / len(dataset)
+    if choice == "auto" and share >= NEARLY_ALL:
+        return dataset, None
+    text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+    if choice == "auto" and share < HARDLY_ANY:
+        return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
+    return replace(
+        touching, system=dataset.system
+    ), f"{text}; these alone were learned from (--rows all takes every row)"
+
+
+MOST = 3
+"""Findings whose text is shown; the others by their subject."""
+
+
+def findings_in_one_line(
+    findings: Sequence[forcegp.checks.Finding], data: Path, words: Sequence[str] = (), advise: bool = False
+) -> str | None:
+    """The worst findings, the subjects of the others, and where to read more; None if there are none.
+
+    `words` are the options of forcegp check that show the same findings; `advise` names what to do about the worst
+    finding instead, where no options do.
+    """
+    if not findings:
+        return None
+    shown = [f"{each.subject}: {each.seen.rstrip('.')}" for each in findings[:MOST]]
+    more = dict.fromkeys(each.subject for each in findings[MOST:])
+    others = [f"further {', '.join(more)}"] if more else []
+    see = f"See {shlex.join(['forcegp', 'check', str(data), *words])}"
+    following = findings[0].remedy.rstrip(".") if advise else see
+    return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
+
 
 KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
 

@@ -15,9 +15,8 @@ import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.output_folders import plots_folder, require_free_file, require_free_folder
-from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.tables import NONE, columns, facts
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput

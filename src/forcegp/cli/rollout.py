@@ -15,8 +15,8 @@ import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
+from forcegp.cli.input_options import SystemChoice, carried_over
 from forcegp.cli.output_folders import output_folder, require_free_folder
-from forcegp.cli.system_choice import SystemChoice, carried_over
 from forcegp.cli.tables import NONE, columns, facts, number, percent
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput

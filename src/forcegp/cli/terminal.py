@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -18,7 +19,45 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from forcegp.cli.option_names import with_option_names
+_ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
+
+OTHERWISE = {
+    "contacts": "contact",
+    "folder": "out",
+    "locked": "lock",
+    "most_rows": "max_rows",
+    "observe": "learn_from",
+    "system": "robot",
+}
+"""Options whose argument has another name in Python."""
+
+ELSEWHERE = {
+    "`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)",
+    "forcegp.data.rows_in_contact": "--rows in-contact",
+}
+"""Calls of Python that an option stands for."""
+
+
+def with_option_names(message: str, options: Collection[str]) -> str:
+    """The message with --points for `points` and --points 5 for `points=5`, where the command has such an option.
+
+    The library marks arguments in its messages by backquotes, and options have the same names.
+
+    Arguments that the command does not have stay as they are.
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name, value = found[1], (found[2] or "").strip("'")
+        name = name if name in options else OTHERWISE.get(name, name)
+        if name not in options:
+            return found[0]
+        flag = f"--{name.replace('_', '-')}"
+        return flag if value in ("", "True") else f"{flag}{'=' if value.startswith('-') else ' '}{value}"
+
+    for call, words in ELSEWHERE.items():
+        message = message.replace(call, words)
+    return _ARGUMENT.sub(option, message)
+
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""

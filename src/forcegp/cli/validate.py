@@ -15,11 +15,9 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.validation
-from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.friction_laws import friction_laws
-from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
+from forcegp.cli.input_options import PreparationOptions, RobotOptions
+from forcegp.cli.syntax import friction_laws
 from forcegp.cli.tables import NONE, columns, number
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 
 import forcegp.mechanics
-from forcegp.data.contact_residual import BLOCKS, Residual, moved_points, tensors
+from forcegp.data.contact_residual import BLOCKS, Residual, missing_contact, moved_points, tensors
 from forcegp.data.dataset import Dataset
-from forcegp.data.missing_contact import missing_contact
 from forcegp.errors import ForceGPError
 
 MOST_ROWS = 240

@@ -12,8 +12,7 @@ from forcegp.evaluation.summary_statistics import formatted, in_columns, markdow
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
-from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_cost, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
 
 TASKS = "forcegp.experiments.ablation_jobs"

@@ -16,8 +16,7 @@ from torch import Tensor
 from forcegp.data import farthest_rows, low_pass
 from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
-from forcegp.experiments.fits import MODEL
-from forcegp.experiments.model_names import MODELS
+from forcegp.experiments.fits import MODEL, MODELS
 from forcegp.inference import OptimizerOptions, minimize_objective
 from forcegp.jobs import JobStore
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData, load_posterior

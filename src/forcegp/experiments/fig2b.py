@@ -12,9 +12,18 @@ from typing_extensions import override
 from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
-from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
-from forcegp.experiments.plots.learning_curves import learning_curves_figure
+from forcegp.experiments.figures import learning_curves_figure
+from forcegp.experiments.fits import (
+    ANALYTICAL,
+    GAUSSIAN_PROCESSES,
+    MODELS,
+    NETWORKS,
+    FitSettings,
+    all_name,
+    fit_name,
+    fit_series,
+    fit_to_all,
+)
 from forcegp.jobs import Job, JobStore
 
 SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")

@@ -16,9 +16,8 @@ from forcegp.evaluation.metrics import interval_coverage
 from forcegp.evaluation.summary_statistics import markdown_table, number
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fits import MODEL, FitSettings, fit_name, fit_series
-from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.plots.prediction_window import prediction_window_figure
+from forcegp.experiments.figures import prediction_window_figure
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
 from forcegp.models import load_posterior
 

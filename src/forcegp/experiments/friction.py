@@ -11,10 +11,16 @@ from typing_extensions import override
 
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
 from forcegp.evaluation.summary_statistics import formatted
-from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
+from forcegp.experiments.force_experiment import (
+    LABELS,
+    ForceExperiment,
+    Trial,
+    dots_figure,
+    only_test,
+    score_table,
+    trial_name,
+)
 from forcegp.experiments.force_jobs import MODEL, load
-from forcegp.experiments.force_scenarios import LABELS
-from forcegp.experiments.force_tables import dots_figure, only_test, score_table
 from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.experiments.ablation import Ablation
-from forcegp.experiments.data_efficiency import DataEfficiency
-from forcegp.experiments.deep_kernel import DeepKernel
+from forcegp.experiments.data_efficiency import DataEfficiency, DeepKernel
 from forcegp.experiments.experiment import DataSettings, Experiment
 from forcegp.experiments.extrapolation import Extrapolation
 from forcegp.experiments.fig2b import Fig2b
@@ -14,8 +13,7 @@ from forcegp.experiments.fig3 import Fig3
 from forcegp.experiments.fig4 import Fig4
 from forcegp.experiments.fits import FitSettings
 from forcegp.experiments.friction import Friction
-from forcegp.experiments.transfer import Transfer
-from forcegp.experiments.unilateral_contact import UnilateralContact
+from forcegp.experiments.other_contacts import Transfer, UnilateralContact
 
 PAPER_DATA = DataSettings(train_seconds=200.0, rows=10_000, test_seconds=100.0, every=12)
 SMOKE_DATA = DataSettings(train_seconds=10.0, rows=400, test_seconds=12.0, every=12)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,98 @@ from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import save_figure
+from forcegp.evaluation.summary_statistics import markdown_table
 from forcegp.experiments.experiment import Experiment, Row
-from forcegp.experiments.pages import page_of
-from forcegp.experiments.report import report
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
+
+PAPER_INTRODUCTION = """Rath, Geist and Trimpe, "Using Physics Knowledge for Learning Rigid-body Forward Dynamics with \
+Gaussian Process Force Priors" (CoRL 2021), figure by figure, and what goes beyond it. This page, its tables and its \
+figures are written by
+
+    {command}
+
+and never by hand; the numbers lie beside it as JSON and CSV. Every pair of training and test trajectory has its own \
+way-points and noise, so no test row is a training row. Medians over seeds come with the least and the largest value."""
+
+FORCES_INTRODUCTION = """What priors on forces are worth: data efficiency, friction as it is, other \
+contacts, and the parts of the posterior. [forces.md](forces.md) explains the priors. This page, its tables and its \
+figures are written by
+
+    {command}
+
+and never by hand; the numbers lie beside it as JSON and CSV. One experiment by its name: `forcegp reproduce NAME \
+--preset forces`. Every training and every test trajectory has its own way-points and noise, the noise of the \
+acceleration is 0.1 rad/s², “noise-free” errors are against the acceleration without it. Medians over seeds come with \
+the least and the largest value."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """`name` is that of the file and of the folder beside it; `introduction` holds `{command}`."""
+
+    name: str
+    title: str
+    introduction: str
+
+
+PAPER = Page("reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
+FORCES = Page("force-priors", "Force priors: results", FORCES_INTRODUCTION)
+
+TRIAL_PRESETS = ("smoke", "forces-smoke")
+"""Presets that test the machinery; their numbers mean nothing for the models."""
+
+
+def page_of(preset: str) -> Page:
+    """The page of the results of that preset."""
+    return FORCES if preset.startswith("forces") else PAPER
+
+
+def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]]) -> str:
+    """Markdown from the documents of the experiments: one section for each, then the times."""
+    preset = documents[experiments[0].name]["preset"]
+    page = page_of(preset)
+    parts = [f"# {page.title}"]
+    parts.append(page.introduction.format(command=documents[experiments[0].name]["command"]))
+    if preset in TRIAL_PRESETS:
+        parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers mean nothing for the models.**")
+    for experiment in experiments:
+        document = documents[experiment.name]
+        parts.append(f"## {experiment.title}")
+        parts += [f"![{experiment.title}]({page.name}/{name}.png)" for name in document["figures"]]
+        parts.append(experiment.section(document["summary"]))
+        parts += _warnings(document["warnings"])
+    seconds = {name: value for document in documents.values() for name, value in document["cpu_seconds"].items()}
+    machines = sorted({machine for document in documents.values() for machine in document["machines"]})
+    parts += ["## Time", _times(" and ".join(machines), seconds)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _warnings(by_job: Mapping[str, Sequence[str]]) -> list[str]:
+    """What the computation warned of, with the number of jobs and one of them; numbers in the text are that one's."""
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for job, messages in by_job.items():
+        for message in messages:
+            kinds.setdefault(re.sub(r"\d[\d.e+-]*", "#", message), []).append((job, message))
+    if not kinds:
+        return []
+    lines = [f"* jobs: {len(found)}, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
+    return ["Warnings while this was computed:\n\n" + "\n".join(lines)]
+
+
+def _times(machine: str, times: Mapping[str, float]) -> str:
+    groups: dict[str, list[float]] = {}
+    for name, seconds in times.items():
+        kind, *rest = name.split("/")
+        group = f"{kind}/{rest[0]}/{rest[-1]}" if kind == "fits" else kind
+        groups.setdefault(group, []).append(seconds)
+    rows = [[group, str(len(each)), f"{max(each):.0f}", f"{sum(each):.0f}"] for group, each in groups.items()]
+    text = (
+        f"{sum(times.values()) / 3600:.2f} CPU-hours for {len(times)} jobs, on {machine}. A job includes loading and "
+        "scoring, not only the search."
+    )
+    return f"{text}\n\n{markdown_table(['jobs', 'number', 'longest [CPU s]', 'all [CPU s]'], rows)}"
+
 
 KIND = "forcegp reproduce"
 

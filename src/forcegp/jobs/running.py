@@ -14,8 +14,7 @@ from typing import Any
 
 from forcegp.atomic_files import require_writable, write_json
 from forcegp.errors import BackendError, FitError, ForceGPError, OutdatedWarning
-from forcegp.jobs.job import Job, digests
-from forcegp.jobs.machine import machine
+from forcegp.jobs.job import Job, digests, machine
 from forcegp.jobs.store import RESULT_FILE, JobStore
 from forcegp.parallel import Backend, Joblib, Pool, Shared
 

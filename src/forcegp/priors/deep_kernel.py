@@ -20,8 +20,13 @@ from torch import Tensor
 from torch.distributions import StudentT
 from typing_extensions import override
 
-from forcegp.priors.kernel_parameters import float64, log_scale, register_log_normal_prior
-from forcegp.priors.stationary_kernels import LOG_LENGTHSCALE_SPREAD, typical_lengthscale
+from forcegp.priors.basic_kernels import (
+    LOG_LENGTHSCALE_SPREAD,
+    float64,
+    log_scale,
+    register_log_normal_prior,
+    typical_lengthscale,
+)
 
 UNITS = 2
 """Places of abrupt change."""

@@ -11,8 +11,14 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.priors.kernel_parameters import LOG_VARIANCE_SPREAD, float64, log_scale, register_log_normal_prior
-from forcegp.priors.weight_kernels import constant, linear
+from forcegp.priors.basic_kernels import (
+    LOG_VARIANCE_SPREAD,
+    constant,
+    float64,
+    linear,
+    log_scale,
+    register_log_normal_prior,
+)
 
 WIDTH = 0.1
 """Start value of the velocity at which dry friction is developed, as a fraction of the rms velocity."""

@@ -1,22 +1,39 @@
-"""`JointForces`: one independent Gaussian process per joint force, on (q, v, u); the prior of the paper."""
+"""Priors on forces or accelerations at every joint as functions of the whole state, and no forces at all."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.priors.expressed_kernels import ExpressedKernels
-from forcegp.priors.joint_units import joint_labels, joint_units
+from forcegp.priors.force_prior import ExpressedKernels, ForcePrior
 from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
+
+UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "a": ("rad/s^2", "m/s^2"), "u": ("Nm", "N")}
+"""Of positions, velocities, accelerations and forces, for joints that turn and joints that slide."""
+
+
+def joint_units(quantity: str, joints: Sequence[str], robot: Robot) -> tuple[str, ...]:
+    """The unit that a key of `UNITS` has at each of the joints."""
+    turning, sliding = UNITS[quantity]
+    slides = {joint.name for joint in robot.joints if joint.type == "prismatic"}
+    return tuple(sliding if name in slides else turning for name in joints)
+
+
+def joint_labels(what: str, quantity: str, joints: Sequence[str], robot: Robot) -> tuple[str, ...]:
+    """`what` of every joint with its unit, for example "velocity of joint_1 [rad/s]"."""
+    units = joint_units(quantity, joints, robot)
+    return tuple(f"{what} of {name} [{unit}]" for name, unit in zip(joints, units, strict=True))
+
 
 INPUTS = ("q", "v", "u")
 ANGLES = ("plain", "sin-cos")
@@ -97,3 +114,50 @@ def as_names(given: object) -> tuple[Any, ...]:
 
 def _turns(robot: Robot) -> Tensor:
     return torch.tensor([joint.type != "prismatic" for joint in robot.joints], device=robot.device)
+
+
+@dataclass(frozen=True)
+class JointAccelerations(JointForces):
+    """Q_U = M f(x): the processes f_j are the acceleration (rad/s^2, m/s^2) that an unconstrained robot would have.
+
+    Then H M f = f - M^-1 A^T (A M^-1 A^T)^+ A f, the projection of f onto what the constraint allows (Geist & Trimpe
+    2020, "Learning constrained dynamics with Gauss' principle adhering Gaussian processes", the S-GP [38] of Rath et
+    al. 2021). With the mean "zero" the processes carry gravity and actuation, too. Without contacts H M is the
+    identity, and this is an independent Gaussian process per joint.
+    """
+
+    @override
+    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        return dynamics.M
+
+    @override
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
+        return joint_units("a", robot.joint_names, robot)
+
+
+@dataclass(frozen=True)
+class NoForces(ForcePrior):
+    """Q_U = 0: no latent function at all, so a = M^-1 Q_b + H Q_K + noise (Rath et al. 2021, eq. 4 with Q_z = 0).
+
+    What can be fitted are learned noise and physical parameters, by maximum likelihood.
+    """
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        return ()
+
+    @override
+    def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        return dynamics.H[..., :0]
+
+    @override
+    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
+        return ()
+
+    @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        return ()
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return ()

@@ -17,9 +17,14 @@ from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.baselines.network_layers import ResidualLayers, check_numbers, initial_weights
 from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, fit_settings, inputs
-from forcegp.models.baselines.network_training import Batches, held_out_rows
+from forcegp.models.baselines.neural_network import (
+    Batches,
+    ResidualLayers,
+    check_numbers,
+    held_out_rows,
+    initial_weights,
+)
 from forcegp.models.noise import Noise
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
