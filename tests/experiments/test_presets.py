@@ -9,8 +9,7 @@ import pytest
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments.force_experiment import SCENARIOS, ForceExperiment, Trial
-from forcegp.experiments.presets import PRESETS, experiments_of
-from forcegp.experiments.reproduction import TRIAL_PRESETS, as_csv, page_of, report
+from forcegp.experiments.reproduction import PRESETS, TRIAL_PRESETS, as_csv, experiments_of, page_of, report
 from forcegp.jobs import Job
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

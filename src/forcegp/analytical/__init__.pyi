@@ -4,7 +4,6 @@ from .identifiability import (
     torque_regressor as torque_regressor,
 )
 from .identification import identify_analytical as identify_analytical, held_out_noise as held_out_noise
-from .least_squares import ROUNDS as ROUNDS
-from .noise_levels import NoiseLevels as NoiseLevels
+from .least_squares import ROUNDS as ROUNDS, NoiseLevels as NoiseLevels
 from .result import AnalyticalIdentification as AnalyticalIdentification
 from .recorded_rows import motion_residuals as motion_residuals, residual_scores as residual_scores

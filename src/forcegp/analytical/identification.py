@@ -11,8 +11,7 @@ import torch
 from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies, thickened
 from forcegp.analytical.identifiability import body_pseudo_inertias
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import Fit, weighted_least_squares
-from forcegp.analytical.noise_levels import NoiseLevels
+from forcegp.analytical.least_squares import Fit, NoiseLevels, weighted_least_squares
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset

@@ -14,8 +14,7 @@ from jaxtyping import Float, Int
 from forcegp.analytical.bodies import BodyCoordinates, FreeBodies, with_bodies, with_joint_dynamics
 from forcegp.analytical.identifiability import UNITS, BaseParameters, body_names, parameter_names
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import Fit, correlation_time
-from forcegp.analytical.noise_levels import NoiseLevels
+from forcegp.analytical.least_squares import Fit, NoiseLevels, correlation_time
 from forcegp.analytical.recorded_rows import RecordedRows, residual_scores
 from forcegp.data import Dataset
 from forcegp.mechanics import (

@@ -163,7 +163,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
             ):
                 longest = (int(start), length)
     start, length = longest
-    if not length or _is_extreme(values, values[start]):
+    if not length or values[start] in (values.min(), values.max()):
         return []
     return [
         Finding(
@@ -176,10 +176,6 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
             numbers={"quantity": name, "row": start, "seconds": length * step},
         )
     ]
-
-
-def _is_extreme(values: np.ndarray, value: float) -> bool:
-    return bool(value in (values.min(), values.max()))
 
 
 def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:

@@ -20,12 +20,8 @@ from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.cli.model_choice import POINTS, resolved_noise
-from forcegp.cli.output_folders import output_folder, require_free_folder
-from forcegp.cli.tables import NONE, columns, number
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
-
-KIND = "forcegp compare"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +63,7 @@ class Compare(LearningOptions):
         if len(self.prior) < 2:
             given = f"only {self.prior[0]}" if self.prior else "none"
             raise InvalidInput(f"--prior names the candidates, and there is {given}; give it twice or more.")
-        if self.out is not None:
-            require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.out)
 
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
@@ -138,7 +133,7 @@ class Compare(LearningOptions):
     def _write(
         self, out: Path, comparison: forcegp.PriorComparison, content: Mapping[str, Any], folders: Mapping[str, str]
     ) -> None:
-        with output_folder(out, KIND, self._given(), overwrite=self.overwrite) as folder:
+        with self.folder(out, self._given()) as folder:
             for name, posterior in comparison.posteriors.items():
                 forcegp.save_posterior(posterior, folder / folders[name])
             write_json(folder / "comparison.json", {**content, "models": dict(folders)})

@@ -14,10 +14,10 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.models
+from forcegp.atomic_files import require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.file_digests import require_unchanged
 
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""

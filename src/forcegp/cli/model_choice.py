@@ -15,7 +15,6 @@ import forcegp.models
 import forcegp.priors
 from forcegp.cli.command import unless_given
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.output_folders import output_folder
 from forcegp.errors import InvalidInput
 
 ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
@@ -37,10 +36,10 @@ class FitOptions(LearningOptions):
     out: Annotated[Path, arg(metavar="RUN")] = field()
     """The folder to write."""
 
-    def _write(self, posterior: forcegp.models.Posterior, kind: str, more: Mapping[str, str] | None = None) -> None:
+    def _write(self, posterior: forcegp.models.Posterior, more: Mapping[str, str] | None = None) -> None:
         """The model, `more` files by name with their text, and how it was made."""
         content = {**self._given(), "resolved": dict(posterior.settings)}
-        with output_folder(self.out, kind, content, overwrite=self.overwrite) as folder:
+        with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
             for name, text in (more or {}).items():
                 (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change

@@ -18,8 +18,7 @@ import forcegp.validation
 from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.syntax import friction_laws
-from forcegp.cli.tables import NONE, columns, number
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
 
 SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")

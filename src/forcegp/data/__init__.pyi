@@ -2,8 +2,10 @@ from .row_selection import (
     time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
     require_disjoint as require_disjoint, train_test_split as train_test_split,
 )
-from .contact_detection import contact_rows as contact_rows, rows_in_contact as rows_in_contact
-from .contact_evidence import ContactDoubt as ContactDoubt, contact_doubts as contact_doubts
+from .contact_evidence import (
+    contact_rows as contact_rows, rows_in_contact as rows_in_contact, ContactDoubt as ContactDoubt,
+    contact_doubts as contact_doubts,
+)
 from .dataset import Dataset as Dataset
 from .delay import Delay as Delay, estimate_delay as estimate_delay
 from .filtering import (

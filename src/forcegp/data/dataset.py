@@ -15,13 +15,14 @@ from typing_extensions import override
 import forcegp.mechanics
 from forcegp.data.dataset_fields import (
     FrozenDict,
+    arrays_of,
     finite_columns,
+    frame_of,
     frozen_json,
     integer_column,
     units_for,
     validated_units,
 )
-from forcegp.data.frames import arrays_of, frame_of
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message, usable_arguments
 from forcegp.summary import Summary, listed, rounded

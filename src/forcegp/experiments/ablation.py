@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians, number
+from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
@@ -65,8 +65,6 @@ class Ablation(Experiment):
                 fit = fit_name(model, self.largest, seed)
                 spec = {"fit": fit, "data": data.name, "seed": seed, "train_seconds": self.data.train_seconds}
                 out.append(Job(_overlap_name(model, seed), f"{TASKS}:overlap", spec, (fit,), 20.0))
-        spec = {**shared, "data": self.data.job(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
-        out.append(Job("ablation/dense", f"{TASKS}:dense", spec, (spec["data"],), 0.5 * self.steps))
         return out
 
     @override
@@ -93,8 +91,7 @@ class Ablation(Experiment):
             other = medians(fits, ("mae", "mae_noise_free"))
             overlap[model] = medians(jobs, ("mae", "mae_noise_free", "shared"))
             overlap[model] |= {f"{name}_other": each for name, each in other.items()}
-        summary = {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
-        return summary | {"dense": results.result("ablation/dense")}
+        return {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
 
     @staticmethod
     def _scores(jobs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -114,7 +111,7 @@ class Ablation(Experiment):
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        parts = (self._search_text, self._dense_text, self._filter_text, self._overlap_text, self._floor_text)
+        parts = (self._search_text, self._filter_text, self._overlap_text, self._floor_text)
         return "\n\n".join(part(summary) for part in parts)
 
     def _search_text(self, summary: Mapping[str, Any]) -> str:
@@ -139,19 +136,6 @@ class Ablation(Experiment):
             + markdown_table(["model", "paper", *columns.values()], rows)
             + "\n\nNegative log likelihood that each plain search reached (lower is better):\n\n"
             + markdown_table(["model", *SCHEDULES.values()], likelihoods)
-        )
-
-    def _dense_text(self, summary: Mapping[str, Any]) -> str:
-        dense = summary["dense"]
-        share = dense["ours_seconds"] / dense["dense_seconds"]
-        return (
-            f"**What does convergence cost?** S-GP, N = {self.largest}, in one process, in CPU seconds: "
-            f"{dense['steps']} steps of Adam in the dense formulation of the paper (7N × 7N covariance, two LU "
-            f"factorisations, autograd) take {dense['dense_seconds']:.0f} s and end at a negative log likelihood of "
-            f"{dense['dense_nll']:.1f}; our search takes {dense['ours_seconds']:.1f} s "
-            f"({dense['ours_status']}) and ends at {dense['ours_nll']:.1f}: {share:.3f} of the time. Both are plain "
-            "maximum likelihood; value and gradients of both formulations agree to "
-            f"{number(dense['gradient_difference'])} at the start."
         )
 
     def _filter_text(self, summary: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from forcegp.models import IndependentGP, StructuredGP, save_posterior
 from forcegp.models.structured.components import term_slices
 from forcegp.priors import ContactFriction, JointFriction, named_prior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.simulation.friction_laws import DryFriction, ViscousFriction
+from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
 from forcegp.simulation.kuka_motion import joint_friction_of, tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]

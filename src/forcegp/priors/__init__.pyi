@@ -1,7 +1,9 @@
 from .contact_friction import ContactFriction as ContactFriction
 from .force_prior import ForcePrior as ForcePrior, Scaling as Scaling, SumPrior as SumPrior
-from .joint_forces import JointAccelerations as JointAccelerations, JointForces as JointForces, NoForces as NoForces
-from .per_joint import JointFriction as JointFriction, PeriodicJointForces as PeriodicJointForces
+from .joint_forces import (
+    JointAccelerations as JointAccelerations, JointForces as JointForces, NoForces as NoForces,
+    JointFriction as JointFriction, PeriodicJointForces as PeriodicJointForces,
+)
 from .kernels import KERNELS as KERNELS, kernel_of as kernel_of
 from .named import (
     NAMED_PRIORS as NAMED_PRIORS, NamedPrior as NamedPrior, named_prior as named_prior, PRIORS as PRIORS,

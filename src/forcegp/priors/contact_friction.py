@@ -14,9 +14,8 @@ from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.expected_friction import ExpectedFriction, TabulatedCurve
 from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling, SumPrior
-from forcegp.priors.joint_forces import chosen_inputs
+from forcegp.priors.joint_forces import JointFriction, chosen_inputs, joint_indices
 from forcegp.priors.kernels import check_kernel
-from forcegp.priors.per_joint import JointFriction, joint_indices
 from forcegp.priors.tool_forces import (
     ToolPoint,
     contact_axes,

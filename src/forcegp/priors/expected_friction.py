@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.priors.per_joint import joint_indices
+from forcegp.priors.joint_forces import joint_indices
 from forcegp.priors.tool_forces import ToolPoint
 
 SMALLEST_SHARE = 0.1

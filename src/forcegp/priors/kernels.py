@@ -21,8 +21,10 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.priors.basic_kernels import (
     LOG_VARIANCE_SPREAD,
+    SmoothSignKernel,
     constant,
     float64,
+    friction,
     linear,
     matern,
     periodic,
@@ -32,7 +34,6 @@ from forcegp.priors.basic_kernels import (
     squared_exponential_kernel,
 )
 from forcegp.priors.deep_kernel import deep
-from forcegp.priors.friction_kernel import SmoothSignKernel, friction
 
 KernelFactory = Callable[[int, Tensor | float], Kernel]
 """Called with the number of features and the start variance of the function; returns a fresh float64 kernel."""

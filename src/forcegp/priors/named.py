@@ -13,10 +13,9 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.stored_objects import object_from_dict
 from forcegp.priors.contact_friction import ContactFriction
 from forcegp.priors.force_prior import ForcePrior, SumPrior
-from forcegp.priors.joint_forces import JointAccelerations, JointForces, NoForces
+from forcegp.priors.joint_forces import JointAccelerations, JointForces, JointFriction, NoForces, PeriodicJointForces
 from forcegp.priors.kernels import KERNELS
 from forcegp.priors.payload import Payload
-from forcegp.priors.per_joint import JointFriction, PeriodicJointForces
 from forcegp.priors.tool_forces import ToolForces
 
 PRIORS: dict[str, type[ForcePrior]] = {

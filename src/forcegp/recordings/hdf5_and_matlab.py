@@ -96,7 +96,7 @@ class MatlabHDF5(HDF5Arrays):
             cells = [name for name, item in named if item.attrs.get("MATLAB_class", b"") == b"cell"]
         if cells and not arrays:
             raise _cell(self.path, cells[0])
-        return {name: _as_rows(shape) for name, shape in arrays.items()}
+        return {name: (shape[1], 1) if _is_row(shape) else shape for name, shape in arrays.items()}
 
     @override
     def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
@@ -164,10 +164,6 @@ def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:
 
 def _is_row(shape: tuple[int, ...]) -> bool:
     return len(shape) == 2 and shape[0] == 1 and shape[1] > 1
-
-
-def _as_rows(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (shape[1], 1) if _is_row(shape) else shape
 
 
 def _cell(path: Path, name: str) -> FileFormatError:

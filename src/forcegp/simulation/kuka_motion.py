@@ -12,17 +12,20 @@ from jaxtyping import Bool, Float
 
 from forcegp.errors import MissingExtra, RobotModelError, SimulationError
 from forcegp.simulation.bullet import BulletArm
-from forcegp.simulation.contact_forces import ArmState, BulletContact, IdealContact, NoContact, with_tool_sphere
-from forcegp.simulation.friction_laws import (
+from forcegp.simulation.contact_forces import (
+    ArmState,
+    BulletContact,
     DryFriction,
+    IdealContact,
     JointStribeckFriction,
+    NoContact,
     PointFriction,
     RoughPatch,
     ViscousFriction,
+    with_tool_sphere,
 )
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
-from forcegp.simulation.tables import Table, table_of
-from forcegp.simulation.trajectory import PathOverTable, TaskSpaceController
+from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"

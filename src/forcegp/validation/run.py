@@ -125,7 +125,7 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
     for level in (0.5, 0.95):
         place = levels.index(level)
         name = f"coverage_{round(100 * level)}"
-        out[name] = _covered(results, place)
+        out[name] = median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
         out[f"{name}_per_joint"] = _per_joint(results, lambda result, place=place: result["coverage"][place])
     out["calibration"] = {
         "levels": levels,
@@ -136,10 +136,6 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
     }
     out["motions"] = _motions([result["motions"] for result in results])
     return out
-
-
-def _covered(results: Sequence[Result], place: int) -> dict[str, Any] | None:
-    return median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
 
 
 def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:

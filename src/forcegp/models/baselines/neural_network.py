@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, fit_settings, inputs
+from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, inputs
 from forcegp.models.noise import Noise
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
@@ -219,11 +219,7 @@ class NeuralNetwork(NetworkModel):
             evaluations=self.steps,
             cpu_seconds=time.process_time() - start_time,
         )
-        fitted = replace(self, noise=self.resolved_noise(rows))
-        numbers = {name: getattr(self, name) for name in ("width", "steps", "batch", "rate")}
-        return fitted.condition(
-            training, parameters, result, fit_settings(rows, dataset, seed, fitted.noise, **numbers)
-        )
+        return self.trained(rows, dataset, training, seed, result)
 
     def _descend(
         self, weights: dict[str, Tensor], x: Tensor, a: Tensor, generator: torch.Generator, progress: FitProgress | None
