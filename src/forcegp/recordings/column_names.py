@@ -135,8 +135,11 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     return bool(words & WORDS[signal])
 
 
-NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-WORD = re.compile(r"[^\s+*/`]+")
+WORD_ENDS = r"(?!\w)"
+FACTOR = (
+    r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?))(?!\w)|(?P<pi>pi)(?!\w)"
+    r"|(?P<word>[^\s+*/`]+)"
+)
 NAME_LETTER = re.compile(r"\w")
 
 
@@ -178,35 +181,29 @@ def parse_expression(text: str, columns: Collection[str], owner: str) -> LinearE
 
 
 class _Parser:
+    """What is left of the text is `rest`, without blanks before it."""
+
     def __init__(self, text: str, columns: Collection[str], owner: str) -> None:
-        self.text = text
-        self.columns = columns
-        self.owner = owner
-        self.longest_first = sorted(columns, key=len, reverse=True)
-        self.position = 0
+        self.text, self.columns, self.owner = text, columns, owner
+        self.rest = text.lstrip()
+        longest_first = sorted(columns, key=len, reverse=True)
+        names = "|".join(re.escape(name) + (WORD_ENDS if NAME_LETTER.match(name[-1]) else "") for name in longest_first)
+        self.factor = re.compile(FACTOR % names)
 
     def expression(self) -> LinearExpression:
-        weights: dict[str, float] = {}
-        constant = 0.0
+        weights: dict[str | None, float] = {}  # None: the constant
         sign = 1.0
         self._taken("+")
-        while True:
+        while sign:
             name, factor = self._term()
-            if name is None:
-                constant += sign * factor
-            else:
-                weights[name] = weights.get(name, 0.0) + sign * factor
-            if self._taken("+"):
-                sign = 1.0
-            elif self._taken("-"):
-                sign = -1.0
-            elif self._rest() == "":
-                break
-            else:
-                raise self._wrong("expected + or -")
-        if not math.isfinite(constant) or not all(math.isfinite(weight) for weight in weights.values()):
+            weights[name] = weights.get(name, 0.0) + sign * factor
+            sign = 1.0 if self._taken("+") else -1.0 if self._taken("-") else 0.0
+        if self.rest:
+            raise self._wrong("expected + or -")
+        if not all(math.isfinite(weight) for weight in weights.values()):
             raise InvalidInput(f"{self.text!r} has a number that is not finite.")
-        return LinearExpression({name: weight for name, weight in weights.items() if weight != 0.0}, constant)
+        constant = weights.pop(None, 0.0)
+        return LinearExpression({name: weight for name, weight in weights.items() if name and weight != 0.0}, constant)
 
     def _term(self) -> tuple[str | None, float]:
         sign = -1.0 if self._taken("-") else 1.0
@@ -227,47 +224,26 @@ class _Parser:
                 return name, value
 
     def _factor(self) -> tuple[str | None, float]:
-        rest = self._rest()
-        if rest.startswith("`"):
-            end = rest.find("`", 1)
-            if end < 0:
-                raise self._wrong("a backtick without its partner")
-            return self._column(rest[1:end], end + 1), 1.0
-        for name in self.longest_first:
-            if rest.startswith(name) and not (NAME_LETTER.match(rest[len(name) :]) and NAME_LETTER.match(name[-1])):
-                return self._column(name, len(name)), 1.0
-        number = NUMBER.match(rest)
-        if number and not NAME_LETTER.match(rest[number.end() :]):
-            self.position += number.end()
-            return None, float(number[0])
-        if rest.startswith("pi") and not NAME_LETTER.match(rest[2:]):
-            self.position += 2
-            return None, math.pi
-        word = WORD.match(rest)
-        if not word:
-            raise self._wrong("expected a column or a number")
-        return self._column(word[0], len(word[0])), 1.0
-
-    def _column(self, name: str, length: int) -> str:
-        if name not in self.columns:
-            where = "" if name == self.text else f" (in {self.text!r})"
-            raise InvalidInput(unknown_name_message("column", name, f"{self.owner}{where}", self.columns))
-        self.position += length
-        return name
-
-    def _rest(self) -> str:
-        while self.text[self.position : self.position + 1].isspace():
-            self.position += 1
-        return self.text[self.position :]
+        found = self.factor.match(self.rest)
+        if found is None or found.lastgroup is None:
+            backtick = self.rest.startswith("`")
+            raise self._wrong("a backtick without its partner" if backtick else "expected a column or a number")
+        kind, word = found.lastgroup, found[found.lastgroup]
+        self.rest = self.rest[found.end() :].lstrip()
+        if kind in ("number", "pi"):
+            return None, float(word) if kind == "number" else math.pi
+        if word not in self.columns:
+            where = "" if word == self.text else f" (in {self.text!r})"
+            raise InvalidInput(unknown_name_message("column", word, f"{self.owner}{where}", self.columns))
+        return word, 1.0
 
     def _taken(self, sign: str) -> bool:
-        if not self._rest().startswith(sign):
-            return False
-        self.position += 1
-        return True
+        taken = self.rest.startswith(sign)
+        self.rest = self.rest[1:].lstrip() if taken else self.rest
+        return taken
 
     def _wrong(self, why: str) -> InvalidInput:
         return InvalidInput(
-            f"{self.text!r} is not a linear combination of columns: {why} at {self._rest()[:20]!r}. "
+            f"{self.text!r} is not a linear combination of columns: {why} at {self.rest[:20]!r}. "
             "For example: theta2 - theta1, 0.5*`a-b` + pi/2."
         )
