@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Generator, Hashable
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ def connected(address: str | None, jobs: int | None) -> Any:
 
 
 @contextmanager
-def _without_notices() -> Iterator[None]:
+def _without_notices() -> Generator[None, None, None]:
     """Without the note that Ray prints at every start of a cluster; errors are printed as ever."""
     logger = logging.getLogger("ray")
     before = logger.level

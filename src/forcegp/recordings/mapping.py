@@ -190,14 +190,14 @@ OF_FOLDER = "forcegp.yaml"
 class _OnceLoader(yaml.SafeLoader):
     """Safe YAML in which no key may stand twice and nothing may refer to something else."""
 
-    def compose_node(self, parent, index):
+    def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):
             raise yaml.constructor.ConstructorError(
                 None, None, "aliases (*name) are not read", self.peek_event().start_mark
             )
         return super().compose_node(parent, index)
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
         repeated = [key for key in keys if keys.count(key) > 1]
         if repeated:
