@@ -89,6 +89,19 @@ class Command(ABC):
                         f"{path} would be written over {other}, which this command {does}; choose another name."
                     )
 
+    def words(self, *names: str) -> list[str]:
+        """The options of these names that are not left at their defaults, as words of a command."""
+        words: list[str] = []
+        for name in names:
+            given, flag = getattr(self, name), f"--{name.replace('_', '-')}"
+            if given is False and getattr(type(self), name):
+                words.append(f"--no-{flag[2:]}")
+            elif given != getattr(type(self), name):
+                for each in given if isinstance(given, tuple) else (given,):
+                    text = f"{each:g}" if isinstance(each, float) else str(each)
+                    words += [f"{flag}={text}"] if name == "gravity" else [flag, text]  # it may begin with a minus
+        return words
+
     @property
     def kind(self) -> str:
         """The command as people write it, by which folders that it wrote are recognised."""

@@ -19,6 +19,7 @@ from forcegp.cli.command import IDENTIFIED, URDF, Command, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
+ROBOT_OPTIONS = ("robot", "inertias", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""
 
@@ -87,19 +88,6 @@ class RobotOptions(Command):
         if found is not None:
             return found
         return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
-
-    def robot_words(self) -> list[str]:
-        """The options that chose the robot, as words of a command that is to work with the same one."""
-        words = [] if self.robot is None else ["--robot", str(self.robot)]
-        words += [] if self.inertias == "strict" else ["--inertias", self.inertias]
-        words += [
-            word
-            for name, given in (("lock", self.lock), ("armature", self.armature))
-            for value in given
-            for word in (f"--{name}", value)
-        ]
-        words += [] if self.gravity is None else [f"--gravity={self.gravity}"]
-        return words + ([] if self.identified is None else ["--identified", str(self.identified)])
 
     def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
         """A robot from a URDF file, or from the recorded one's text, with what the options change."""

@@ -16,7 +16,7 @@ import forcegp
 import forcegp.checks
 import forcegp.data
 from forcegp.cli.command import DATASET, BackendOptions, unless_given
-from forcegp.cli.input_options import RobotOptions
+from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.syntax import parse_contacts
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ContactError, ContactWarning
@@ -139,7 +139,7 @@ class LearningOptions(BackendOptions, RobotOptions):
             found = forcegp.checks.quick_check(*looked_at)
             used = [each for each in found if accelerations or each.subject not in ("acceleration", "noise_std")]
             # check has no --contact: it would find nothing wrong with the contacts of the data
-            line = findings_in_one_line(used, self.data, self.robot_words(), advise=bool(self.contact))
+            line = findings_in_one_line(used, self.data, self.words(*ROBOT_OPTIONS), advise=bool(self.contact))
             if line is not None:
                 terminal.warn(line)
         warnings.simplefilter("ignore", ContactWarning)
@@ -153,12 +153,6 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.known_force:
             system = _with_known_forces(system, self.known_force)
         return system
-
-    def system_words(self) -> list[str]:
-        """The options that chose the system, as words of a command that is to work with the same one."""
-        words = self.robot_words()
-        words += [word for value in self.contact for word in ("--contact", value)]
-        return words + [word for value in self.known_force for word in ("--known-force", value)]
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
         """The rows to learn from, and a note to print after the fit."""

@@ -161,7 +161,21 @@ class Terminal:
         if self.err.is_terminal:
             yield from self._bar(what, may_end_early)
         else:
-            yield _PlainProgress(self, what, may_end_early).report
+            yield self._lines(what, may_end_early)
+
+    def _lines(self, what: str, may_end_early: bool) -> ProgressCallback:
+        """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
+        start = reported = time.monotonic()
+
+        def report(done: int, total: int, note: str = "") -> None:
+            nonlocal reported
+            now = time.monotonic()
+            if now - reported >= PLAIN_SECONDS and done < total:
+                reported = now
+                parts = [f"{done / total:.0%}", _remaining(now - start, done, total, may_end_early), note]
+                self.note(f"{what}: {', '.join(part for part in parts if part)}")
+
+        return report
 
     def _bar(self, what: str, may_end_early: bool) -> Iterator[ProgressCallback]:
         columns = (
@@ -190,24 +204,6 @@ def _columns_needed(console: Console, renderable: RenderableType) -> int:
     folded = [column for column in renderable.columns if not column.no_wrap]
     names = [Measurement.get(console, wide, cell).maximum for column in folded for cell in column.cells]
     return Measurement.get(console, wide, renderable).maximum - max(0, max(names, default=0) - FOLDED)
-
-
-class _PlainProgress:
-    """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
-
-    def __init__(self, terminal: Terminal, what: str, may_end_early: bool) -> None:
-        self.terminal = terminal
-        self.what = what
-        self.may_end_early = may_end_early
-        self.start = self.reported = time.monotonic()
-
-    def report(self, done: int, total: int, note: str = "") -> None:
-        now = time.monotonic()
-        if now - self.reported < PLAIN_SECONDS or done >= total:
-            return
-        self.reported = now
-        parts = [f"{done / total:.0%}", _remaining(now - self.start, done, total, self.may_end_early), note]
-        self.terminal.note(f"{self.what}: {', '.join(part for part in parts if part)}")
 
 
 def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> str:
