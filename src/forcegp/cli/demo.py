@@ -31,10 +31,7 @@ SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so 
 MODELS = {"S-GP": ("s-gp", "zero"), "S-GP + analytical mean": ("s-gp-analytical-mean", "analytical")}
 """Name in the paper -> (folder, mean)."""
 
-PUBLISHED_MAE = {
-    name: dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[place], strict=True))
-    for name, place in (("S-GP", "s-gp"), ("S-GP + analytical mean", "s-gp-mean"))
-}
+PUBLISHED_MAE = dict(zip(MODELS, (published.FIG2B_MAE["s-gp"], published.FIG2B_MAE["s-gp-mean"]), strict=True))
 """Mean absolute error against noisy accelerations by number of points."""
 
 

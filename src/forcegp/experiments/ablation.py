@@ -11,7 +11,7 @@ from typing_extensions import override
 from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_cost, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
 
@@ -28,7 +28,6 @@ class Ablation(Experiment):
     name: ClassVar[str] = "ablation"
     title: ClassVar[str] = "What the paper leaves unclear, measured"
 
-    data: DataSettings
     points: tuple[int, ...]
     seeds: tuple[int, ...]
     settings: FitSettings
@@ -116,11 +115,12 @@ class Ablation(Experiment):
 
     def _search_text(self, summary: Mapping[str, Any]) -> str:
         columns = {OURS: "ours", **SCHEDULES}
-        place = dict(zip(published.FIG2B_POINTS, range(len(published.FIG2B_POINTS)), strict=True)).get(self.largest)
         rows = []
         for model, variants in summary["schedules"].items():
-            paper = "–" if place is None else f"{published.FIG2B_MAE[model][place]:.4f}"
-            rows.append([MODELS[model].label, paper, *(formatted(variants[name]["mae"]) for name in columns)])
+            paper = published.FIG2B_MAE[model].get(self.largest)
+            rows.append(
+                [MODELS[model].label, formatted(paper), *(formatted(variants[name]["mae"]) for name in columns)]
+            )
         likelihoods = [
             [MODELS[model].label, *(formatted(variants[name]["nll"], 0) for name in SCHEDULES)]
             for model, variants in summary["schedules"].items()

@@ -77,7 +77,9 @@ def _draw_published(axes: Axes, summary: Mapping[str, Any], score: str) -> None:
     curves = {"mae": published.FIG2B_MAE, "constraint_error": published.FIG2B_CONSTRAINT_ERROR}.get(score, {})
     for model, values in curves.items():
         if model in summary["curves"]:
-            axes.plot(published.FIG2B_POINTS, values, color=COLORS[model], linestyle="--", linewidth=1.0, alpha=0.8)
+            axes.plot(
+                list(values), list(values.values()), color=COLORS[model], linestyle="--", linewidth=1.0, alpha=0.8
+            )
 
 
 ESTIMATES = (

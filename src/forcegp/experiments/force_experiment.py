@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
 from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, median_and_range, medians
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.jobs import Job, JobStore
 
@@ -89,7 +89,6 @@ class Trial:
 class ForceExperiment(Experiment):
     """Trials on seeds; a subclass defines the trials and describes the results."""
 
-    data: DataSettings
     points: tuple[int, ...]
     seeds: tuple[int, ...]
     settings: FitSettings

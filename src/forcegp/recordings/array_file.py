@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
+import re
 import zipfile
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
@@ -123,16 +124,8 @@ def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
     """So that demo_10 comes after demo_9."""
-    parts, digits = [], ""
-    for letter in name + "\0":
-        if letter.isdigit():
-            digits += letter
-            continue
-        if digits:
-            parts.append((0, int(digits), ""))
-            digits = ""
-        parts.append((1, 0, letter))
-    return parts
+    parts = re.findall(r"\d+|\D", name)
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def _some(names: list[str]) -> str:
