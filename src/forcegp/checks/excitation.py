@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from forcegp.analytical.identifiability import base_parameters, excitation
-from forcegp.checks.check_input import CheckInput
-from forcegp.checks.findings import Finding, listed, look, ok, plain
+from forcegp.checks.check_input import CheckInput, Finding, listed, look, ok, plain
 from forcegp.checks.successive_rows import white_noise
 from forcegp.errors import InvalidInput
 

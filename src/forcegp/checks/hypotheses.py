@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.check_input import DEGREE, CheckInput
-from forcegp.checks.findings import Finding, listed, wrong
+from forcegp.checks.check_input import DEGREE, CheckInput, Finding, listed, wrong
 from forcegp.checks.torques import (
     Correction,
     TorqueFit,

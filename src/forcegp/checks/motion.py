@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, GAP, CheckInput
-from forcegp.checks.findings import Finding, listed, look, ok
+from forcegp.checks.check_input import DEGREE, GAP, CheckInput, Finding, listed, look, ok
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput
+from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, plain, worst
 from forcegp.checks.excitation import (
     excitation_findings,
     noise_findings,
@@ -15,7 +15,6 @@ from forcegp.checks.excitation import (
     stated_noise_findings,
     torque_noise,
 )
-from forcegp.checks.findings import SEVERITIES, Finding, Severity, listed, look, plain, worst
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings, sampling_findings
 from forcegp.checks.parameters import parameter_findings

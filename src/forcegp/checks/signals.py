@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput
-from forcegp.checks.findings import Finding, listed, look, wrong
+from forcegp.checks.check_input import CheckInput, Finding, listed, look, wrong
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.findings import Finding, listed, plain
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, plain
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH

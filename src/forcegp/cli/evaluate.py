@@ -15,7 +15,7 @@ import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
 from forcegp.cli.input_options import SystemChoice, carried_over
-from forcegp.cli.syntax import parse_contacts
+from forcegp.cli.learning_options import parse_contacts
 from forcegp.cli.terminal import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,

@@ -21,8 +21,8 @@ from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.fit import fit_summary, fit_with_progress
 from forcegp.cli.input_options import SYSTEM_FILE
+from forcegp.cli.learning_options import friction_laws, parse_learn, with_learned_forces
 from forcegp.cli.model_choice import FitOptions, resolved_noise
-from forcegp.cli.syntax import friction_laws, parse_learn, with_learned_forces
 from forcegp.cli.terminal import NONE, Terminal, columns, with_option_names
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 

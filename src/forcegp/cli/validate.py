@@ -17,7 +17,7 @@ import forcegp
 import forcegp.validation
 from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
-from forcegp.cli.syntax import friction_laws
+from forcegp.cli.learning_options import friction_laws
 from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
 

@@ -1,3 +1,2 @@
 from .job import Job as Job, digests as digests, code_digest as code_digest
-from .running import Progress as Progress, run_jobs as run_jobs
-from .store import JobStore as JobStore
+from .running import Progress as Progress, run_jobs as run_jobs, JobStore as JobStore

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from forcegp.checks.findings import plain
+from forcegp.checks.check_input import plain
 from forcegp.data import Dataset, time_blocks
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
