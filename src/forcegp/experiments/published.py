@@ -11,7 +11,9 @@ _MAE = {
     "s-gp": (0.5856, 0.2092, 0.1193, 0.1049, 0.1006, 0.0977),
     "s-gp-mean": (0.1051, 0.0936, 0.0868, 0.0855, 0.0847, 0.0844),
 }
-FIG2B_MAE = {model: dict(zip(FIG2B_POINTS, values, strict=True)) for model, values in _MAE.items()}
+FIG2B_MAE: dict[str, dict[int, float]] = {
+    model: dict(zip(FIG2B_POINTS, values, strict=True)) for model, values in _MAE.items()
+}
 """Mean absolute error against noisy accelerations [rad/s^2], mean over the joints, by number of training points."""
 
 FIG2B_CONSTRAINT_ERROR = {

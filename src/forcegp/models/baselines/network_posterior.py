@@ -83,7 +83,8 @@ class NetworkModel(Model):
         noise = self.resolved_noise(rows)
         settings = described_rows(rows, dataset) | {"seed": seed, "noise": None if noise is None else noise.to_dict()}
         settings |= {name: value for name, value in vars(self).items() if name not in ("system", "noise")}
-        return replace(self, noise=noise).condition(training, result.parameters, result, settings)
+        fitted = replace(self, noise=noise)  # type: ignore[type-var]  # every network is a dataclass
+        return fitted.condition(training, result.parameters, result, settings)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
