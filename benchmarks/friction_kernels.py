@@ -23,9 +23,7 @@ from forcegp.errors import NumericalWarning
 from forcegp.evaluation import evaluate
 from forcegp.models import StructuredGP
 from forcegp.priors import KERNELS, ContactFriction, kernel_of
-from forcegp.priors.friction_kernel import SmoothSignKernel
-from forcegp.priors.kernel_parameters import float64
-from forcegp.priors.weight_kernels import linear
+from forcegp.priors.basic_kernels import SmoothSignKernel, float64, linear
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 POINTS, SEEDS = 200, (401, 402)

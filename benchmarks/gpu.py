@@ -31,7 +31,7 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
-from forcegp.jobs.machine import machine
+from forcegp.jobs.job import machine
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.robots.devices import usable_device

@@ -19,7 +19,7 @@ from forcegp import KukaSurfaceConfig, StructuredGP, simulate_kuka_surface
 from forcegp.errors import NumericalWarning
 from forcegp.inference import OptimizerOptions
 from forcegp.robots import parameters_from_physical
-from forcegp.simulation.kuka_description import TOOL_LINK
+from forcegp.simulation.kuka_motion import TOOL_LINK
 
 F64 = torch.float64
 TOO_HEAVY = 0.5

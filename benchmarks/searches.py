@@ -18,7 +18,7 @@ from pathlib import Path
 from benchmarks.large_data import recording
 from forcegp import Dataset, StructuredGP
 from forcegp.data import farthest_rows
-from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS
 from forcegp.priors import named_prior
 
 SEEDS = (11, 12, 13, 14, 15)

@@ -40,7 +40,7 @@ from forcegp.data import (
     units_for,
 )
 from forcegp.errors import DataWarning, NumericalWarning
-from forcegp.evaluation.recorded_segments import RecordedMotions, recorded_motions
+from forcegp.evaluation.rollout_scores import RecordedMotions, recorded_motions
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, RotorInertia
 from forcegp.models import Noise, StructuredGP, StructuredPosterior
 from forcegp.models.structured.marginal_likelihood import Mean

@@ -10,7 +10,7 @@ import pytest
 from tests.cli.in_process import run_here
 from tests.examples import run_example
 
-from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.main import parse_arguments
 
 
 def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):

@@ -6,9 +6,15 @@ import torch
 from tests.models.arm import URDF
 from tests.robots.robot_models import TREE
 
-from forcegp.analytical.bodies import ConsistentBodies, FreeBodies, upper_cholesky
-from forcegp.analytical.identified_robot import thickened, with_bodies, with_joint_dynamics
-from forcegp.analytical.regressor import body_pseudo_inertias, standard_parameters
+from forcegp.analytical.bodies import (
+    ConsistentBodies,
+    FreeBodies,
+    thickened,
+    upper_cholesky,
+    with_bodies,
+    with_joint_dynamics,
+)
+from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
 from forcegp.errors import NonPhysicalInertia
 from forcegp.models.structured.objective import squared_distance
 from forcegp.robots import Robot

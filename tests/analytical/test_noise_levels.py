@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forcegp.analytical.noise_levels import NoiseLevels
+from forcegp.analytical.least_squares import NoiseLevels
 
 ACCELERATION, FORCE = np.array([0.5, 2.0]), np.array([0.3, 0.1])
 

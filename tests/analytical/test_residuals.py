@@ -8,9 +8,9 @@ import torch
 from tests.models.arm import arm_system
 
 from forcegp.analytical.bodies import ConsistentBodies
+from forcegp.analytical.identifiability import body_pseudo_inertias
 from forcegp.analytical.identification import joint_terms
 from forcegp.analytical.recorded_rows import RecordedRows
-from forcegp.analytical.regressor import body_pseudo_inertias
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import (
     Armature,

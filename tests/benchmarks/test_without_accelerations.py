@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from benchmarks.without_accelerations import Source, Targets, coarse, fitted, multiarm
 
-from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.main import parse_arguments
 from forcegp.data import WeakForm
 from forcegp.errors import NumericalWarning
 

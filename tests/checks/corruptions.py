@@ -15,7 +15,7 @@ import torch
 from tests.checks.logs import column, exchanged
 
 from forcegp.checks import check, quick_check
-from forcegp.cli.findings_line import findings_in_one_line
+from forcegp.cli.learning_options import findings_in_one_line
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.mechanics import Contact, MechanicalSystem, Plane

@@ -6,9 +6,9 @@ import shlex
 import pytest
 from tests.examples import run_example
 
-from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.check import Check
 from forcegp.cli.import_log import Import
+from forcegp.cli.main import parse_arguments
 from forcegp.cli.prepare import Prepare
 
 

@@ -25,7 +25,7 @@ from tests.checks.corruptions import (
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.parameters import parameter_findings
-from forcegp.cli.findings_line import findings_in_one_line
+from forcegp.cli.learning_options import findings_in_one_line
 
 ONLY_CHECK = ("coarse positions",)
 """What a fit does not mention: real encoders are coarse."""

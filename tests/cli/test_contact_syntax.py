@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts
+from forcegp.cli.learning_options import EXAMPLE, parse_contact, parse_contacts
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
 

@@ -13,9 +13,8 @@ import pytest
 from tests.cli.one_line import assert_refused
 from tests.models.arm import URDF, arm_data, arm_system
 
-from forcegp.cli.arguments import one_line
 from forcegp.cli.fit import _report
-from forcegp.cli.main import main
+from forcegp.cli.main import main, one_line
 from forcegp.cli.terminal import Terminal
 from forcegp.data import Dataset, units_for
 from forcegp.mechanics import MechanicalSystem

@@ -15,7 +15,7 @@ from tests.models.arm import arm_data
 from tests.recordings.log_files import motion, table, write_text
 from tests.validation.moving_arm import moving_arm
 
-from forcegp.cli.arguments import COMMANDS
+from forcegp.cli.main import COMMANDS
 
 QUICK = ("--points", 8, "--iterations", 2, "--restarts", 1)
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 from tests.models.arm import arm_data
 
-from forcegp.cli.arguments import COMMANDS, parse_arguments
-from forcegp.cli.option_names import OTHERWISE, with_option_names
+from forcegp.cli.main import COMMANDS, parse_arguments
+from forcegp.cli.terminal import OTHERWISE, with_option_names
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.models import StructuredGP
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|`?ray [a-z]+|xcode-select|start one with)[^;)`]* --[a-z]")
-ALLOWED = {"parallel/connection.py": "--port and --address of ray"}
+ALLOWED = {"parallel/cluster.py": "--port and --address of ray"}
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,8 @@ from tests.models.arm import URDF, arm_data
 
 import forcegp
 from forcegp import Dataset, load_posterior
-from forcegp.atomic_files import atomic_folder
+from forcegp.atomic_files import atomic_folder, write_digests
 from forcegp.cli.main import main
-from forcegp.file_digests import write_digests
 
 QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
 IMPORT = "import log.csv --time time --q q_a --u u_a --joints a"

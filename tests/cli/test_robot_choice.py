@@ -10,8 +10,8 @@ import pytest
 from tests.models.arm import URDF, arm_data, arm_system
 from tests.robots.test_nearest_inertia import BROKEN
 
-from forcegp.cli.arguments import parse_arguments
-from forcegp.cli.robot_options import SYSTEM_FILE
+from forcegp.cli.input_options import SYSTEM_FILE
+from forcegp.cli.main import parse_arguments
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError, NonPhysicalInertia
 from forcegp.mechanics import CoulombJointFriction

@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from forcegp import Dataset, load_posterior
-from forcegp.file_digests import require_unchanged
+from forcegp.atomic_files import require_unchanged
 
 FEW = "--points 10 --iterations 3 --restarts 1"
 VALIDATE = "--split blocks:5:3 --models analytical --seeds 1 --points 10 --starts 1 --horizon 0.02"

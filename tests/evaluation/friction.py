@@ -11,7 +11,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import StructuredGP, StructuredPosterior
 from forcegp.priors import ForcePrior
-from forcegp.priors.tool_point import ToolPoint
+from forcegp.priors.tool_forces import ToolPoint
 
 VISCOUS = 2.0
 """N/(m/s) at the tool."""

@@ -76,7 +76,7 @@ def test_components_are_scored_against_the_parts_of_the_truth(friction, data):
 
 def test_blocks_of_rows_join_seamlessly(friction, data, monkeypatch):
     whole = force_scores(friction, data)
-    monkeypatch.setattr(sys.modules["forcegp.evaluation.force_errors"], "ROWS_PER_BLOCK", 7)
+    monkeypatch.setattr(sys.modules["forcegp.evaluation.predicted_rows"], "ROWS_PER_BLOCK", 7)
     parts = force_scores(friction, data)
     for name, score in whole.joint_force.items():
         assert parts.joint_force[name].mae == pytest.approx(score.mae, rel=1e-9)

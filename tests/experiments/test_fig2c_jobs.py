@@ -7,7 +7,7 @@ from tests.experiments.oracle import Tool
 
 from forcegp.experiments.fig2c import _found_at
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, CENTER_OFFSET, MASS_BOUND, MASS_OFFSET, wrong_system
-from forcegp.simulation.kuka_description import TOOL_LINK
+from forcegp.simulation.kuka_motion import TOOL_LINK
 
 
 def bodies(system) -> dict[str, pin.Inertia]:

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from forcegp.data import farthest_rows
-from forcegp.experiments.fits import FitSettings, fit_series, fitted
-from forcegp.experiments.model_names import MODELS, NETWORKS
+from forcegp.experiments.fits import MODELS, NETWORKS, FitSettings, fit_series, fitted
 
 SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, tolerance={"0": 1e-6, "400": 1e-5})
 

@@ -107,7 +107,7 @@ def test_black_boxes_are_scored_on_accelerations_alone(rubbing):
 
 
 def test_curves_are_held_against_their_laws(rubbing):
-    from forcegp.experiments.true_curves import true_curves
+    from forcegp.experiments.force_jobs import true_curves
 
     posterior, _ = rubbing
     found, laws = force_jobs.curve_scores(posterior), true_curves(posterior)

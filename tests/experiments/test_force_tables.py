@@ -8,10 +8,16 @@ from tests.experiments.stored_jobs import keep
 from forcegp.evaluation.summary_statistics import median_and_range
 from forcegp.experiments.experiment import DataSettings
 from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.force_experiment import TEST_SEED, ForceExperiment, Trial, trial_name
-from forcegp.experiments.force_tables import dots_figure, only_test, score_table
-from forcegp.experiments.transfer import Transfer
-from forcegp.experiments.unilateral_contact import UnilateralContact
+from forcegp.experiments.force_experiment import (
+    TEST_SEED,
+    ForceExperiment,
+    Trial,
+    dots_figure,
+    only_test,
+    score_table,
+    trial_name,
+)
+from forcegp.experiments.friction import Transfer, UnilateralContact
 from forcegp.jobs import JobStore
 
 DATA = DataSettings(train_seconds=3.0, rows=50, test_seconds=2.0, every=5)

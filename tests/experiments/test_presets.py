@@ -8,12 +8,8 @@ import pytest
 
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
-from forcegp.experiments.force_experiment import ForceExperiment, Trial
-from forcegp.experiments.force_scenarios import SCENARIOS
-from forcegp.experiments.pages import TRIAL_PRESETS, page_of
-from forcegp.experiments.presets import PRESETS, experiments_of
-from forcegp.experiments.report import report
-from forcegp.experiments.reproduction import as_csv
+from forcegp.experiments.force_experiment import SCENARIOS, ForceExperiment, Trial
+from forcegp.experiments.reproduction import PRESETS, TRIAL_PRESETS, as_csv, experiments_of, page_of, report
 from forcegp.jobs import Job
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

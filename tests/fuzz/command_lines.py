@@ -12,7 +12,7 @@ from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import DefectError, Target, require_ended_well
 from tests.fuzz.values import WORDS, hostile_pickle
 
-from forcegp.cli.arguments import COMMANDS, parse_arguments
+from forcegp.cli.main import COMMANDS, parse_arguments
 from forcegp.errors import ForceGPError
 
 FILES = ("train.h5", "test.h5", "bare.h5", "arm.urdf", "log.csv", "log.yaml", "log.npz", "log.mcap")

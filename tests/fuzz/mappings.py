@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.fuzz.oracle import CANARY, Target, allowed, require_no_code
 from tests.fuzz.values import DAMAGE, NUMBERS, SCALARS, WORDS, Damage, damaged
 
-from forcegp.recordings.mapping_file import mapping_text, read_mapping
+from forcegp.recordings.mapping import mapping_text, read_mapping
 
 KEYS = ("time", "step", "q", "v", "u", "a", "joints", "unit", "sign", "scale", "offset", "episode", "episodes")
 KEYS += ("headerless", "delimiter", "side_by_side", "x", "q")

@@ -17,7 +17,7 @@ from tests.fuzz.oracle import DefectError, Target, allowed, require_ended_well, 
 from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, XML_EDITS, Damage, damaged, edited_json, edited_xml
 
 from forcegp import load_posterior
-from forcegp.file_digests import write_digests
+from forcegp.atomic_files import write_digests
 from forcegp.models import NeuralNetwork  # noqa: F401  KINDS needs it
 
 TENSORS = "tensors.safetensors"

@@ -16,10 +16,10 @@ from tests.fuzz.oracle import require_ended_well
 from tests.models.arm import URDF
 
 import forcegp
+from forcegp.atomic_files import write_digests
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
-from forcegp.file_digests import write_digests
 from forcegp.mechanics import MechanicalSystem
-from forcegp.recordings.mapping_file import read_mapping
+from forcegp.recordings.mapping import read_mapping
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 

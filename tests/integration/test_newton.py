@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forcegp.errors import InvalidInput
-from forcegp.integration.newton import find_roots, rows_jacobian
+from forcegp.integration.integrators import find_roots, rows_jacobian
 
 
 def implicit_step(friction, joints: int, states: int):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.jobs.source_code import _file, _source, code_digest, imported_files
+from forcegp.jobs.job import _file, _source, code_digest, imported_files
 
 FILES = {
     "__init__.py": "",

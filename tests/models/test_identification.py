@@ -15,7 +15,7 @@ from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference import LatentKernels, OptimizerOptions, minimize_objective
 from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
 from forcegp.models import Coefficients, Noise, StructuredGP, load_posterior, save_posterior
-from forcegp.models.identification.curvature import FLAT, curvature_about
+from forcegp.models.identification.identification import FLAT, curvature_about
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
 from forcegp.models.structured.objective import squared_distance, with_variance_priors
 from forcegp.priors import NoForces

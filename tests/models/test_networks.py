@@ -12,9 +12,14 @@ from tests.models.model_conformance import ModelConformance
 from forcegp.errors import FitError, InvalidInput
 from forcegp.models import Noise
 from forcegp.models.baselines.network_ensemble import NetworkEnsemble
-from forcegp.models.baselines.network_layers import ResidualLayers, SigmoidLayer, initial_weights
-from forcegp.models.baselines.network_training import Batches, held_out_rows
-from forcegp.models.baselines.neural_network import NeuralNetwork
+from forcegp.models.baselines.neural_network import (
+    Batches,
+    NeuralNetwork,
+    ResidualLayers,
+    SigmoidLayer,
+    held_out_rows,
+    initial_weights,
+)
 
 SMALL = {"members": 3, "width": 16, "depth": 2, "steps": 90, "batch": 20}
 

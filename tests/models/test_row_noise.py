@@ -12,8 +12,8 @@ from scipy.stats import multivariate_normal
 from tests.inference.dense import dense_negative_log_likelihood
 from tests.models.arm import NOISE, arm_data, arm_system
 
+from forcegp.atomic_files import write_digests
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.file_digests import write_digests
 from forcegp.inference import OptimizerOptions
 from forcegp.models import (
     IndependentGP,

@@ -15,8 +15,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from tests.models.arm import URDF, arm_data, arm_system
 
+from forcegp.atomic_files import SUMS, write_digests
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
-from forcegp.file_digests import SUMS, write_digests
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, MechanicalSystem, Sphere
 from forcegp.models import IndependentGP, Noise, StructuredGP, load_posterior, save_posterior

@@ -5,8 +5,8 @@ import os
 import pytest
 
 from forcegp import load_posterior
+from forcegp.atomic_files import SUMS, require_unchanged
 from forcegp.errors import FileFormatError
-from forcegp.file_digests import SUMS, require_unchanged
 
 
 def test_a_pipe_as_model_or_as_digests_is_refused_at_once(tmp_path):

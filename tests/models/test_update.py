@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import load_file
 from tests.models.arm import arm_data, arm_system
 
+from forcegp.atomic_files import write_digests
 from forcegp.errors import ContactError, DataWarning, FileFormatError, InvalidInput, NotEnoughMemory
-from forcegp.file_digests import write_digests
 from forcegp.inference import OptimizerOptions, likelihood
 from forcegp.inference import memory as memory_module
 from forcegp.mechanics import Contact, Plane

@@ -9,7 +9,7 @@ from tests.parallel import tasks
 from tests.parallel.conformance import BackendConformance, WorkersConformance
 
 from forcegp.errors import BackendError, InvalidInput, MissingExtra
-from forcegp.parallel import Joblib, Ray, Serial, backend_for, backend_of, connection
+from forcegp.parallel import Joblib, Ray, Serial, backend_for, backend_of, cluster
 
 
 class TestSerial(BackendConformance):
@@ -94,6 +94,6 @@ def test_a_port_on_which_nothing_listens_is_told(dead_address):
 
 def test_something_else_that_answers_is_told(silent_address, monkeypatch):
     pytest.importorskip("ray")
-    monkeypatch.setattr(connection, "JOIN_SECONDS", 3.0)
+    monkeypatch.setattr(cluster, "JOIN_SECONDS", 3.0)
     with pytest.raises(BackendError, match=rf"what answers at {silent_address} is no Ray cluster"):
         next(Ray(silent_address).map(tasks.process, [0]))

@@ -24,10 +24,9 @@ import forcegp.recordings.reading as reading
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
-from forcegp.recordings.episode_rows import EpisodeRows
+from forcegp.recordings.episode_rows import EpisodeRows, Stretch
 from forcegp.recordings.formats import open_source
-from forcegp.recordings.spool import Spool
-from forcegp.recordings.time_stamps import Stretch
+from forcegp.recordings.reading import Spool
 
 NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{joints}",), joints=JOINTS)
 ARRAYS = ColumnMapping(time="time", q=("q",), v=("v",), u=("u",), joints=JOINTS)

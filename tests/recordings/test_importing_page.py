@@ -6,10 +6,10 @@ import shlex
 import pytest
 from tests.examples import run_example
 
-from forcegp.cli.arguments import parse_arguments
 from forcegp.cli.import_log import Import
+from forcegp.cli.main import parse_arguments
 from forcegp.recordings import read_mapping
-from forcegp.recordings.signal_units import UNITS
+from forcegp.recordings.mapping import UNITS
 
 
 @pytest.fixture(scope="module")

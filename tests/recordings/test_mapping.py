@@ -10,11 +10,8 @@ from tests.recordings.log_files import JOINTS, motion, table, write_text
 
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings import ColumnMapping, mapping_text, open_source, read_mapping
-from forcegp.recordings.column_guessing import guessed_columns, guessed_time
-from forcegp.recordings.column_names import expanded, listed
-from forcegp.recordings.linear_expressions import parse_expression
-from forcegp.recordings.mapping_file import by_quantity, factors_of, mapping_of
-from forcegp.recordings.signal_units import UNITS, log_unit
+from forcegp.recordings.column_names import expanded, guessed_columns, guessed_time, listed, parse_expression
+from forcegp.recordings.mapping import UNITS, by_quantity, factors_of, log_unit, mapping_of
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
 

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from tests.recordings.log_files import EPOCH, joint_states, motion, write_bag2
 
-from forcegp.recordings import mcap_chunks as mcap_module
-from forcegp.recordings import open_source
-from forcegp.recordings.mcap_chunks import mcap_chunks
-from forcegp.recordings.raw_messages import _ordered_chunks, topic_messages
+from forcegp.recordings import open_source, ros_bag
+from forcegp.recordings.ros_bag import _ordered_chunks, mcap_chunks, topic_messages
 
 pytest.importorskip("rosbags")
 
@@ -58,7 +56,7 @@ def test_both_ways_give_the_same_bytes(tmp_path, monkeypatch):
                     yield int(stamp), batch.buffer[begin : begin + length].tobytes()
 
     fast = list(messages())
-    monkeypatch.setattr("forcegp.recordings.raw_messages._ordered_chunks", lambda reader: None)
+    monkeypatch.setattr("forcegp.recordings.ros_bag._ordered_chunks", lambda reader: None)
     assert fast == list(messages())
     assert len(fast) == 267
 
@@ -83,9 +81,9 @@ def hidden(place: str, name: str):
 
 def other_offsets(monkeypatch):
     """Offsets that mean something else."""
-    own = mcap_module._begins_at
+    own = ros_bag._begins_at
     monkeypatch.setattr(
-        mcap_module,
+        ros_bag,
         "_begins_at",
         lambda info, file: own(info._replace(chunk_start_offset=info.chunk_start_offset + 9), file),
     )

@@ -5,8 +5,13 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from forcegp.errors import SimulationError
-from forcegp.simulation.contact_forces import multiplier_with_friction
-from forcegp.simulation.friction_laws import DryFriction, JointStribeckFriction, RoughPatch, ViscousFriction
+from forcegp.simulation.contact_forces import (
+    DryFriction,
+    JointStribeckFriction,
+    RoughPatch,
+    ViscousFriction,
+    multiplier_with_friction,
+)
 
 STRIBECK = DryFriction(coulomb=0.3, static=0.5, stribeck_velocity=0.1, smoothing=1e-6)
 UP = np.array([0.0, 0.0, 1.0])

@@ -8,7 +8,7 @@ from tests.data.samples import assert_equal
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, SimulationError
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.simulation.friction_laws import DryFriction, JointStribeckFriction, RoughPatch
+from forcegp.simulation.contact_forces import DryFriction, JointStribeckFriction, RoughPatch
 
 pytest.importorskip("pybullet")
 

@@ -13,7 +13,7 @@ from forcegp.errors import DatasetError, InvalidInput, SimulationError
 from forcegp.mechanics import Plane
 from forcegp.robots import Robot
 from forcegp.simulation import SCENARIOS, KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.simulation.kuka_description import TOOL_LINK
+from forcegp.simulation.kuka_motion import TOOL_LINK
 
 pytest.importorskip("pybullet")
 

@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.tables import table_of
-from forcegp.simulation.trajectory import PathOverTable
+from forcegp.simulation.trajectory import PathOverTable, table_of
 
 KINDS = ("plane", "tilted", "sphere")
 MIDDLE = np.array([0.0, 0.5, 0.055])

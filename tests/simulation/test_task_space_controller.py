@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from forcegp.simulation.task_space_controller import TaskSpaceController, rotation_vector
+from forcegp.simulation.trajectory import TaskSpaceController, rotation_vector
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.models import StructuredGP
 from forcegp.priors import NoForces
 from forcegp.robots import Robot
-from forcegp.validation.horizons import held_out_motions, motion_scores
+from forcegp.validation.scores import held_out_motions, motion_scores
 
 SLEDGE = """<robot name="sledge"><link name="base"/><link name="sledge"><inertial><mass value="{mass}"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>

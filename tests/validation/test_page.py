@@ -8,7 +8,7 @@ import pytest
 from tests.examples import run_example
 from tests.validation.moving_arm import moving_arm
 
-from forcegp.cli.arguments import parse_arguments
+from forcegp.cli.main import parse_arguments
 from forcegp.cli.validate import Validate
 from forcegp.validation import DEFAULT_MODELS
 from forcegp.validation.candidates import candidates

@@ -1,20 +1,18 @@
-"""Identification of a robot from recorded motions by regression: what classical methods make of the same data."""
+"""`identify_analytical`: rigid-body parameters from a recording; and how wrong such systems are about other motions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies
-from forcegp.analytical.identified_robot import thickened
+from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies, thickened
+from forcegp.analytical.identifiability import body_pseudo_inertias
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import Fit, weighted_least_squares
-from forcegp.analytical.noise_levels import NoiseLevels
+from forcegp.analytical.least_squares import Fit, NoiseLevels, weighted_least_squares
 from forcegp.analytical.recorded_rows import RecordedRows
-from forcegp.analytical.regressor import body_pseudo_inertias
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import dataset_first, require_rows
@@ -171,3 +169,43 @@ def joint_terms(
     needed, measured, speed = (np.sqrt((x**2).mean(0)) for x in (needed, u, v))
     torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in (np.maximum(needed, measured), speed))
     return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)
+
+
+STRETCHES = 4
+"""Stretches of time that logs of fewer than three episodes are cut into."""
+
+
+@dataset_first
+def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> NoiseLevels:
+    """Noise of accelerations and forces about systems identified without the rows in question.
+
+    Residuals of the rows that parameters were fitted to are too small for others: those of a filtered log resemble
+    their neighbours. So every stretch is predicted by a system identified from the rest (block cross-validation;
+    Burman, Chow & Nolan 1994), and the levels of noise are those of all these residuals.
+
+    `how` are the options of `identify_analytical`; inertias must be consistent. Rows are left out by episodes, where
+    there are three or more, else by `STRETCHES` stretches of time.
+    Raises InvalidInput for free inertias, whose mass matrix need not be one, and for too few rows.
+    """
+    if how.get("inertias", "consistent") != "consistent":
+        raise InvalidInput("held-out noise needs a mass matrix that can be inverted; use inertias='consistent'.")
+    residuals, masses = [], []
+    for left_out in _stretches(dataset):
+        kept = np.ones(len(dataset), dtype=bool)
+        kept[left_out] = False
+        found = identify_analytical(dataset.rows(kept), system, **how).system
+        rows = dataset.rows(left_out)
+        q, v, u = (torch.tensor(x, device=found.robot.device) for x in (rows.q, rows.v, rows.u))
+        dynamics = found.dynamics(q, v, u)
+        residuals.append(rows.a - dynamics.acceleration_map().offset.cpu().numpy())
+        masses.append(dynamics.M.cpu().numpy())
+    return NoiseLevels.of(np.concatenate(residuals), np.concatenate(masses))
+
+
+def _stretches(dataset: Dataset) -> list[np.ndarray]:
+    """Row numbers of each stretch."""
+    if len(dataset.episodes) >= 3:
+        return [np.flatnonzero(dataset.episode == number) for number in dataset.episodes]
+    if len(dataset) < 2 * STRETCHES:
+        raise InvalidInput(f"the dataset has {len(dataset)} rows; held-out noise needs {2 * STRETCHES} or more.")
+    return np.array_split(np.lexsort((dataset.time, dataset.episode)), STRETCHES)

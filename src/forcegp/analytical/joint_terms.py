@@ -150,7 +150,7 @@ class JointTerms:
                 "lists none; add it to known_forces, or use rotors='armature'."
             )
         self.fields = [field for law in self.laws for field in law.fields] + ([INERTIA] if inertia else [])
-        mass = mass / self._geared() if inertia else mass
+        mass = mass / np.maximum((self._transmission().numpy() ** 2).sum(1), 1e-12) if inertia else mass
         sizes = [
             f.size[2] * torque ** f.size[0] * velocity ** f.size[1] * (mass if f is INERTIA else 1.0)
             for f in self.fields
@@ -263,6 +263,3 @@ class JointTerms:
         """(rotor, nv, nv): inertia added per unit of each rotor's."""
         T = self._transmission().numpy()
         return T[:, :, None] * T[:, None, :]
-
-    def _geared(self) -> np.ndarray:
-        return np.maximum((self._transmission().numpy() ** 2).sum(1), 1e-12)

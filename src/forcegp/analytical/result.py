@@ -11,15 +11,11 @@ import scipy.linalg
 import torch
 from jaxtyping import Float, Int
 
-from forcegp.analytical.bodies import BodyCoordinates, FreeBodies
-from forcegp.analytical.identifiability import BaseParameters
-from forcegp.analytical.identified_robot import with_bodies, with_joint_dynamics
+from forcegp.analytical.bodies import BodyCoordinates, FreeBodies, with_bodies, with_joint_dynamics
+from forcegp.analytical.identifiability import UNITS, BaseParameters, body_names, parameter_names
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import Fit, correlation_time
-from forcegp.analytical.noise_levels import NoiseLevels
-from forcegp.analytical.recorded_rows import RecordedRows
-from forcegp.analytical.regressor import UNITS, body_names, parameter_names
-from forcegp.analytical.scores import residual_scores
+from forcegp.analytical.least_squares import Fit, NoiseLevels, correlation_time
+from forcegp.analytical.recorded_rows import RecordedRows, residual_scores
 from forcegp.data import Dataset
 from forcegp.mechanics import (
     CoulombJointFriction,
@@ -63,7 +59,7 @@ class AnalyticalIdentification(Summary):
 
     @property
     def parameters(self) -> Float[np.ndarray, "nv 10"]:
-        """Standard parameters of the bodies, see `forcegp.analytical.regressor`."""
+        """Standard parameters of the bodies, see `forcegp.analytical.identifiability`."""
         return self.bodies.parameters(self._in_bodies)
 
     @cached_property

@@ -1,2 +1,2 @@
-from .findings import SEVERITIES as SEVERITIES, Finding as Finding, Severity as Severity
+from .check_input import SEVERITIES as SEVERITIES, Finding as Finding, Severity as Severity
 from .report import CheckReport as CheckReport, check as check, quick_check as quick_check

@@ -1,11 +1,12 @@
-"""What the checks look at: the log as it is, and the same at even times, filtered and differentiated."""
+"""The log as every check sees it, and what a check found."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,6 +27,52 @@ from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
+
+Severity = Literal["ok", "look", "wrong"]
+SEVERITIES: tuple[Severity, ...] = ("ok", "look", "wrong")
+"""From harmless to spoiling every result."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One result of a check.
+
+    severity: ok, nothing to do; look, a person should judge; wrong, results would be wrong.
+    subject: what was checked, in a few words, the same for all logs.
+    seen: what was seen, with joint, row, time and numbers.
+    remedy: what to do about it; empty if nothing.
+    joints: names of the joints concerned; numbers: the numbers of `seen`, for programs.
+    """
+
+    severity: Severity
+    subject: str
+    seen: str
+    remedy: str = ""
+    joints: tuple[str, ...] = ()
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return {**vars(self), "joints": list(self.joints), "numbers": dict(self.numbers)}
+
+
+wrong, look, ok = partial(Finding, severity="wrong"), partial(Finding, severity="look"), partial(Finding, severity="ok")
+
+
+def worst(findings: Sequence[Finding]) -> Severity:
+    """The severity of the worst of them; ok if there are none."""
+    return SEVERITIES[max((SEVERITIES.index(finding.severity) for finding in findings), default=0)]
+
+
+def plain(values: np.ndarray) -> list[float | None]:
+    """Numbers for JSON, which has no NaN."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def listed(names: Sequence[str]) -> str:
+    """`a, b and c`."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
 
 GAP = 5.0
 """Median steps without a row at which a motion is taken for two."""

@@ -14,10 +14,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.check_input import DEGREE, CheckInput
-from forcegp.checks.findings import Finding, listed, wrong
-from forcegp.checks.gravity import estimated_gravity, with_gravity
-from forcegp.checks.torques import Correction, TorqueFit, fit_torques, inverse_dynamics, unexplained_share
+from forcegp.checks.check_input import DEGREE, CheckInput, Finding, listed, wrong
+from forcegp.checks.torques import (
+    Correction,
+    TorqueFit,
+    estimated_gravity,
+    fit_torques,
+    inverse_dynamics,
+    unexplained_share,
+    with_gravity,
+)
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 

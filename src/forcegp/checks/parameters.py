@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.checks.findings import Finding, look
-from forcegp.checks.gravity import with_gravity
-from forcegp.checks.torques import SLOW, inverse_dynamics
+from forcegp.checks.check_input import Finding, look
+from forcegp.checks.torques import SLOW, inverse_dynamics, with_gravity
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput
-from forcegp.checks.findings import Finding, listed, look, wrong
+from forcegp.checks.check_input import CheckInput, Finding, listed, look, wrong
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
 
@@ -163,7 +162,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
             ):
                 longest = (int(start), length)
     start, length = longest
-    if not length or _is_extreme(values, values[start]):
+    if not length or values[start] in (values.min(), values.max()):
         return []
     return [
         Finding(
@@ -176,10 +175,6 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
             numbers={"quantity": name, "row": start, "seconds": length * step},
         )
     ]
-
-
-def _is_extreme(values: np.ndarray, value: float) -> bool:
-    return bool(value in (values.min(), values.max()))
 
 
 def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:

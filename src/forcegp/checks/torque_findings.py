@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.findings import Finding, listed, plain
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, plain
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH
@@ -96,7 +95,7 @@ def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
                 severity="wrong",
                 subject="dead torque",
                 seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
-                f"{np.std(tau):.3g} {_unit(inputs, joint)} rms.",
+                f"{np.std(tau):.3g} {'Nm' if inputs.rotates[joint] else 'N'} rms.",
                 remedy="The channel is dead, unless the joint has no motor and the URDF is wrong.",
                 joints=(name,),
                 numbers={"needed": float(np.std(tau))},
@@ -173,10 +172,6 @@ def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, rem
         joints=names,
         numbers=numbers,
     )
-
-
-def _unit(inputs: CheckInput, joint: int) -> str:
-    return "Nm" if inputs.rotates[joint] else "N"
 
 
 def not_compared(inputs: CheckInput) -> Finding:

@@ -15,14 +15,10 @@ import forcegp
 import forcegp.evaluation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.output_folders import plots_folder, require_free_folder
-from forcegp.cli.preparation_options import CutoffOptions
-from forcegp.cli.robot_options import RobotOptions
-from forcegp.cli.tables import NONE, columns
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.input_options import CutoffOptions, RobotOptions
+from forcegp.cli.terminal import NONE, Terminal, columns
 from forcegp.errors import DatasetError
 
-KIND = "forcegp check"
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 
 
@@ -53,8 +49,7 @@ class Check(CutoffOptions, RobotOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
-        if self.plots is not None:
-            require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.plots)
 
         preparation = self._preparation()
         dataset = forcegp.Dataset.load(self.data)
@@ -64,9 +59,10 @@ class Check(CutoffOptions, RobotOptions):
             report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
-            with plots_folder(terminal, self.plots, KIND, {"data": str(self.data)}, overwrite=self.overwrite) as folder:
+            with self.folder(self.plots, {"data": str(self.data)}) as folder:
                 forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
                 write_json(folder / "check.json", content)
+            terminal.note(f"plots: {self.plots}")
         terminal.show(*_shown(terminal, self.data, report))
         wrong = [finding for finding in report.findings if finding.severity == "wrong"]
         if self.strict and wrong:

@@ -1,17 +1,22 @@
-"""What every command shares: two flags, the check that its input files are there, and `run`."""
+"""What commands share: two flags, checks of what they read and write, where to compute, and `run`."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import platform
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, get_type_hints
 
 from tyro.conf import arg
 
+import forcegp.parallel
+from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_writable, write_digests, write_json
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -32,6 +37,8 @@ class InputPath:
     is_there: Callable[[Path], bool] = Path.is_file
 
 
+CONFIG = "config.json"
+LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
 OUTPUTS = ("out", "plots", "docs", "write_mapping")
 """Names of the fields with what a command writes: never an input, nor another output."""
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
@@ -82,6 +89,64 @@ class Command(ABC):
                         f"{path} would be written over {other}, which this command {does}; choose another name."
                     )
 
+    def words(self, *names: str) -> list[str]:
+        """The options of these names that are not left at their defaults, as words of a command."""
+        words: list[str] = []
+        for name in names:
+            given, flag = getattr(self, name), f"--{name.replace('_', '-')}"
+            if given is False and getattr(type(self), name):
+                words.append(f"--no-{flag[2:]}")
+            elif given != getattr(type(self), name):
+                for each in given if isinstance(given, tuple) else (given,):
+                    text = f"{each:g}" if isinstance(each, float) else str(each)
+                    words += [f"{flag}={text}"] if name == "gravity" else [flag, text]  # it may begin with a minus
+        return words
+
+    @property
+    def kind(self) -> str:
+        """The command as people write it, by which folders that it wrote are recognised."""
+        return f"forcegp {type(self).__name__.lower()}"
+
+    def require_free(self, path: Path | None) -> None:
+        """Refuse what exists, unless it is an empty folder, or one that only this command wrote to, with --overwrite.
+
+        None is no folder. Raises InvalidInput, or OSError where nothing can be written, before any work is done.
+        """
+        if path is None:
+            return
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            if not path.is_dir() or _config(path).get("kind") != self.kind:
+                raise InvalidInput(
+                    f"{path} exists and was not written by `{self.kind}`, so it is not overwritten; choose another "
+                    "name."
+                )
+            if not getattr(self, "overwrite", True):
+                raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
+            others = added_files(path)
+            if others:
+                raise InvalidInput(
+                    f"{path} holds files that `{self.kind}` did not write ({', '.join(others[:3])}), so it is not "
+                    "overwritten; move them away, or choose another name."
+                )
+        require_writable(path)
+
+    @contextlib.contextmanager
+    def folder(self, path: Path, content: Mapping[str, Any]) -> Iterator[Path]:
+        """A new folder to write into, there once all is in it.
+
+        It gets a `config.json` with this content, versions and the list of its files, and the digests of all. Raises as
+        `require_free`, also for what appeared meanwhile.
+        """
+        with atomic_folder(path) as folder:
+            folder.mkdir()
+            yield folder
+            present = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+            versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+            files = sorted({CONFIG, SUMS, *present})
+            write_json(folder / CONFIG, {"kind": self.kind, **content, "versions": versions, "files": files})
+            write_digests(folder)
+            self.require_free(path)
+
     @abstractmethod
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do it and return what `--json` prints. Raises ForceGPError or OSError for what the user can mend."""
@@ -96,3 +161,57 @@ def _same(one: Path, other: Path) -> bool:
 
 def _within(inner: Path, outer: Path) -> bool:
     return Path(os.path.realpath(inner)).is_relative_to(os.path.realpath(outer))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendOptions(Command):
+    """What every command asks that can compute in several processes, or on several machines."""
+
+    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="")] = None
+    backend: Annotated[str | None, arg(metavar="serial|joblib|ray", constructor=str, help_behavior_hint="")] = None
+    """serial: in this process. joblib: in processes of this machine. ray: on the machines of a Ray cluster; see
+    docs/clusters.md. (default: serial for one job, else joblib)"""
+    address: Annotated[str | None, unless_given("HOST:PORT", "that of this machine", str)] = None
+    """The head of the Ray cluster, for --backend ray."""
+
+    def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
+        """The backend that is asked for, or else the default: this process for one job, several for more.
+
+        Raises InvalidInput for options that contradict each other.
+        """
+        if self.backend is None and self.address is not None:
+            raise InvalidInput(f"--address is {self.address}, that of a cluster; add --backend ray.")
+        name = self.backend or default
+        return (
+            forcegp.parallel.backend_for(None, self.jobs)
+            if name is None
+            else forcegp.parallel.backend_of(name, self.jobs, self.address)
+        )
+
+
+def require_free_file(
+    path: Path, *, overwrite: bool, own: Callable[[Path], bool], what: str = "a dataset of forcegp"
+) -> None:
+    """Refuse what exists, unless it is `own` or empty and --overwrite is given, and what cannot be written.
+
+    Raises InvalidInput or OSError before any work is done.
+    """
+    if path.is_dir():
+        raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
+    if path.exists() and not path.is_file():
+        raise InvalidInput(f"{path} is not a regular file; choose another name.")
+    if path.exists() and not overwrite:
+        raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
+    if path.exists() and path.stat().st_size and not own(path):
+        raise InvalidInput(f"{path} is not {what}, so it is not overwritten; choose another name.")
+    require_writable(path)
+
+
+def _config(path: Path) -> dict[str, Any]:
+    try:
+        config = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return config if isinstance(config, dict) else {}

@@ -18,15 +18,14 @@ import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.fit_options import POINTS
+from forcegp.cli.input_options import ROBOT_OPTIONS
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.model_choice import resolved_noise
-from forcegp.cli.output_folders import output_folder, require_free_folder
-from forcegp.cli.tables import NONE, columns, number
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.model_choice import POINTS, resolved_noise
+from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
 
-KIND = "forcegp compare"
+SAME = (*ROBOT_OPTIONS, "contact", "known_force", "mean", "noise", "force_noise", "rows", "hyperprior")
+"""Options that a fit needs, too: for another robot, contact or noise nothing was compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +67,7 @@ class Compare(LearningOptions):
         if len(self.prior) < 2:
             given = f"only {self.prior[0]}" if self.prior else "none"
             raise InvalidInput(f"--prior names the candidates, and there is {given}; give it twice or more.")
-        if self.out is not None:
-            require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.out)
 
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
@@ -139,7 +137,7 @@ class Compare(LearningOptions):
     def _write(
         self, out: Path, comparison: forcegp.PriorComparison, content: Mapping[str, Any], folders: Mapping[str, str]
     ) -> None:
-        with output_folder(out, KIND, self._given(), overwrite=self.overwrite) as folder:
+        with self.folder(out, self._given()) as folder:
             for name, posterior in comparison.posteriors.items():
                 forcegp.save_posterior(posterior, folder / folders[name])
             write_json(folder / "comparison.json", {**content, "models": dict(folders)})
@@ -156,22 +154,13 @@ class Compare(LearningOptions):
         if self.out is not None:
             following = f"Next: forcegp evaluate {self.out / folders[preferred]} TEST.h5"
         else:
-            chosen = "".join(f" {_quoted(word)}" for word in self._same_words())
+            chosen = "".join(f" {_quoted(word)}" for word in self.words(*SAME))
             following = (
                 f"Next: forcegp fit {self.data}{chosen} --prior {_quoted(preferred)} --points {comparison.points} "
                 "--out run"
             )
         table = columns(title, header, rows, long_names=True)
         return [table, Text(comparison.verdict), Text(following)]
-
-    def _same_words(self) -> list[str]:
-        """Options that a fit needs, too: for another robot, contact or noise nothing was compared."""
-        words = self.system_words()
-        words += [] if self.mean == "analytical" else ["--mean", self.mean]
-        words += [] if self.noise == "dataset" else ["--noise", self.noise]
-        words += [] if self.force_noise is None else ["--force-noise", f"{self.force_noise:g}"]
-        words += [] if self.rows == "auto" else ["--rows", self.rows]
-        return words + ([] if self.hyperprior else ["--no-hyperprior"])
 
     def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best

@@ -20,24 +20,18 @@ from forcegp.atomic_files import write_json
 from forcegp.cli.command import Command, Debug, Json
 from forcegp.cli.evaluate import draw, evaluate_with_progress
 from forcegp.cli.fit import fit_summary, fit_with_progress
-from forcegp.cli.output_folders import output_folder, require_free_folder
 from forcegp.cli.simulate import simulate_with_progress
-from forcegp.cli.tables import NONE, NORMAL_FORCES, columns, multiplier_scores, nats, number, percent
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import NONE, NORMAL_FORCES, Terminal, columns, multiplier_scores, nats, number, percent
 from forcegp.errors import InvalidInput
 from forcegp.experiments import published
 
-KIND = "forcegp demo"
 NOISE = 0.1  # rad/s^2, as in the paper
 SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
 
 MODELS = {"S-GP": ("s-gp", "zero"), "S-GP + analytical mean": ("s-gp-analytical-mean", "analytical")}
 """Name in the paper -> (folder, mean)."""
 
-PUBLISHED_MAE = {
-    name: dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[place], strict=True))
-    for name, place in (("S-GP", "s-gp"), ("S-GP + analytical mean", "s-gp-mean"))
-}
+PUBLISHED_MAE = dict(zip(MODELS, (published.FIG2B_MAE["s-gp"], published.FIG2B_MAE["s-gp-mean"]), strict=True))
 """Mean absolute error against noisy accelerations by number of points."""
 
 
@@ -71,11 +65,11 @@ class Demo(Command):
         """All four steps."""
         if self.points < 2:
             raise InvalidInput(f"--points is {self.points}; at least 2 are needed.")
-        require_free_folder(self.out, kind=KIND, overwrite=True)
+        self.require_free(self.out)
         machine = {"system": platform.platform(), "cores": os.cpu_count(), "python": platform.python_version()}
         options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
         start = time.monotonic()
-        with output_folder(self.out, KIND, {"options": options, "machine": machine}, overwrite=True) as folder:
+        with self.folder(self.out, {"options": options, "machine": machine}) as folder:
             train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
             models, evaluations, fit_seconds = {}, {}, {}
             for name, (place, mean) in MODELS.items():

@@ -14,22 +14,19 @@ import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
-from forcegp.cli.contact_syntax import parse_contacts
-from forcegp.cli.output_folders import plots_folder, require_free_folder
-from forcegp.cli.system_choice import SystemChoice, carried_over
-from forcegp.cli.tables import (
+from forcegp.cli.input_options import SystemChoice, carried_over
+from forcegp.cli.learning_options import parse_contacts
+from forcegp.cli.terminal import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,
     NORMAL_FORCES_SEEN,
+    Terminal,
     evaluation_table,
     facts,
     force_facts,
     number,
 )
-from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
-
-KIND = "forcegp evaluate"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +63,7 @@ class Evaluate(Command):
         """Evaluate, draw if asked to, and show."""
         if self.every < 1:
             raise InvalidInput(f"--every is {self.every}; it must be at least 1.")
-        if self.plots is not None:
-            require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.plots)
 
         posterior = forcegp.load_posterior(self.run_folder)
         dataset = forcegp.Dataset.load(self.data).rows(slice(None, None, self.every))
@@ -92,10 +88,10 @@ class Evaluate(Command):
         }
         if self.plots is not None:
             options = {name: scores[name] for name in ("run", "data", "every", "system", "contact")}
-            with plots_folder(terminal, self.plots, KIND, {"options": options}, overwrite=self.overwrite) as folder:
+            with self.folder(self.plots, {"options": options}) as folder:
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
-
+            terminal.note(f"plots: {self.plots}")
         learned = NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
         forces_table = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
         terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))

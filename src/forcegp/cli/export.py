@@ -11,12 +11,8 @@ from tyro.conf import Positional, arg
 
 import forcegp
 from forcegp.cli.command import MODEL, Command, Debug, Json
-from forcegp.cli.output_folders import output_folder, require_free_folder
-from forcegp.cli.tables import columns
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
-
-KIND = "forcegp export"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +54,11 @@ class Export(Command):
         """Write and show."""
         if self.integrator is not None and self.steps is None:
             raise InvalidInput("--integrator was given without --steps, which says how long a step lasts.")
-        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.out)
         posterior = forcegp.load_posterior(self.run_folder)
         names = ("to", "covariance", "jacobian", "steps", "integrator")
         content = {"run": str(self.run_folder), **{name: getattr(self, name) for name in names}}
-        with output_folder(self.out, KIND, content, overwrite=self.overwrite) as folder:
+        with self.folder(self.out, content) as folder:
             found = TARGETS[self.to](self, terminal, posterior, folder)
         return {"out": str(self.out), **content, **found}
 

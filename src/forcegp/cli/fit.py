@@ -14,15 +14,9 @@ import forcegp.inference
 import forcegp.models
 import forcegp.robots
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.fit_options import ModelOptions
-from forcegp.cli.model_choice import make_model, resolved, search_arguments, window_observation
-from forcegp.cli.option_names import with_option_names
-from forcegp.cli.output_folders import require_free_folder
-from forcegp.cli.tables import facts
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.model_choice import ModelOptions, make_model, resolved, search_arguments, window_observation
+from forcegp.cli.terminal import Terminal, facts, with_option_names
 from forcegp.errors import InvalidInput
-
-KIND = "forcegp fit"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +42,7 @@ class Fit(ModelOptions):
         """Fit and save."""
         if self.seed < 0:
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
-        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.out)
         command = resolved(self)
         self._backend()  # refused now, not after the data are read
         assert command.points is not None, "a resolved command has points"
@@ -66,7 +60,7 @@ class Fit(ModelOptions):
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
         posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
         summary = fit_summary(posterior, time.monotonic() - start)
-        command._write(posterior, KIND)
+        command._write(posterior)
         if rows_note is not None:
             terminal.note(rows_note)
         for doubt in forcegp.evaluation.unfinished_search(posterior):

@@ -14,10 +14,8 @@ import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, URDF, Debug, Json, unless_given
-from forcegp.cli.output_folders import require_free_file
-from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_options import RobotOptions
+from forcegp.cli.command import LOG, MAPPING, URDF, Debug, Json, require_free_file, unless_given
+from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError, InvalidInput
 

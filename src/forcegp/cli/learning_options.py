@@ -1,9 +1,11 @@
-"""What every command asks that learns from a dataset: the data, what is known about the robot, and how to search."""
+"""What every command asks that learns from a dataset: data, robot and search; and what options say in short."""
 
 from __future__ import annotations
 
 import hashlib
+import shlex
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,14 +14,188 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 import forcegp
 import forcegp.checks
-from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import DATASET, unless_given
-from forcegp.cli.contact_rows_choice import RowsChoice, rows_to_learn
-from forcegp.cli.contact_syntax import parse_contacts
-from forcegp.cli.findings_line import findings_in_one_line
-from forcegp.cli.robot_options import RobotOptions
+import forcegp.data
+import forcegp.mechanics
+import forcegp.models
+import forcegp.robots
+from forcegp.cli.command import DATASET, BackendOptions, unless_given
+from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import ContactWarning
+from forcegp.errors import ContactError, ContactWarning, InvalidInput
+
+SYNTAX = {
+    "plane": ("nx,ny,nz,offset", 4),
+    "sphere": ("cx,cy,cz,radius", 4),
+    "cylinder": ("px,py,pz,ax,ay,az,radius", 7),
+}
+"""Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
+
+EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
+
+
+def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
+    """One contact per text; the single text `none` is no contact. Raises InvalidInput for anything else."""
+    if "none" in texts:
+        if len(texts) > 1:
+            raise InvalidInput("--contact none stands alone; the other contacts contradict it.")
+        return ()
+    return tuple(parse_contact(text) for text in texts)
+
+
+def parse_contact(text: str) -> forcegp.Contact:
+    """`FRAME@x,y,z:SURFACE:numbers` as a contact; without `@x,y,z` the point is the origin of the frame.
+
+    Raises InvalidInput saying what is wrong with the text, and what is right.
+    """
+    place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
+    if kind not in SYNTAX or not place:
+        forms = ", ".join(f"{name}:{form}" for name, (form, _) in SYNTAX.items())
+        raise InvalidInput(
+            f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
+        )
+    form, count = SYNTAX[kind]
+    values = _numbers(text, kind, numbers, form, count)
+    frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
+    x, y, z = _numbers(text, "the point", point, "x,y,z", 3)
+    if kind == "plane":
+        surface = forcegp.Plane((values[0], values[1], values[2]), values[3])
+    elif kind == "sphere":
+        surface = forcegp.Sphere((values[0], values[1], values[2]), values[3])
+    else:
+        surface = forcegp.Cylinder((values[0], values[1], values[2]), (values[3], values[4], values[5]), values[6])
+    return forcegp.Contact(frame, (x, y, z), surface)
+
+
+def _numbers(text: str, what: str, given: str, form: str, count: int) -> list[float]:
+    try:
+        values = [float(entry) for entry in given.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InvalidInput(
+            f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
+        )
+    return values
+
+
+def parse_learn(words: Sequence[str]) -> tuple[forcegp.models.Learned, ...]:
+    """`LINK:mass,com,inertia`, or `FORCE`, `FORCE:joint,joint`, either with `=START`. Raises InvalidInput."""
+    if not words:
+        raise InvalidInput("nothing to estimate; add --learn LINK:mass,com, or another that --help names.")
+    forces = [name for name, kind in forcegp.mechanics.KNOWN_FORCES.items() if kind.learned is not None]
+    learned: list[forcegp.models.Learned] = []
+    for word in words:
+        what, _, start = word.partition("=")
+        name, _, listed = what.rpartition(":") if ":" in what else (what, "", "")
+        entries = tuple(entry for entry in listed.split(",") if entry)
+        if name in forces:
+            learned.append(forcegp.Coefficients(name, entries or None, _number(word, start) if start else None))
+        elif entries and not start:
+            learned.append(forcegp.robots.LinkInertia(name, entries))
+        else:
+            raise InvalidInput(
+                f"--learn {word} is not LINK:PARTS, with parts out of mass,com,inertia, nor one of {', '.join(forces)} "
+                "with :JOINTS or =START as you wish."
+            )
+    return tuple(learned)
+
+
+def with_learned_forces(
+    system: forcegp.MechanicalSystem, learn: Sequence[forcegp.models.Learned]
+) -> tuple[forcegp.MechanicalSystem, list[str]]:
+    """The system with every learned force in its list, from the URDF's coefficients, and the names that were added."""
+    make = {
+        "viscous-joint-friction": (
+            forcegp.ViscousJointFriction,
+            lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
+        ),
+        "coulomb-joint-friction": (
+            forcegp.CoulombJointFriction,
+            lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
+        ),
+        "load-joint-friction": (forcegp.LoadJointFriction, lambda: forcegp.LoadJointFriction(0.0, 0.0, 0.1)),
+        "armature": (forcegp.Armature, lambda: forcegp.Armature(0.0)),
+        "rotor-inertia": (forcegp.RotorInertia, lambda: forcegp.RotorInertia(0.0)),
+    }
+    added: dict[str, None] = {}
+    for entry in learn:
+        if isinstance(entry, forcegp.Coefficients) and not any(
+            type(f) is make[entry.force][0] for f in system.known_forces
+        ):
+            system = replace(system, known_forces=(*system.known_forces, make[entry.force][1]()))
+            added[entry.force] = None
+    return system, list(added)
+
+
+def _number(word: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InvalidInput(f"--learn {word}: {text!r} is not a number; give a start value such as =0.1.") from None
+
+
+def friction_laws(words: str) -> tuple[str, ...]:
+    """`viscous,coulomb` as a tuple; `none` is no friction. Names are checked by `forcegp.analytical`."""
+    return tuple(word for word in (part.strip() for part in words.split(",")) if word and word != "none")
+
+
+RowsChoice = Literal["auto", "in-contact", "all"]
+
+NEARLY_ALL = 0.995
+"""Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
+HARDLY_ANY = 0.2
+"""Share below which something is wrong with the contact, rather than the tool in the air."""
+
+
+def rows_to_learn(
+    dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, choice: RowsChoice
+) -> tuple[forcegp.Dataset, str | None]:
+    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and a note on it.
+
+    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all, with a note.
+    The note is printed after the fit, so that an error before it stands alone. Raises ContactError with "in-contact" if
+    there are none.
+    """
+    if choice == "all" or not system.contacts:
+        return dataset, None
+    try:
+        touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
+    except ContactError:
+        if choice == "in-contact":
+            raise
+        return dataset, None  # the fit raises a clearer error
+    share = len(touching) / len(dataset)
+    if choice == "auto" and share >= NEARLY_ALL:
+        return dataset, None
+    text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+    if choice == "auto" and share < HARDLY_ANY:
+        return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
+    return replace(
+        touching, system=dataset.system
+    ), f"{text}; these alone were learned from (--rows all takes every row)"
+
+
+MOST = 3
+"""Findings whose text is shown; the others by their subject."""
+
+
+def findings_in_one_line(
+    findings: Sequence[forcegp.checks.Finding], data: Path, words: Sequence[str] = (), advise: bool = False
+) -> str | None:
+    """The worst findings, the subjects of the others, and where to read more; None if there are none.
+
+    `words` are the options of forcegp check that show the same findings; `advise` names what to do about the worst
+    finding instead, where no options do.
+    """
+    if not findings:
+        return None
+    shown = [f"{each.subject}: {each.seen.rstrip('.')}" for each in findings[:MOST]]
+    more = dict.fromkeys(each.subject for each in findings[MOST:])
+    others = [f"further {', '.join(more)}"] if more else []
+    see = f"See {shlex.join(['forcegp', 'check', str(data), *words])}"
+    following = findings[0].remedy.rstrip(".") if advise else see
+    return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
+
 
 KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
 
@@ -81,7 +257,7 @@ class LearningOptions(BackendOptions, RobotOptions):
             found = forcegp.checks.quick_check(*looked_at)
             used = [each for each in found if accelerations or each.subject not in ("acceleration", "noise_std")]
             # check has no --contact: it would find nothing wrong with the contacts of the data
-            line = findings_in_one_line(used, self.data, self.robot_words(), advise=bool(self.contact))
+            line = findings_in_one_line(used, self.data, self.words(*ROBOT_OPTIONS), advise=bool(self.contact))
             if line is not None:
                 terminal.warn(line)
         warnings.simplefilter("ignore", ContactWarning)
@@ -95,12 +271,6 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.known_force:
             system = _with_known_forces(system, self.known_force)
         return system
-
-    def system_words(self) -> list[str]:
-        """The options that chose the system, as words of a command that is to work with the same one."""
-        words = self.robot_words()
-        words += [word for value in self.contact for word in ("--contact", value)]
-        return words + [word for value in self.known_force for word in ("--known-force", value)]
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
         """The rows to learn from, and a note to print after the fit."""

@@ -14,15 +14,10 @@ import forcegp
 import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.output_folders import plots_folder, require_free_file, require_free_folder
-from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_options import RobotOptions
-from forcegp.cli.tables import NONE, columns, facts
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.command import DATASET, Debug, Json, require_free_file, unless_given
+from forcegp.cli.input_options import PreparationOptions, RobotOptions
+from forcegp.cli.terminal import NONE, Terminal, columns, facts
 from forcegp.errors import InvalidInput
-
-KIND = "forcegp prepare"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +45,7 @@ class Prepare(PreparationOptions, RobotOptions):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, save, draw if asked to, and show."""
         require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
-        if self.plots is not None:
-            require_free_folder(self.plots, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.plots)
 
         preparation = self._preparation()
         if preparation.changes_nothing:
@@ -65,9 +59,10 @@ class Prepare(PreparationOptions, RobotOptions):
             prepared.dataset.save(temporary)
             if self.plots is not None:  # plots that fail leave no dataset behind
                 content = {"data": str(self.data), "preparation": prepared.report}
-                with plots_folder(terminal, self.plots, KIND, content, overwrite=self.overwrite) as folder:
+                with self.folder(self.plots, content) as folder:
                     figure = forcegp.evaluation.preparation_figure(dataset, prepared.preparation)
                     forcegp.evaluation.save_figure(figure, folder / "spectra.png")
+                terminal.note(f"plots: {self.plots}")
         terminal.show(*_report(self.out, dataset, prepared))
         return {"out": str(self.out), "data": str(self.data), **prepared.report}
 

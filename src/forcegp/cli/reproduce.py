@@ -11,8 +11,7 @@ from typing import Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 
 import forcegp.experiments
-from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import Debug, Json, unless_given
+from forcegp.cli.command import BackendOptions, Debug, Json, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 

@@ -15,13 +15,10 @@ import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
-from forcegp.cli.output_folders import output_folder, require_free_folder
-from forcegp.cli.system_choice import SystemChoice, carried_over
-from forcegp.cli.tables import NONE, columns, facts, number, percent
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.input_options import SystemChoice, carried_over
+from forcegp.cli.terminal import NONE, Terminal, columns, facts, number, percent
 from forcegp.errors import InvalidInput
 
-KIND = "forcegp rollout"
 DEFAULT_STARTS = 10
 MOMENTS = (0.1, 0.25, 0.5, 1.0)
 """Parts of the duration at which the table shows the errors."""
@@ -67,7 +64,7 @@ class Rollout(Command):
         """Roll out, compare, draw and show."""
         rows = self._starts()
         baumgarte = parse_baumgarte(self.baumgarte)
-        require_free_folder(self.out, kind=KIND, overwrite=self.overwrite)
+        self.require_free(self.out)
 
         posterior = forcegp.load_posterior(self.run_folder)
         dataset = forcegp.Dataset.load(self.data)
@@ -98,7 +95,7 @@ class Rollout(Command):
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
         options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
         content = {"options": {name: summary[name] for name in options}}
-        with output_folder(self.out, KIND, content, overwrite=self.overwrite) as folder:
+        with self.folder(self.out, content) as folder:
             self._write(folder, rollout, recorded, errors, dataset, summary)
         terminal.note(f"figure: {self.out / 'rollout.png'}")
         terminal.show(*_report(summary))

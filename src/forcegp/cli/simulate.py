@@ -16,8 +16,7 @@ import forcegp
 import forcegp.data
 import forcegp.simulation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import Command, Debug, Json
-from forcegp.cli.output_folders import require_free_file
+from forcegp.cli.command import Command, Debug, Json, require_free_file
 from forcegp.cli.terminal import Terminal
 
 

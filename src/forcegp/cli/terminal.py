@@ -1,24 +1,68 @@
-"""Output of a command: results on stdout, everything else on stderr; with --json, only JSON on stdout."""
+"""Output of a command: results and tables on stdout, everything else on stderr; with --json, only JSON on stdout."""
 
 from __future__ import annotations
 
 import ctypes
 import json
 import os
+import re
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
 from typing import Any, Protocol
 
+from rich import box
 from rich.console import Console, RenderableType
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
-from forcegp.cli.option_names import with_option_names
+import forcegp
+import forcegp.evaluation
+
+_ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
+
+OTHERWISE = {
+    "contacts": "contact",
+    "folder": "out",
+    "locked": "lock",
+    "most_rows": "max_rows",
+    "observe": "learn_from",
+    "system": "robot",
+}
+"""Options whose argument has another name in Python."""
+
+ELSEWHERE = {
+    "`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)",
+    "forcegp.data.rows_in_contact": "--rows in-contact",
+}
+"""Calls of Python that an option stands for."""
+
+
+def with_option_names(message: str, options: Collection[str]) -> str:
+    """The message with --points for `points` and --points 5 for `points=5`, where the command has such an option.
+
+    The library marks arguments in its messages by backquotes, and options have the same names.
+
+    Arguments that the command does not have stay as they are.
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name, value = found[1], (found[2] or "").strip("'")
+        name = name if name in options else OTHERWISE.get(name, name)
+        if name not in options:
+            return found[0]
+        flag = f"--{name.replace('_', '-')}"
+        return flag if value in ("", "True") else f"{flag}{'=' if value.startswith('-') else ' '}{value}"
+
+    for call, words in ELSEWHERE.items():
+        message = message.replace(call, words)
+    return _ARGUMENT.sub(option, message)
+
 
 PLAIN_SECONDS = 10.0
 """Between two lines about progress where there is no terminal to draw a bar on."""
@@ -117,7 +161,21 @@ class Terminal:
         if self.err.is_terminal:
             yield from self._bar(what, may_end_early)
         else:
-            yield _PlainProgress(self, what, may_end_early).report
+            yield self._lines(what, may_end_early)
+
+    def _lines(self, what: str, may_end_early: bool) -> ProgressCallback:
+        """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
+        start = reported = time.monotonic()
+
+        def report(done: int, total: int, note: str = "") -> None:
+            nonlocal reported
+            now = time.monotonic()
+            if now - reported >= PLAIN_SECONDS and done < total:
+                reported = now
+                parts = [f"{done / total:.0%}", _remaining(now - start, done, total, may_end_early), note]
+                self.note(f"{what}: {', '.join(part for part in parts if part)}")
+
+        return report
 
     def _bar(self, what: str, may_end_early: bool) -> Iterator[ProgressCallback]:
         columns = (
@@ -148,24 +206,6 @@ def _columns_needed(console: Console, renderable: RenderableType) -> int:
     return Measurement.get(console, wide, renderable).maximum - max(0, max(names, default=0) - FOLDED)
 
 
-class _PlainProgress:
-    """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
-
-    def __init__(self, terminal: Terminal, what: str, may_end_early: bool) -> None:
-        self.terminal = terminal
-        self.what = what
-        self.may_end_early = may_end_early
-        self.start = self.reported = time.monotonic()
-
-    def report(self, done: int, total: int, note: str = "") -> None:
-        now = time.monotonic()
-        if now - self.reported < PLAIN_SECONDS or done >= total:
-            return
-        self.reported = now
-        parts = [f"{done / total:.0%}", _remaining(now - self.start, done, total, self.may_end_early), note]
-        self.terminal.note(f"{self.what}: {', '.join(part for part in parts if part)}")
-
-
 def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> str:
     """`12 s left` at the speed so far, or `at most 12 s left`."""
     if not LEAST_SHARE * total < done < total or elapsed < 1.0:
@@ -173,3 +213,116 @@ def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> st
     seconds = elapsed * (total - done) / done
     time_left = f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"
     return f"at most {time_left}" if may_end_early else time_left
+
+
+NONE = "–"
+NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
+NORMAL_FORCES_KNOWN = "it follows from the known forces alone"
+NORMAL_FORCES_SEEN = "this prior leaves no force along the contact normal free, so accelerations decide it"
+
+
+def facts(title: str, values: Mapping[str, str]) -> Table:
+    """Names and values, one per line."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, show_header=False, pad_edge=False)
+    table.add_column(style="dim")
+    table.add_column()
+    for name, value in values.items():
+        table.add_row(name, Text(value))
+    return table
+
+
+def columns(
+    title: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    last: Sequence[str] = (),
+    long_names: bool = False,
+) -> Table:
+    """A table whose first column is text and whose others are numbers; `last` is set apart below.
+
+    Texts of the first column are folded where they are `long_names`, all other cells never.
+    """
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    for place, name in enumerate(header):
+        folded = long_names and not place
+        table.add_column(name, justify="right" if place else "left", no_wrap=not folded, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    if last:
+        table.add_section()
+        table.add_row(*last, style="bold")
+    return table
+
+
+def evaluation_table(title: str, evaluation: forcegp.Evaluation) -> Table:
+    """One line per joint and their mean."""
+    header = ["joint", "MAE", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "MAE, known\nphysics"]
+    formats = {
+        "mae": number,
+        "mae_noise_free": number,
+        "rmse": number,
+        "nlpd": nats,
+        "coverage_95": percent,
+        "known_physics_mae": number,
+    }
+    rows = []
+    for joint, name in enumerate(evaluation.joint_names):
+        each = {score: getattr(evaluation, f"{score}_per_joint") for score in formats}
+        cells = [show(None if each[score] is None else each[score][joint]) for score, show in formats.items()]
+        rows.append([name, *cells])
+    means = [show(getattr(evaluation, score)) for score, show in formats.items()]
+    return columns(title, header, rows, last=["mean (NLPD: joint)", *means])
+
+
+def multiplier_scores(evaluation: forcegp.Evaluation) -> str:
+    """`MAE 1.2345 N, 90.1 % in the 95 % band`, against the true multipliers."""
+    inside = percent(evaluation.multiplier_coverage_95)
+    return f"MAE {number(evaluation.multiplier_mae)} N, {inside} in the 95 % band"
+
+
+def force_facts(scores: forcegp.evaluation.ForceScores, normal_forces: str) -> dict[str, str]:
+    """One line per force whose true value is given: its errors relative to its size, and whether the intervals hold.
+
+    `normal_forces` is a remark on what determines the multiplier.
+    """
+    values = {f"{name}, at the joints": _force_scores(score) for name, score in scores.joint_force.items()}
+    values |= {f"{name}, at its point": _force_scores(score) for name, score in scores.point_force.items()}
+    if scores.multiplier is not None:
+        text = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
+        values["contact force (multiplier)"] = text
+    return values
+
+
+def _force_scores(score: forcegp.evaluation.ForceScore) -> str:
+    """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
+    if score.relative_rmse is None:
+        error = f"{number(score.rmse)} (the true force is zero)"
+    else:
+        share = 100.0 * score.relative_rmse
+        error = f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %"
+    return f"RMS error {error}, {percent(score.coverage_95)} in the 95 % band"
+
+
+def number(value: float | None) -> str:
+    """Four decimals for numbers of ordinary size, a power of ten for others, a dash for none."""
+    if value is None:
+        return NONE
+    return f"{value:.4f}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.0e}"
+
+
+def nats(value: float | None) -> str:
+    """Two decimals: differences below a hundredth of a nat are not significant."""
+    return NONE if value is None else f"{value:.2f}"
+
+
+def percent(value: float | None) -> str:
+    """`94.6 %`."""
+    return NONE if value is None else f"{100.0 * value:.1f} %"

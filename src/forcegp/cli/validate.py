@@ -15,13 +15,10 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.validation
-from forcegp.cli.backend_options import BackendOptions
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.friction_laws import friction_laws
-from forcegp.cli.preparation_options import PreparationOptions
-from forcegp.cli.robot_options import RobotOptions
-from forcegp.cli.tables import NONE, columns, number
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
+from forcegp.cli.input_options import PreparationOptions, RobotOptions
+from forcegp.cli.learning_options import friction_laws
+from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
 
 SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")

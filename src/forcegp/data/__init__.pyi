@@ -1,22 +1,24 @@
-from .blocks import time_blocks as time_blocks
-from .contact_detection import contact_rows as contact_rows, rows_in_contact as rows_in_contact
-from .contact_evidence import ContactDoubt as ContactDoubt, contact_doubts as contact_doubts
+from .row_selection import (
+    time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
+    require_disjoint as require_disjoint, train_test_split as train_test_split,
+)
+from .contact_evidence import (
+    contact_rows as contact_rows, rows_in_contact as rows_in_contact, ContactDoubt as ContactDoubt,
+    contact_doubts as contact_doubts,
+)
 from .dataset import Dataset as Dataset
 from .delay import Delay as Delay, estimate_delay as estimate_delay
-from .farthest_points import farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows
 from .filtering import (
     differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass
     as low_pass, low_pass_gain as low_pass_gain, resample as resample, uniform_step as uniform_step, zero_phase_low_pass
     as zero_phase_low_pass,
 )
-from .frozen_dict import FrozenDict as FrozenDict
+from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
 from .hdf5 import is_dataset as is_dataset
 from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
 from .spectrum import (
     MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,
 )
-from .splits import require_disjoint as require_disjoint, train_test_split as train_test_split
-from .units import REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
 from .windows import (
     OBSERVATIONS as OBSERVATIONS, VelocityIncrements as VelocityIncrements, WeakForm as WeakForm, WindowObservation as
     WindowObservation, Windows as Windows, observation_of as observation_of,

@@ -13,11 +13,17 @@ from jaxtyping import Float, Int
 from typing_extensions import override
 
 import forcegp.mechanics
-from forcegp.data.columns import finite_columns, integer_column
-from forcegp.data.frames import arrays_of, frame_of
-from forcegp.data.frozen_dict import FrozenDict, frozen_json
+from forcegp.data.dataset_fields import (
+    FrozenDict,
+    arrays_of,
+    finite_columns,
+    frame_of,
+    frozen_json,
+    integer_column,
+    units_for,
+    validated_units,
+)
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.data.units import units_for, validated_units
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message, usable_arguments
 from forcegp.summary import Summary, listed, rounded
 

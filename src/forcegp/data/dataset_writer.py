@@ -21,10 +21,8 @@ from jaxtyping import Float
 
 import forcegp.mechanics
 from forcegp.atomic_files import atomic_file
-from forcegp.data.columns import finite_columns
-from forcegp.data.frozen_dict import frozen_json
+from forcegp.data.dataset_fields import finite_columns, frozen_json, validated_units
 from forcegp.data.hdf5 import COMPRESSION, NewFile, describe
-from forcegp.data.units import validated_units
 from forcegp.errors import DatasetError
 
 Rows = Float[np.ndarray, "rows nv"]

@@ -48,7 +48,7 @@ class Preparation:
 
     @usable_arguments("Preparation")
     def __post_init__(self) -> None:
-        if self.cutoff not in (None, "auto") and not _positive(self.cutoff):
+        if self.cutoff not in (None, "auto") and not (_finite(self.cutoff) and self.cutoff > 0):
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
         if isinstance(self.order, bool) or not isinstance(self.order, int) or not 1 <= self.order <= 12:
             raise InvalidInput(f"order is {self.order!r}; it must be an integer from 1 to 12.")
@@ -271,7 +271,3 @@ def _plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:
 
 def _finite(value: object) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
-def _positive(value: object) -> bool:
-    return _finite(value) and value > 0  # type: ignore[operator]  # a number, after the first check

@@ -25,9 +25,9 @@ from scipy.special import beta
 from typing_extensions import override
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.farthest_points import farthest_point_sampling
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
+from forcegp.data.row_selection import farthest_point_sampling
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message, usable_arguments
 from forcegp.robots.real_numbers import whole_number
 

@@ -1,25 +1,26 @@
-from .doubts import unfinished_search as unfinished_search
-from .evaluation import Evaluation as Evaluation
+from .doubts import (
+    unfinished_search as unfinished_search, moved_system as moved_system, system_warnings as system_warnings,
+    normal_force_rests_on_prior as normal_force_rests_on_prior,
+)
+from .evaluation import Evaluation as Evaluation, evaluate as evaluate
 from .force_errors import (
     ForceScore as ForceScore, ForceScores as ForceScores, curve_coverage as curve_coverage, force_scores as
     force_scores,
 )
-from .overlap import moved_system as moved_system, system_warnings as system_warnings
-from .plots.check import check_figure as check_figure
 from .plots.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
-from .plots.likelihood import likelihood_figure as likelihood_figure
-from .plots.normal_force import normal_force_figure as normal_force_figure
-from .plots.prediction import prediction_figure as prediction_figure
+from .plots.log import check_figure as check_figure, preparation_figure as preparation_figure
+from .plots.prediction import (
+    likelihood_figure as likelihood_figure, normal_force_figure as normal_force_figure, prediction_figure as
+    prediction_figure,
+)
 from .plots.rollout import rollout_figure as rollout_figure
-from .plots.spectrum import preparation_figure as preparation_figure
 from .plots.style import save_figure as save_figure
-from .plots.summary import summary_figure as summary_figure
-from .plots.tool_path import tool_path_figure as tool_path_figure
+from .plots.tool_path import summary_figure as summary_figure, tool_path_figure as tool_path_figure
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows
 from .prior_comparison import (
     PriorComparison as PriorComparison, PriorScore as PriorScore, compare_priors as compare_priors,
 )
-from .recorded_segments import RecordedMotions as RecordedMotions, recorded_motions as recorded_motions
-from .rollout_scores import RolloutErrors as RolloutErrors, rollout_errors as rollout_errors
-from .scoring import evaluate as evaluate
-from .unobservable_forces import normal_force_rests_on_prior as normal_force_rests_on_prior
+from .rollout_scores import (
+    RecordedMotions as RecordedMotions, recorded_motions as recorded_motions, RolloutErrors as RolloutErrors,
+    rollout_errors as rollout_errors,
+)

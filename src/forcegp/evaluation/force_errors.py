@@ -7,27 +7,23 @@ truth none is compared, since only their sum is true then.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Numbers
+from forcegp.evaluation.predicted_rows import in_blocks
 from forcegp.models import StructuredPosterior
 from forcegp.models.prediction import Gaussian
 from forcegp.models.protocol import Posterior
-from forcegp.models.search import SMALL_COVARIANCE
 from forcegp.models.structured.components import Curve, term_slices
 
-ROWS_PER_BLOCK = 1024
 ROUNDING = 1e-9
 """Relative to the size of the truth: widths and distances below it are none."""
 
@@ -198,13 +194,8 @@ def _predict(
     posterior: Posterior, dataset: Dataset, named: Collection[str]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Mean and variance of the named components and lambda at every row, in blocks so that memory stays bounded."""
-    small = posterior.training.q.numel() <= SMALL_COVARIANCE
-    blocks: list[dict[str, Gaussian]] = []
-    with torch.no_grad(), threadpool_limits(1) if small else nullcontext():
-        for start in range(0, len(dataset), ROWS_PER_BLOCK):
-            rows = slice(start, start + ROWS_PER_BLOCK)
-            states = (values[rows] for values in (dataset.q, dataset.v, dataset.u))
-            blocks.append(_forces(posterior, named, *states))
+    columns = (dataset.q, dataset.v, dataset.u)
+    blocks = in_blocks(posterior, dataset, lambda rows: _forces(posterior, named, *(each[rows] for each in columns)))
 
     def joined(name: str, part: str) -> np.ndarray:
         return np.concatenate([getattr(block[name], part).cpu().numpy() for block in blocks])

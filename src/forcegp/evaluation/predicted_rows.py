@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from forcegp.models.protocol import Posterior
 from forcegp.models.search import SMALL_COVARIANCE
 
 ROWS_PER_BLOCK = 1024
+Block = TypeVar("Block")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,20 +67,31 @@ def predict_rows(
     posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
 ) -> PredictedRows:
     """Predict all rows. `A` and `b` are those of the Dataset's own system if it has one, else the model's."""
+    blocks = in_blocks(posterior, dataset, lambda block: _predict_block(posterior, dataset, block), progress)
+    joined: dict[str, Any] = {}
+    for field in fields(PredictedRows):
+        parts = [getattr(block, field.name) for block in blocks]
+        joined[field.name] = None if parts[0] is None else np.concatenate(parts)
+    return PredictedRows(**joined)
+
+
+def in_blocks(
+    posterior: Posterior,
+    dataset: Dataset,
+    predict: Callable[[slice], Block],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Block]:
+    """What `predict` returns for all rows, some at a time so that memory stays bounded, without gradients."""
     small = posterior.training.q.numel() <= SMALL_COVARIANCE
     blocks = []
     # On small matrices threads wait for each other: measured 8 times slower with 2 busy cores.
     with torch.no_grad(), threadpool_limits(1) if small else nullcontext():
         for start in range(0, len(dataset), ROWS_PER_BLOCK):
             block = slice(start, min(start + ROWS_PER_BLOCK, len(dataset)))
-            blocks.append(_predict_block(posterior, dataset, block))
+            blocks.append(predict(block))
             if progress is not None:
                 progress(block.stop, len(dataset))
-    joined: dict[str, Any] = {}
-    for field in fields(PredictedRows):
-        parts = [getattr(block, field.name) for block in blocks]
-        joined[field.name] = None if parts[0] is None else np.concatenate(parts)
-    return PredictedRows(**joined)
+    return blocks
 
 
 def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> PredictedRows:

@@ -28,7 +28,7 @@ from forcegp.data import Dataset, time_blocks
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.evaluation.doubts import unfinished_search
-from forcegp.evaluation.scoring import evaluate
+from forcegp.evaluation.evaluation import evaluate
 from forcegp.inference import Exact, OptimizerOptions, ProblemSize
 from forcegp.inference.memory import require_memory
 from forcegp.mechanics import MechanicalSystem

@@ -1,3 +1,3 @@
-from .pages import page_of as page_of
-from .presets import experiments_of as experiments_of
-from .reproduction import page_name as page_name, reproduce as reproduce
+from .reproduction import (
+    page_of as page_of, page_name as page_name, reproduce as reproduce, experiments_of as experiments_of,
+)

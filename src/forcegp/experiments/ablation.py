@@ -8,12 +8,11 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians, number
+from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fits import FitSettings, fit_cost, fit_name, fit_series
-from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
+from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_cost, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
 
 TASKS = "forcegp.experiments.ablation_jobs"
@@ -29,7 +28,6 @@ class Ablation(Experiment):
     name: ClassVar[str] = "ablation"
     title: ClassVar[str] = "What the paper leaves unclear, measured"
 
-    data: DataSettings
     points: tuple[int, ...]
     seeds: tuple[int, ...]
     settings: FitSettings
@@ -66,8 +64,6 @@ class Ablation(Experiment):
                 fit = fit_name(model, self.largest, seed)
                 spec = {"fit": fit, "data": data.name, "seed": seed, "train_seconds": self.data.train_seconds}
                 out.append(Job(_overlap_name(model, seed), f"{TASKS}:overlap", spec, (fit,), 20.0))
-        spec = {**shared, "data": self.data.job(self.seeds[0]).name, "seed": self.seeds[0], "steps": self.steps}
-        out.append(Job("ablation/dense", f"{TASKS}:dense", spec, (spec["data"],), 0.5 * self.steps))
         return out
 
     @override
@@ -94,8 +90,7 @@ class Ablation(Experiment):
             other = medians(fits, ("mae", "mae_noise_free"))
             overlap[model] = medians(jobs, ("mae", "mae_noise_free", "shared"))
             overlap[model] |= {f"{name}_other": each for name, each in other.items()}
-        summary = {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
-        return summary | {"dense": results.result("ablation/dense")}
+        return {"points": self.largest, "schedules": schedules, "filters": filters, "overlap": overlap}
 
     @staticmethod
     def _scores(jobs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -115,16 +110,17 @@ class Ablation(Experiment):
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        parts = (self._search_text, self._dense_text, self._filter_text, self._overlap_text, self._floor_text)
+        parts = (self._search_text, self._filter_text, self._overlap_text, self._floor_text)
         return "\n\n".join(part(summary) for part in parts)
 
     def _search_text(self, summary: Mapping[str, Any]) -> str:
         columns = {OURS: "ours", **SCHEDULES}
-        place = dict(zip(published.FIG2B_POINTS, range(len(published.FIG2B_POINTS)), strict=True)).get(self.largest)
         rows = []
         for model, variants in summary["schedules"].items():
-            paper = "–" if place is None else f"{published.FIG2B_MAE[model][place]:.4f}"
-            rows.append([MODELS[model].label, paper, *(formatted(variants[name]["mae"]) for name in columns)])
+            paper = published.FIG2B_MAE[model].get(self.largest)
+            rows.append(
+                [MODELS[model].label, formatted(paper), *(formatted(variants[name]["mae"]) for name in columns)]
+            )
         likelihoods = [
             [MODELS[model].label, *(formatted(variants[name]["nll"], 0) for name in SCHEDULES)]
             for model, variants in summary["schedules"].items()
@@ -140,19 +136,6 @@ class Ablation(Experiment):
             + markdown_table(["model", "paper", *columns.values()], rows)
             + "\n\nNegative log likelihood that each plain search reached (lower is better):\n\n"
             + markdown_table(["model", *SCHEDULES.values()], likelihoods)
-        )
-
-    def _dense_text(self, summary: Mapping[str, Any]) -> str:
-        dense = summary["dense"]
-        share = dense["ours_seconds"] / dense["dense_seconds"]
-        return (
-            f"**What does convergence cost?** S-GP, N = {self.largest}, in one process, in CPU seconds: "
-            f"{dense['steps']} steps of Adam in the dense formulation of the paper (7N × 7N covariance, two LU "
-            f"factorisations, autograd) take {dense['dense_seconds']:.0f} s and end at a negative log likelihood of "
-            f"{dense['dense_nll']:.1f}; our search takes {dense['ours_seconds']:.1f} s "
-            f"({dense['ours_status']}) and ends at {dense['ours_nll']:.1f}: {share:.3f} of the time. Both are plain "
-            "maximum likelihood; value and gradients of both formulations agree to "
-            f"{number(dense['gradient_difference'])} at the start."
         )
 
     def _filter_text(self, summary: Mapping[str, Any]) -> str:

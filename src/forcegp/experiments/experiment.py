@@ -38,7 +38,7 @@ class Experiment(ABC):
     name: ClassVar[str]
     title: ClassVar[str]
 
-    data: Any
+    data: DataSettings
     points: Any
 
     def with_points(self, points: Sequence[int]) -> Experiment:

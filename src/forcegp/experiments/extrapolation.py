@@ -10,11 +10,10 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
-from forcegp.experiments.fits import FitSettings, fit_cost
-from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
-from forcegp.experiments.plots.extrapolation import extrapolation_figure
+from forcegp.experiments.figures import extrapolation_figure
+from forcegp.experiments.fits import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS, FitSettings, fit_cost
 from forcegp.jobs import Job, JobStore
 
 TASKS = "forcegp.experiments.extrapolation_jobs"
@@ -34,7 +33,6 @@ class Extrapolation(Experiment):
     name: ClassVar[str] = "extrapolation"
     title: ClassVar[str] = "Extrapolation: the other half of the table, and faster"
 
-    data: DataSettings
     points: int
     seeds: tuple[int, ...]
     settings: FitSettings

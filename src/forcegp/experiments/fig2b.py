@@ -11,10 +11,19 @@ from typing_extensions import override
 
 from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fits import FitSettings, all_name, fit_name, fit_series, fit_to_all
-from forcegp.experiments.model_names import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS
-from forcegp.experiments.plots.learning_curves import learning_curves_figure
+from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.figures import learning_curves_figure
+from forcegp.experiments.fits import (
+    ANALYTICAL,
+    GAUSSIAN_PROCESSES,
+    MODELS,
+    NETWORKS,
+    FitSettings,
+    all_name,
+    fit_name,
+    fit_series,
+    fit_to_all,
+)
 from forcegp.jobs import Job, JobStore
 
 SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
@@ -35,7 +44,6 @@ class Fig2b(Experiment):
     name: ClassVar[str] = "fig2b"
     title: ClassVar[str] = "Figure 2b: error against training points"
 
-    data: DataSettings
     points: tuple[int, ...]
     seeds: tuple[int, ...]
     seeds_many_points: tuple[int, ...]
@@ -83,7 +91,7 @@ class Fig2b(Experiment):
         out: list[Row] = []
         for model, curve in summary["curves"].items():
             for count, scores in curve.items():
-                paper = dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[model], strict=True)).get(int(count))
+                paper = published.FIG2B_MAE[model].get(int(count))
                 row: Row = {"model": MODELS[model].label, "points": int(count), "seeds": scores["seeds"]}
                 row |= {"paper_mae": paper, "converged": scores["converged"]}
                 out.append(row | in_columns({name: scores[name] for name in SCORES}))
@@ -110,9 +118,8 @@ class Fig2b(Experiment):
         for score in SCORES:
             rows = []
             for model, curve in summary["curves"].items():
-                paper = dict(zip(published.FIG2B_POINTS, published.FIG2B_MAE[model], strict=True))
                 if score == "mae":
-                    cells = [f"{paper[int(count)]:.4f}" if int(count) in paper else "–" for count in curve]
+                    cells = [formatted(published.FIG2B_MAE[model].get(int(count))) for count in curve]
                     rows.append([f"{MODELS[model].label}, paper", *cells])
                 label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
                 digits = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}.get(score, 4)

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from forcegp.experiments.figures import estimation_figure
 from forcegp.experiments.fits import fit_cost
-from forcegp.experiments.plots.estimation import estimation_figure
 from forcegp.jobs import Job, JobStore
 
 AXES = ("com.x", "com.y", "com.z")
@@ -26,7 +26,6 @@ class Fig2c(Experiment):
     name: ClassVar[str] = "fig2c"
     title: ClassVar[str] = "Figure 2c: the tool's mass and centre of mass"
 
-    data: DataSettings
     points: int
     seed: int
     points_interval: int

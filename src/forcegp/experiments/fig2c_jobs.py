@@ -18,7 +18,7 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Identification, StructuredGP, StructuredPosterior
 from forcegp.priors import JointForces, NoForces
 from forcegp.robots import parameters_from_physical, physical_from_parameters
-from forcegp.simulation.kuka_description import TOOL_LINK
+from forcegp.simulation.kuka_motion import TOOL_LINK
 
 MODELS = {"s-gp": "S-GP", "analytical": "analytical model"}
 MEANS = {"analytical": "with Q_K", "zero": "without Q_K"}

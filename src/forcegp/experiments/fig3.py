@@ -15,10 +15,9 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation.metrics import interval_coverage
 from forcegp.evaluation.summary_statistics import markdown_table, number
 from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fits import MODEL, FitSettings, fit_name, fit_series
-from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.plots.prediction_window import prediction_window_figure
+from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.figures import prediction_window_figure
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
 from forcegp.models import load_posterior
 
@@ -32,7 +31,6 @@ class Fig3(Experiment):
     name: ClassVar[str] = "fig3"
     title: ClassVar[str] = "Figure 3: four models on the same three seconds"
 
-    data: DataSettings
     points: tuple[int, ...]
     seed: int
     start: float

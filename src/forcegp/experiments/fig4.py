@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.summary_statistics import in_columns, markdown_table, median_and_range, number
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
-from forcegp.experiments.fits import FitSettings, fit_series, fit_to_all
-from forcegp.experiments.model_names import GAUSSIAN_PROCESSES, MODELS
-from forcegp.experiments.plots.rollouts import rollouts_figure
+from forcegp.experiments.figures import rollouts_figure
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series, fit_to_all
 from forcegp.jobs import Job, JobStore
 
 BLACK_BOXES = ("gp", "neural-network")
@@ -32,7 +31,6 @@ class Fig4(Experiment):
     name: ClassVar[str] = "fig4"
     title: ClassVar[str] = "Figure 4: roll-outs"
 
-    data: DataSettings
     points: tuple[int, ...]
     seeds: tuple[int, ...]
     starts: int

@@ -1,12 +1,12 @@
-"""Jobs that fit one model to one training set and score it: what most figures are made of.
+"""Models by name, and jobs that fit one of them to one training set and score it: what most figures are made of.
 
 Fits to more points begin where the fit to fewer ended, because the training sets are nested.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,70 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
 from forcegp.experiments.data import scored_rows, training_rows
-from forcegp.experiments.model_names import MODELS, NETWORKS
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import Job, JobStore
-from forcegp.models import load_posterior, save_posterior
+from forcegp.mechanics import MechanicalSystem, ViscousJointFriction
+from forcegp.models import (
+    Coefficients,
+    IndependentGP,
+    NetworkEnsemble,
+    NeuralNetwork,
+    Noise,
+    StructuredGP,
+    load_posterior,
+    save_posterior,
+)
+from forcegp.priors import JointAccelerations, NoForces
+from forcegp.simulation.kuka_motion import TOOL_LINK
+
+START_FRICTION = 0.1
+"""Where the estimation of the joints' viscous friction begins [Nms/rad]."""
+
+
+def _nothing(system: MechanicalSystem) -> Mapping[str, Any]:
+    return {}
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """A model's label in the paper's figures, how it is made for a system, and further arguments of its fit."""
+
+    label: str
+    make: Callable[[MechanicalSystem], Any]
+    fit_arguments: Callable[[MechanicalSystem], Mapping[str, Any]] = field(default=_nothing)
+
+
+def _analytical(system: MechanicalSystem) -> StructuredGP:
+    return StructuredGP(system, NoForces(), noise=Noise(0.1, learn=True))
+
+
+def _analytical_with_friction(system: MechanicalSystem) -> StructuredGP:
+    return _analytical(replace(system, known_forces=(*system.known_forces, ViscousJointFriction(START_FRICTION))))
+
+
+def _physical_parameters(system: MechanicalSystem) -> Mapping[str, Any]:
+    tool = system.robot.link(TOOL_LINK).inertial("mass", "com")
+    return {"learn": [tool, Coefficients("viscous-joint-friction")]}
+
+
+MODELS = {
+    "gp": ModelKind("GP", IndependentGP),
+    "s-gp-38": ModelKind("S-GP [38]", lambda system: StructuredGP(system, JointAccelerations(), "zero")),
+    "s-gp": ModelKind("S-GP", lambda system: StructuredGP(system, mean="zero")),
+    "s-gp-mean": ModelKind("S-GP + analytical mean", StructuredGP),
+    "analytical": ModelKind("analytical model", _analytical),
+    "analytical-fitted": ModelKind("analytical model, fitted", _analytical_with_friction, _physical_parameters),
+    "neural-network": ModelKind("neural network 21-80-7", NeuralNetwork),
+    "ensemble": ModelKind("network ensemble", NetworkEnsemble),
+}
+"""The analytical model has the true parameters; fitted, its tool's mass and centre of mass and a viscous friction of
+every joint are estimated by maximum likelihood. The level of the noise is learned by both.
+"""
+
+GAUSSIAN_PROCESSES = ("gp", "s-gp-38", "s-gp", "s-gp-mean")
+NETWORKS = ("neural-network", "ensemble")
+ANALYTICAL = ("analytical", "analytical-fitted")
+
 
 MODEL = "model"
 """The folder of the fitted model inside its job."""

@@ -1,4 +1,4 @@
-"""Friction as it is: Coulomb, Stribeck, proportional to the load, in the joints, and what each prior makes of it."""
+"""Friction as it is, in every contact: Coulomb, Stribeck, under load, on other surfaces, and with one that opens."""
 
 from __future__ import annotations
 
@@ -10,11 +10,17 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.evaluation.summary_statistics import formatted
-from forcegp.experiments.force_experiment import ForceExperiment, Trial, trial_name
-from forcegp.experiments.force_jobs import MODEL, load
-from forcegp.experiments.force_scenarios import LABELS
-from forcegp.experiments.force_tables import dots_figure, only_test, score_table
+from forcegp.evaluation.summary_statistics import formatted, markdown_table, medians
+from forcegp.experiments.force_experiment import (
+    LABELS,
+    ForceExperiment,
+    Trial,
+    dots_figure,
+    only_test,
+    score_table,
+    trial_name,
+)
+from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS, MODEL, load
 from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 
@@ -97,3 +103,103 @@ class Friction(ForceExperiment):
             if curves:
                 parts.append(f"Curve in its band: {'; '.join(curves)}.")
         return "\n\n".join(parts)
+
+
+SURFACES = {"plane": "viscous", "tilted plane": "tilted", "sphere": "sphere"}
+SURFACES_AND_JOINTS = {
+    "plane": "viscous-joints",
+    "tilted plane": "tilted-joints",
+    "sphere": "sphere-joints",
+    "free motion": "free-joints",
+}
+
+
+@dataclass(frozen=True)
+class Transfer(ForceExperiment):
+    """Trained on the plane, tested on every other surface."""
+
+    name: ClassVar[str] = "transfer"
+    title: ClassVar[str] = "Transfer to other contacts"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [
+            trial
+            for points in self.points
+            for trial in (
+                Trial("tool friction", "viscous", "tool-friction", points, SURFACES),
+                Trial("contact friction", "viscous", "contact-friction", points, SURFACES),
+                Trial("joint forces (the paper's)", "viscous", "joint", points, SURFACES),
+                Trial(
+                    "joint + tool friction",
+                    "viscous-joints",
+                    "joint-friction+tool-friction",
+                    points,
+                    SURFACES_AND_JOINTS,
+                ),
+                Trial("joint forces (the paper's)", "viscous-joints", "joint", points, SURFACES_AND_JOINTS),
+            )
+        ]
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        parts = [
+            f"`posterior.with_contacts(...)`: trained on the plane, analytical mean, {len(self.seeds)} seeds; MAE "
+            "against noise-free accelerations [rad/s²], and in brackets how many times as large as on the plane "
+            "(ratio of medians)."
+        ]
+        for scenario, tests, heading in (
+            ("viscous", SURFACES, "Viscous friction at the tool"),
+            ("viscous-joints", SURFACES_AND_JOINTS, "Viscous friction at the tool, Stribeck friction in the joints"),
+        ):
+            rows = []
+            for trial in summary["trials"]:
+                if trial["scenario"] == scenario:
+                    home = trial["tests"]["plane"]["mae_noise_free"]
+                    errors = [trial["tests"][label]["mae_noise_free"] for label in tests]
+                    cells = [f"{formatted(error)} [{error['median'] / home['median']:.2f}]" for error in errors]
+                    rows.append([trial["label"], str(trial["points"]), *cells])
+            parts += [f"**{heading}**", markdown_table(["model", "points", *tests], rows)]
+        return "\n\n".join(parts)
+
+
+MODELS = {
+    "known physics alone": KNOWN_PHYSICS,
+    "independent GP": BLACK_BOX,
+    "joint forces (the paper's)": "joint",
+    "tool friction": "tool-friction",
+    "contact friction": "contact-friction",
+    "load friction": "load-friction",
+}
+
+
+@dataclass(frozen=True)
+class UnilateralContact(ForceExperiment):
+    """Trained on rows that the data show to be in contact."""
+
+    name: ClassVar[str] = "unilateral-contact"
+    title: ClassVar[str] = "A contact that opens and closes"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [Trial(label, "bullet", prior, points) for label, prior in MODELS.items() for points in self.points]
+
+    @override
+    def summary(self, results: JobStore) -> dict[str, Any]:
+        found = [results.result(self.data_job("bullet", seed, training=True).name) for seed in self.seeds]
+        return super().summary(results) | medians(found, ("in_contact_truth", "in_contact_detected"))
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        columns = ("mae", "mae_noise_free", "mae_touching", "mae_in_the_air", "coverage_95", "normal_force_error")
+        return "\n\n".join(
+            [
+                "PyBullet's unilateral contact with Coulomb friction, from which the tool lifts now and then: "
+                f"{formatted(summary['in_contact_truth'], 3)} of the rows are in contact, "
+                f"{formatted(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
+                f"accelerations alone (`forcegp.data.rows_in_contact`); models are trained on these. "
+                f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
+                "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.",
+                score_table(summary["trials"], columns),
+            ]
+        )

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.integration import INTEGRATORS, integrator_named
-from forcegp.integration.integrators import check_time_step
-from forcegp.integration.newton import rows_jacobian
+from forcegp.integration.integrators import check_time_step, rows_jacobian
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.rollout import AccelerationFunction
 

@@ -19,10 +19,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from forcegp import __version__
-from forcegp.atomic_files import atomic_folder
+from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_unchanged, write_digests
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
-from forcegp.file_digests import SUMS, added_files, require_unchanged, write_digests
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.protocol import Model, Posterior

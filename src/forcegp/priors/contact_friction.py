@@ -1,8 +1,9 @@
-"""`ContactFriction`: what resists the sliding of a contact along its surface."""
+"""`ContactFriction`: what resists the sliding of a contact, and the normal force that this friction changes itself."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -11,13 +12,11 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.priors.expected_friction import ExpectedFriction
-from forcegp.priors.expressed_kernels import ExpressedKernels
-from forcegp.priors.force_prior import Scaling
-from forcegp.priors.joint_forces import chosen_inputs
+from forcegp.priors.expected_friction import ExpectedFriction, TabulatedCurve
+from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling, SumPrior
+from forcegp.priors.joint_forces import JointFriction, chosen_inputs, joint_indices
 from forcegp.priors.kernels import check_kernel
-from forcegp.priors.per_joint import joint_indices
-from forcegp.priors.tool_point import (
+from forcegp.priors.tool_forces import (
     ToolPoint,
     contact_axes,
     has_contact,
@@ -189,3 +188,44 @@ def _speed(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
 
 def _direction(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2 1"]:
     return (sliding / _speed(sliding))[..., None]
+
+
+Table = Callable[[str], TabulatedCurve]
+"""Name of a latent -> its posterior mean over the velocities that the data visited."""
+
+
+def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior | None:
+    """The same prior, where isotropic `ContactFriction` with a load and no `expected` expects the friction in `table`.
+
+    A first fit takes the normal force under the known forces alone; its posterior mean of the sliding friction, and of
+    the `JointFriction` beside it in the sum, gives a better one, with which a second fit finds better curves, and so
+    on. An `expected` that is there was given on purpose and stays. None for priors without such a term.
+    """
+    terms = prior.summands()
+    names = prior.latent_names(robot)
+    slices = prior.slices(robot) if isinstance(prior, SumPrior) else (slice(0, len(names)),)
+    if not any(_wants_load(term) for term in terms):
+        return None
+    joints = tuple(
+        (joint, table(latent))
+        for term, which in zip(terms, slices, strict=True)
+        if isinstance(term, JointFriction)
+        for joint, latent in zip(term.latent_names(robot), names[which], strict=True)
+    )
+    refined = tuple(
+        _expecting(term, ExpectedFriction(table(names[which][0]), joints)) if _wants_load(term) else term
+        for term, which in zip(terms, slices, strict=True)
+    )
+    return refined[0] if len(refined) == 1 else SumPrior(refined)
+
+
+def _wants_load(term: ForcePrior) -> bool:
+    """Whether its latent is a friction coefficient over the sliding speed alone, and the load is still to be found."""
+    if not isinstance(term, ContactFriction) or not term.load or term.expected is not None:
+        return False
+    return term.axes == "isotropic" and term.inputs == ("velocity",) and not term.viscous
+
+
+def _expecting(term: ForcePrior, expected: ExpectedFriction) -> ContactFriction:
+    assert isinstance(term, ContactFriction), "terms with a load are contact frictions"
+    return replace(term, expected=expected)

@@ -16,8 +16,8 @@ from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.priors.per_joint import joint_indices
-from forcegp.priors.tool_point import ToolPoint
+from forcegp.priors.joint_forces import joint_indices
+from forcegp.priors.tool_forces import ToolPoint
 
 SMALLEST_SHARE = 0.1
 """Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""

@@ -17,6 +17,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.priors.kernels import kernel_of
 from forcegp.robots import Robot
 
 Scaling = Literal["standardize", "scale", "none"]
@@ -196,3 +197,26 @@ class SumPrior(ForcePrior):
 
     def _joined(self, of: Callable[[ForcePrior], tuple[Any, ...]]) -> tuple[Any, ...]:
         return tuple(entry for term in self.terms for entry in of(term))
+
+
+class ExpressedKernels(ForcePrior):
+    """A dataclass of plain values whose `kernel_expression` every latent has a kernel of."""
+
+    kernel: Any  # an expression, or None, of which every subclass names its own
+
+    @property
+    def kernel_expression(self) -> str:
+        """An expression of `forcegp.priors.kernel_of`."""
+        assert isinstance(self.kernel, str), "a prior whose kernel may be None overrides this"
+        return self.kernel
+
+    @override
+    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+        return kernels_of(self.kernel_expression, dimensions, variances)
+
+
+def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
+    """One kernel per latent from the same expression."""
+    return tuple(
+        kernel_of(expression, dimension, variance) for dimension, variance in zip(dimensions, variances, strict=True)
+    )

@@ -12,9 +12,8 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.priors.expressed_kernels import kernels_of
-from forcegp.priors.force_prior import ForcePrior
-from forcegp.priors.tool_point import require_moving
+from forcegp.priors.force_prior import ForcePrior, kernels_of
+from forcegp.priors.tool_forces import require_moving
 from forcegp.robots import Robot
 
 

@@ -1,11 +1,25 @@
-"""Short ways to write lists of column names: `pos{1..7}`, `{left,right}_arm`, `position.{joints}`."""
+"""Columns of a log: lists in short, names that are guessed, and linear combinations.
+
+    expression = ["+"] term { ("+" | "-") term }
+    term       = ["-"] factor { ("*" | "/") factor }    at most one column, and only numbers below "/"
+    factor     = number | "pi" | column | `column`
+
+Known columns are recognised letter by letter, the longest first, so most names need no quotes whatever they contain;
+backticks settle the rest.
+"""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
-from forcegp.errors import InvalidInput
+import numpy as np
+from jaxtyping import Float
+
+from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.recordings.source import Source
 
 BRACES = re.compile(r"\{([^{}]*)\}")
 RANGE = re.compile(r"(\d+)\.\.(\d+)")
@@ -68,3 +82,168 @@ def _choices(pattern: str, inside: str, joints: Sequence[str]) -> list[str]:
     if len(choices) > 1 and all(choices):
         return choices
     raise InvalidInput(f"{pattern!r}: write {{1..7}}, {{a,b}} or {{joints}} in braces, not {{{inside}}}.")
+
+
+WORDS = {
+    "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
+    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
+    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "joint_torque", "joint_effort"},
+    "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
+    "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
+}
+"""What the rest of a column's name, beside that of the joint, must mean."""
+
+
+def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple[str, ...] | None:
+    """One column per joint whose names are the joint's name in a text that means `signal`; None if there is none.
+
+    Raises InvalidInput if several sets of columns could be meant.
+    """
+    templates: dict[tuple[str, str], dict[str, str]] = {}
+    for column in source.columns():
+        for joint in joints:
+            for found in re.finditer(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])", column):
+                around = column[: found.start()], column[found.end() :]
+                templates.setdefault(around, {})[joint] = column
+    fitting = [
+        tuple(found[joint] for joint in joints)
+        for around, found in templates.items()
+        if len(found) == len(joints) and _says(signal, around)
+    ]
+    if len(fitting) > 1:
+        candidates = " or ".join(", ".join(columns) for columns in fitting)
+        raise InvalidInput(f"{source.path}: {signal} could be {candidates}; choose with --{signal}.")
+    return fitting[0] if fitting else None
+
+
+def guessed_time(source: Source, used: Sequence[str]) -> str | None:
+    """The column that must be the time: by the format, or the only one of such a name. None if there is none."""
+    by_format = source.time_beside(used)
+    if by_format is not None:
+        return by_format
+    named = [column for column in source.columns() if column.lower() in WORDS["time"]]
+    if len(named) > 1:
+        raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; choose with `time`.")
+    return named[0] if named else None
+
+
+def _says(signal: str, around: tuple[str, str]) -> bool:
+    """Do the last word before the joint's name or the first after it name the signal?"""
+    before = re.split(r"[^A-Za-z_]+", around[0].rstrip("_.:/ -["))[-1]
+    after = re.split(r"[^A-Za-z_]+", around[1].lstrip("_.:/ -]"))[0]
+    words = {word.strip("_").lower() for word in (before, after)} - {""}
+    return bool(words & WORDS[signal])
+
+
+WORD_ENDS = r"(?!\w)"
+FACTOR = (
+    r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?))(?!\w)|(?P<pi>pi)(?!\w)"
+    r"|(?P<word>[^\s+*/`]+)"
+)
+NAME_LETTER = re.compile(r"\w")
+
+
+@dataclass(frozen=True)
+class LinearExpression:
+    """`constant + sum of weight * column`.
+
+    `weights` maps column names to their weights, none of them twice.
+    """
+
+    weights: Mapping[str, float]
+    constant: float = 0.0
+
+    @property
+    def is_column(self) -> bool:
+        """Is this one column as it is?"""
+        return self.constant == 0.0 and list(self.weights.values()) == [1.0]
+
+    def value(self, columns: Mapping[str, np.ndarray], rows: int) -> Float[np.ndarray, " rows"]:
+        """The combination of these columns; a column by itself comes out to the last bit."""
+        result = None
+        for name, weight in self.weights.items():
+            term = np.asarray(columns[name], dtype=np.float64)
+            term = term if weight == 1.0 else weight * term
+            result = term if result is None else result + term
+        if result is None:
+            return np.full(rows, self.constant)
+        return result if self.constant == 0.0 else result + self.constant
+
+
+def parse_expression(text: str, columns: Collection[str], owner: str) -> LinearExpression:
+    """Read a linear combination of `columns`; `owner` is the file that has them, for messages.
+
+    Raises InvalidInput, saying where, for anything that is not a linear combination, and for a column of another name.
+    """
+    if text in columns:
+        return LinearExpression({text: 1.0})
+    return _Parser(text, columns, owner).expression()
+
+
+class _Parser:
+    """What is left of the text is `rest`, without blanks before it."""
+
+    def __init__(self, text: str, columns: Collection[str], owner: str) -> None:
+        self.text, self.columns, self.owner = text, columns, owner
+        self.rest = text.lstrip()
+        longest_first = sorted(columns, key=len, reverse=True)
+        names = "|".join(re.escape(name) + (WORD_ENDS if NAME_LETTER.match(name[-1]) else "") for name in longest_first)
+        self.factor = re.compile(FACTOR % names)
+
+    def expression(self) -> LinearExpression:
+        weights: dict[str | None, float] = {}  # None: the constant
+        sign = 1.0
+        self._taken("+")
+        while sign:
+            name, factor = self._term()
+            weights[name] = weights.get(name, 0.0) + sign * factor
+            sign = 1.0 if self._taken("+") else -1.0 if self._taken("-") else 0.0
+        if self.rest:
+            raise self._wrong("expected + or -")
+        if not all(math.isfinite(weight) for weight in weights.values()):
+            raise InvalidInput(f"{self.text!r} has a number that is not finite.")
+        constant = weights.pop(None, 0.0)
+        return LinearExpression({name: weight for name, weight in weights.items() if name and weight != 0.0}, constant)
+
+    def _term(self) -> tuple[str | None, float]:
+        sign = -1.0 if self._taken("-") else 1.0
+        name, value = self._factor()
+        value *= sign
+        while True:
+            if self._taken("*"):
+                other, factor = self._factor()
+                if name is not None and other is not None:
+                    raise self._wrong(f"{name!r} times {other!r} is not linear")
+                name, value = name or other, value * factor
+            elif self._taken("/"):
+                other, factor = self._factor()
+                if other is not None or factor == 0.0:
+                    raise self._wrong("only division by a number other than 0 is linear")
+                value /= factor
+            else:
+                return name, value
+
+    def _factor(self) -> tuple[str | None, float]:
+        found = self.factor.match(self.rest)
+        if found is None or found.lastgroup is None:
+            backtick = self.rest.startswith("`")
+            raise self._wrong("a backtick without its partner" if backtick else "expected a column or a number")
+        kind, word = found.lastgroup, found[found.lastgroup]
+        self.rest = self.rest[found.end() :].lstrip()
+        if kind in ("number", "pi"):
+            return None, float(word) if kind == "number" else math.pi
+        if word not in self.columns:
+            where = "" if word == self.text else f" (in {self.text!r})"
+            raise InvalidInput(unknown_name_message("column", word, f"{self.owner}{where}", self.columns))
+        return word, 1.0
+
+    def _taken(self, sign: str) -> bool:
+        taken = self.rest.startswith(sign)
+        self.rest = self.rest[1:].lstrip() if taken else self.rest
+        return taken
+
+    def _wrong(self, why: str) -> InvalidInput:
+        return InvalidInput(
+            f"{self.text!r} is not a linear combination of columns: {why} at {self.rest[:20]!r}. "
+            "For example: theta2 - theta1, 0.5*`a-b` + pi/2."
+        )

@@ -15,16 +15,18 @@ import forcegp.mechanics
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import EpisodeRows
-from forcegp.recordings.formats import open_source
+from forcegp.recordings.episode_rows import EpisodeRows, Stamps, read_stamps
+from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.plausibility import require_plausible_positions, warn_of_implausible_forces
-from forcegp.recordings.reading import RawRecording, read_recording
-from forcegp.recordings.side_by_side import SideBySide
+from forcegp.recordings.reading import (
+    RawRecording,
+    Spool,
+    read_recording,
+    require_plausible_positions,
+    warn_of_implausible_forces,
+)
 from forcegp.recordings.signal_plan import SignalPlan, signal_plan
 from forcegp.recordings.source import Source
-from forcegp.recordings.spool import Spool
-from forcegp.recordings.time_stamps import Stamps, read_stamps
 
 ROUND_RATE = 1e-3
 """A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""

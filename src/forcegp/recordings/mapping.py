@@ -1,13 +1,79 @@
-"""`ColumnMapping`: which columns are the time, positions, velocities and forces, in which units."""
+"""`ColumnMapping`: which columns are what, in which units; its YAML files, and the short forms of the command line."""
 
 from __future__ import annotations
 
+import difflib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from fractions import Fraction
+from pathlib import Path
 from typing import Any, ClassVar
 
-from forcegp.errors import InvalidInput, usable_arguments
-from forcegp.recordings.signal_units import UNITS, log_unit
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from forcegp.errors import FileFormatError, InvalidInput, usable_arguments
+from forcegp.recordings.column_names import listed
+from forcegp.recordings.source import reading
+
+
+@dataclass(frozen=True)
+class LogUnit:
+    """`numerator / denominator` is one unit in SI; both are kept, for x / 1000 rounds once and x * 0.001 twice."""
+
+    name: str
+    si: str
+    numerator: float = 1.0
+    denominator: float = 1.0
+
+    def in_si(self, values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """The values in the SI unit; those that are in it already come out as they are."""
+        if self.numerator != 1.0:
+            values = values * self.numerator
+        return values / self.denominator if self.denominator != 1.0 else values
+
+
+def _units(si: str, **factors: Fraction | int | float) -> dict[str, LogUnit]:
+    made = {}
+    for name, factor in factors.items():
+        name = name.replace("_per_", "/").replace("squared", "^2")
+        if isinstance(factor, Fraction):
+            made[name] = LogUnit(name, si, float(factor.numerator), float(factor.denominator))
+        else:
+            made[name] = LogUnit(name, si, float(factor))
+    return made
+
+
+_MILLI, _MICRO, _NANO = Fraction(1, 1000), Fraction(1, 10**6), Fraction(1, 10**9)
+_DEGREE, _TURN = math.pi / 180.0, 2.0 * math.pi
+
+UNITS: dict[str, dict[str, LogUnit]] = {
+    "time": _units("s", s=1, ms=_MILLI, us=_MICRO, ns=_NANO, min=60),
+    "q": _units("rad", rad=1, mrad=_MILLI, deg=_DEGREE, rev=_TURN)
+    | _units("m", m=1, cm=Fraction(1, 100), mm=_MILLI, um=_MICRO),
+    "v": _units("rad/s", rad_per_s=1, mrad_per_s=_MILLI, deg_per_s=_DEGREE, rev_per_s=_TURN, rpm=_TURN / 60.0)
+    | _units("m/s", m_per_s=1, cm_per_s=Fraction(1, 100), mm_per_s=_MILLI),
+    "u": _units("Nm", Nm=1, mNm=_MILLI, uNm=_MICRO, kNm=1000, Ncm=Fraction(1, 100))
+    | _units("N", N=1, mN=_MILLI, kN=1000),
+    "a": _units("rad/s^2", rad_per_ssquared=1, deg_per_ssquared=_DEGREE)
+    | _units("m/s^2", m_per_ssquared=1, mm_per_ssquared=_MILLI),
+}
+"""By quantity and name: what `ColumnMapping.unit` accepts."""
+
+
+def log_unit(quantity: str, name: str) -> LogUnit:
+    """The unit of that name. Raises InvalidInput listing those of the quantity."""
+    units = UNITS[quantity]
+    spelled = name.strip().replace("**", "^").replace("²", "^2").replace("µ", "u").replace("·", "").replace("°", "deg")
+    if spelled in units:
+        return units[spelled]
+    lower = {known.lower(): known for known in units}
+    close = lower.get(spelled.lower()) or next(iter(difflib.get_close_matches(spelled, units, n=1)), None)
+    hint = f"; did you mean {close}?" if close else "."
+    raise InvalidInput(f"{quantity} has no unit {name!r}{hint} Known: {', '.join(units)}.")
+
 
 SIGNALS = ("q", "v", "u", "a")
 Factors = Mapping[str, tuple[float, ...]]
@@ -115,3 +181,154 @@ def _shortened(value: Any) -> Any:
         return value
     alone = len(value) == 1 and "," not in str(value[0])  # a text with a comma would be read as a list
     return value[0] if alone else list(value)
+
+
+LARGEST = 2**20  # bytes
+OF_FOLDER = "forcegp.yaml"
+
+
+class _OnceLoader(yaml.SafeLoader):
+    """Safe YAML in which no key may stand twice and nothing may refer to something else."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            raise yaml.constructor.ConstructorError(
+                None, None, "aliases (*name) are not read", self.peek_event().start_mark
+            )
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        repeated = [key for key in keys if keys.count(key) > 1]
+        if repeated:
+            raise yaml.constructor.ConstructorError(None, None, f"{repeated[0]!r} stands twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def read_mapping(path: Path) -> ColumnMapping:
+    """The mapping in a YAML file, whose keys are the fields of `ColumnMapping`.
+
+    Raises FileFormatError naming the file and the key.
+    """
+    if not path.is_file():
+        raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
+    with reading(path, "YAML", yaml.YAMLError, AttributeError, IndexError):  # !!timestamp x, !!int ''
+        if path.stat().st_size > LARGEST:
+            raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)  # a SafeLoader
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{path} must be a mapping such as 'q: pos{{1..7}}'.")
+    try:
+        return mapping_of(content)
+    except InvalidInput as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
+    """The mapping in plain values. Raises InvalidInput naming the key that is not known or has a wrong value."""
+    known = [item.name for item in fields(ColumnMapping)]
+    values: dict[str, Any] = {}
+    for key, value in content.items():
+        if key not in known:
+            raise InvalidInput(f"key {key!r} is not known; there are {', '.join(known)}.")
+        if value is None:
+            continue
+        if key in SIGNALS or key == "joints":
+            values[key] = _texts(key, value)
+        elif key == "unit":
+            values[key] = {str(name): _texts(f"unit of {name}", entry) for name, entry in _dict(key, value).items()}
+        elif key in ("sign", "scale", "offset"):
+            values[key] = {
+                signal: _numbers(f"{key} of {signal}", entry) for signal, entry in _by_signal(key, value).items()
+            }
+        elif key == "headerless":
+            values[key] = tuple(_whole(number) for number in (value if isinstance(value, list) else [value]))
+        elif key == "step":
+            values[key] = _number(key, value)
+        elif key == "side_by_side":
+            if not isinstance(value, bool):
+                raise InvalidInput(f"side_by_side is {value!r}; give true or false.")
+            values[key] = value
+        else:
+            if not isinstance(value, str):
+                raise InvalidInput(f"{key} is {value!r}; give a text.")
+            values[key] = value
+    return ColumnMapping(**values)
+
+
+def mapping_text(mapping: ColumnMapping) -> str:
+    """The YAML of a mapping, which `read_mapping` reads."""
+    return yaml.safe_dump(mapping.plain(), sort_keys=False, allow_unicode=True, default_flow_style=False, width=120)
+
+
+def beside(log: Path) -> Path | None:
+    """The mapping that belongs to a log: STEM.yaml beside it, or forcegp.yaml in its folder."""
+    own = log.with_name(f"{log.name.split('.')[0]}.yaml")
+    return next((path for path in (own, log.parent / OF_FOLDER) if path.is_file()), None)
+
+
+def by_quantity(flag: str, text: str) -> dict[str, list[str]]:
+    """`q=deg,m,time=ms` as {"q": ["deg", "m"], "time": ["ms"]}: what follows a name up to the next one is its list."""
+    found: dict[str, list[str]] = {}
+    name = None
+    for part in text.split(","):
+        before, equals, after = part.partition("=")
+        if equals:
+            name, part = before.strip(), after
+            if name in found:
+                raise InvalidInput(f"--{flag} names {name} twice.")
+        if name is None or not part.strip():
+            raise InvalidInput(f"--{flag} is {text!r}; write for example {flag} {_EXAMPLES[flag]}.")
+        found.setdefault(name, []).append(part.strip())
+    return found
+
+
+_EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "scale": "u=0.001", "offset": "q=0,1.5708"}
+
+
+def factors_of(flag: str, text: str) -> Any:
+    """The value of `sign`, `scale` or `offset` as a YAML file would have it."""
+    if "=" not in text:
+        return [_number(flag, part) for part in text.split(",")]
+    return {name: [_number(flag, part) for part in parts] for name, parts in by_quantity(flag, text).items()}
+
+
+def _texts(key: str, value: Any) -> tuple[str, ...]:
+    entries = value if isinstance(value, list) else listed(value) if isinstance(value, str) else [value]
+    if not entries or any(isinstance(entry, bool) or not isinstance(entry, str | int | float) for entry in entries):
+        raise InvalidInput(f"{key} is {value!r}; give a text or a list of texts.")
+    return tuple(str(entry) for entry in entries)
+
+
+def _by_signal(key: str, value: Any) -> Mapping[str, Any]:
+    """A list without signals is for all of them, which only a sign can be: it turns the axis of a joint around."""
+    if isinstance(value, dict):
+        return {str(name): entry for name, entry in value.items()}
+    if key != "sign":
+        raise InvalidInput(f"{key} is {value!r}; name its signal, for example {_EXAMPLES[key]}.")
+    return dict.fromkeys(SIGNALS, value)
+
+
+def _dict(key: str, value: Any) -> Mapping[Any, Any]:
+    if not isinstance(value, dict):
+        raise InvalidInput(f"{key} is {value!r}; name the quantity, for example {_EXAMPLES[key]} ({', '.join(UNITS)}).")
+    return value
+
+
+def _numbers(key: str, value: Any) -> tuple[float, ...]:
+    return tuple(_number(key, entry) for entry in (value if isinstance(value, list) else [value]))
+
+
+def _number(key: str, value: Any) -> float:
+    try:
+        if isinstance(value, bool):
+            raise ValueError
+        return float(value)
+    except (TypeError, ValueError):
+        raise InvalidInput(f"{key} is {value!r}; give a number.") from None
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InvalidInput(f"headerless is {value!r}; give the number of columns.")
+    return value

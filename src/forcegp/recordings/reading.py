@@ -1,16 +1,51 @@
-"""One recording from a log into the spool: columns evaluated, checked for numbers that are none, and set aside."""
+"""One recording from a log into the spool: columns evaluated, checked for values that make no sense, and set aside."""
 
 from __future__ import annotations
 
+import tempfile
+import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from forcegp.errors import DatasetError, FileFormatError
+import forcegp.robots
+from forcegp.errors import DatasetError, DataWarning, FileFormatError
 from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
-from forcegp.recordings.spool import Spool
+
+
+class Spool:
+    """A table of float64 in a file without a name, which is gone with the process whatever ends it.
+
+    Rows are appended in blocks and read back by number; memory holds only what is read. Rates and gaps are known only
+    after the last row, and reading most formats costs more than everything after it, so a log is read once; the result
+    then depends neither on its format nor on the size of the pieces that a reader gives.
+    """
+
+    def __init__(self, folder: Path, width: int) -> None:
+        self.width = width
+        self.rows = 0
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # closed by __exit__
+
+    def __enter__(self) -> Spool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def append(self, table: Float[np.ndarray, "rows width"]) -> None:
+        """Put rows at the end."""
+        self._file.write(np.ascontiguousarray(table, dtype=np.float64).data)
+        self.rows += len(table)
+
+    def read(self, start: int, end: int) -> Float[np.ndarray, "rows width"]:
+        """Rows start to end, the latter excluded, as an array of its own."""
+        self._file.seek(start * self.width * 8)
+        data = self._file.read((end - start) * self.width * 8)
+        return np.frombuffer(data, np.float64).reshape(-1, self.width)
+
 
 ROWS_AT_A_TIME = 16384
 TURN = 2.0 * np.pi
@@ -179,3 +214,57 @@ def _note_episodes(column: np.ndarray, episodes: list[tuple[int, int]], source: 
             )
         seen.add(number)
         episodes.append((number, rows + int(start)))
+
+
+BEYOND = 0.1
+"""Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
+
+TURNS = 4.0 * np.pi
+"""rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees."""
+
+STRONGER = 3.0
+"""Times the limit of the URDF that a force may be before it is warned of."""
+
+
+def require_plausible_positions(
+    recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None, stated: bool
+) -> None:
+    """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees.
+
+    `stated`: the unit of q was given, which is then believed where no URDF contradicts it.
+    Raises DatasetError naming the joint, its range and what to do.
+    """
+    limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
+    for index, item in enumerate(plan.signals):
+        if item.signal != "q":
+            continue
+        low, high = recording.lowest[index], recording.highest[index]
+        lower, upper = limits.get(item.joint, (-np.inf, np.inf))
+        margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        beyond = low < lower - margin or high > upper + margin
+        degrees = item.unit.name == "rad" and max(-low, high) > TURNS
+        where = f"{recording.label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
+        if beyond:
+            hint = "Is it in degrees? Then add `unit` q=deg." if degrees else "Are unit, sign, offset and URDF right?"
+            raise DatasetError(
+                f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF. {hint} `beyond_limits` accepts it."
+            )
+        if degrees and not stated and not np.isfinite(upper - lower):
+            raise DatasetError(
+                f"{where}, more than two turns. Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
+            )
+
+
+def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None) -> None:
+    """Warn (DataWarning) of forces far beyond the limits of the URDF."""
+    limits = {} if robot is None else {joint.name: joint.effort_limit for joint in robot.joints}
+    for index, item in enumerate(plan.signals):
+        limit = limits.get(item.joint, np.inf)
+        most = float(max(-recording.lowest[index], recording.highest[index]))
+        if item.signal == "u" and 0.0 < limit < np.inf and most > STRONGER * limit:
+            warnings.warn(
+                f"{recording.label}: u of joint {item.joint!r} reaches {most:.4g} {item.unit.si}; the URDF allows "
+                f"{limit:.4g}. Is it in another unit (`unit` u=mNm), or on the motor's side of a gear (`scale`)?",
+                DataWarning,
+                stacklevel=2,
+            )

@@ -10,13 +10,10 @@ import numpy as np
 
 import forcegp.robots
 from forcegp.data import FrozenDict
-from forcegp.data.units import ROTATION, TRANSLATION, validated_units
+from forcegp.data.dataset_fields import ROTATION, TRANSLATION, validated_units
 from forcegp.errors import InvalidInput
-from forcegp.recordings.column_guessing import guessed_columns, guessed_time
-from forcegp.recordings.column_names import expanded
-from forcegp.recordings.linear_expressions import LinearExpression, parse_expression
-from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.signal_units import LogUnit, log_unit
+from forcegp.recordings.column_names import LinearExpression, expanded, guessed_columns, guessed_time, parse_expression
+from forcegp.recordings.mapping import SIGNALS, ColumnMapping, LogUnit, log_unit
 from forcegp.recordings.source import Columns, Source
 
 

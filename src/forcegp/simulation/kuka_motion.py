@@ -2,28 +2,104 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from forcegp.errors import SimulationError
+from forcegp.errors import MissingExtra, RobotModelError, SimulationError
 from forcegp.simulation.bullet import BulletArm
-from forcegp.simulation.bullet_contact import BulletContact, with_tool_sphere
-from forcegp.simulation.contact_forces import ArmState, IdealContact, NoContact
-from forcegp.simulation.friction_laws import (
+from forcegp.simulation.contact_forces import (
+    ArmState,
+    BulletContact,
     DryFriction,
+    IdealContact,
     JointStribeckFriction,
+    NoContact,
     PointFriction,
     RoughPatch,
     ViscousFriction,
+    with_tool_sphere,
 )
-from forcegp.simulation.kuka_description import TOOL_LINK
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
-from forcegp.simulation.tables import Table, table_of
-from forcegp.simulation.task_space_controller import TaskSpaceController
-from forcegp.simulation.trajectory import PathOverTable
+from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
+
+TOOL_LINK = "lbr_iiwa_link_7"
+BASE_LINK = "lbr_iiwa_link_0"
+
+
+def kuka_urdf(
+    *,
+    base_height: float,
+    tool_mass: float,
+    tool_center_of_mass: Sequence[float],
+    tool_inertia: Sequence[float],
+    joint_damping: float,
+) -> str:
+    """The URDF with the given inertia of link 7 [kg, m, kg m^2], joint damping [Nms/rad] and base height [m].
+
+    A link `world` with a fixed joint carries the base. Meshes and materials are left out: no file path may go into a
+    Dataset, and collisions are off. The base cannot move and is massless. The licence comment of the original stays at
+    the head. Raises MissingExtra without PyBullet.
+    """
+    path = _original()
+    text = path.read_text(encoding="utf-8")
+    root = ElementTree.fromstring(text)
+    for unused in root.findall("material"):
+        root.remove(unused)
+    for link in root.findall("link"):
+        for child in list(link):
+            if child.tag != "inertial":
+                link.remove(child)
+    for dynamics in root.iter("dynamics"):
+        dynamics.set("damping", repr(float(joint_damping)))
+    tool, base = (root.find(f"link[@name='{name}']/inertial") for name in (TOOL_LINK, BASE_LINK))
+    if tool is None or base is None:
+        raise RobotModelError(
+            f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia; install pybullet 3.2.6 or 3.2.7."
+        )
+    _write_inertial(tool, tool_mass, tool_center_of_mass, tool_inertia)
+    _write_inertial(base, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    _mount(root, base_height)
+    ElementTree.indent(root)
+    head = text[: text.index("<robot")]
+    changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
+    return head + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _original() -> Path:
+    try:
+        import pybullet_data
+    except ImportError as error:
+        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
+    return Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+
+
+def _write_inertial(
+    inertial: ElementTree.Element, mass: float, center_of_mass: Sequence[float], moments: Sequence[float]
+) -> None:
+    inertial.clear()
+    ElementTree.SubElement(inertial, "origin", rpy="0 0 0", xyz=_numbers(center_of_mass))
+    ElementTree.SubElement(inertial, "mass", value=repr(float(mass)))
+    diagonal = dict(zip(("ixx", "iyy", "izz"), (repr(float(moment)) for moment in moments), strict=True))
+    ElementTree.SubElement(inertial, "inertia", ixy="0", ixz="0", iyz="0", **diagonal)
+
+
+def _mount(root: ElementTree.Element, height: float) -> None:
+    joint = ElementTree.Element("joint", name="world_joint", type="fixed")
+    ElementTree.SubElement(joint, "parent", link="world")
+    ElementTree.SubElement(joint, "child", link=BASE_LINK)
+    ElementTree.SubElement(joint, "origin", rpy="0 0 0", xyz=_numbers((0.0, 0.0, height)))
+    root.insert(0, joint)
+    root.insert(0, ElementTree.Element("link", name="world"))
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
 
 TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])
 """Euler angles (0, -pi, 0) as a quaternion (x, y, z, w): the tool points straight down."""

@@ -13,10 +13,9 @@ from forcegp.data import Dataset, units_for
 from forcegp.errors import SimulationError
 from forcegp.mechanics import Actuation, Baumgarte, Contact, MechanicalSystem, RigidBodyBias
 from forcegp.robots import Robot
-from forcegp.simulation.kuka_description import TOOL_LINK, kuka_urdf
-from forcegp.simulation.kuka_motion import Motion, random_stream, simulate_episode
+from forcegp.simulation.kuka_motion import TOOL_LINK, Motion, kuka_urdf, random_stream, simulate_episode
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
-from forcegp.simulation.tables import table_of
+from forcegp.simulation.trajectory import table_of
 
 Progress = Callable[[int, int], None]
 """Called as `progress(steps done, steps in total)`."""

@@ -1,21 +1,51 @@
-"""Every number of the `kuka-surface` scenario. Loads no library: a command line lists the options at once."""
+"""Scenarios by name, and every number of `kuka-surface`. Loads no library: a command line lists the options at once."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import ClassVar, Literal, get_args
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, get_args
 
+import forcegp.data
 from forcegp.errors import InvalidInput, usable_arguments
-from forcegp.simulation.checked_numbers import (
-    FINITE,
-    NOT_NEGATIVE,
-    POSITIVE,
-    Range,
-    checked_numbers,
-    require_choice,
-    require_integer,
-)
+
+Range = tuple[str, float, float]
+"""What is allowed in words, the least and the largest value."""
+
+POSITIVE: Range = ("finite and > 0", 1e-12, 1e9)
+NOT_NEGATIVE: Range = ("finite and >= 0", 0.0, 1e9)
+FINITE: Range = ("finite", -1e9, 1e9)
+
+
+def checked_numbers(name: str, value: Any, allowed: Range, length: int | None) -> float | tuple[float, ...]:
+    """The value as float, or as a tuple of `length` floats. Raises InvalidInput naming the field and its range."""
+    words, lower, upper = allowed
+    values = tuple(value) if isinstance(value, tuple | list) else (value,)
+    if len(values) != (length or 1) or isinstance(value, tuple | list) != (length is not None):
+        raise InvalidInput(
+            f"{name} is {value!r}; it must be {f'{length} numbers' if length else 'one number'}, {words}."
+        )
+    for number in values:
+        valid = isinstance(number, int | float) and not isinstance(number, bool)
+        if not valid or not lower <= number <= upper:  # NaN fails every comparison
+            raise InvalidInput(f"{name} is {value!r}; it must be {words}.")
+    return tuple(float(number) for number in values) if length else float(values[0])
+
+
+def require_integer(name: str, value: Any, lower: int, upper: int) -> None:
+    """Raise InvalidInput naming the field for anything else than an integer in the range."""
+    if isinstance(value, bool) or not isinstance(value, int) or not lower <= value <= upper:
+        raise InvalidInput(f"{name} is {value!r}; it must be an integer from {lower} to {upper}.")
+
+
+def require_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """Raise InvalidInput naming the field for anything but one of the choices."""
+    if value not in choices:
+        raise InvalidInput(f"{name} is {value!r}; it must be one of {', '.join(choices)}.")
+
 
 Friction = Literal["viscous", "coulomb", "stribeck"]
 JointFriction = Literal["none", "coulomb", "stribeck"]
@@ -272,3 +302,34 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "surface": get_args(Surface),
     "contact": get_args(ContactKind),
 }
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A simulation that makes a Dataset. Its libraries are imported at `simulate`, so that listing scenarios is quick.
+
+    summary: one line; config: frozen dataclass of all its numbers; function: "module:name" of a function
+    `(config, progress=None) -> Dataset`.
+    """
+
+    summary: str
+    config: type
+    function: str
+
+    def simulate(self, config: Any, progress: Callable[[int, int], None] | None = None) -> forcegp.data.Dataset:
+        """Run it. `progress(steps done, steps in total)` is called now and then."""
+        if not isinstance(config, self.config):
+            raise InvalidInput(f"config is {type(config).__name__}; this scenario takes {self.config.__name__}.")
+        module, _, name = self.function.partition(":")
+        return getattr(import_module(module), name)(config, progress)
+
+
+SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
+    {
+        "kuka-surface": Scenario(
+            summary="a KUKA iiwa slides its tool on a surface with friction that nobody models",
+            config=KukaSurfaceConfig,
+            function="forcegp.simulation.kuka_surface:simulate_kuka_surface",
+        )
+    }
+)

@@ -1,14 +1,104 @@
-"""Reference motion of the tool: straight segments between random way-points, at rest in each of them."""
+"""What the tool slides on, its way-points, the smooth path through them, and the controller that follows it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+import forcegp.mechanics
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
-from forcegp.simulation.tables import Table
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTable:
+    """The plane through `middle` (3,) [m] with unit `upward` (3,), which is not horizontal."""
+
+    upward: Float[np.ndarray, "3"]
+    middle: Float[np.ndarray, "3"]
+
+    @property
+    def offset(self) -> float:
+        """`n . p` on the plane [m]."""
+        return float(self.upward @ self.middle)
+
+    def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        """Signed distance of a point [m], positive above the table; its gradient is the normal."""
+        return float(self.upward @ p - self.offset)
+
+    def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Outward unit normal."""
+        return self.upward
+
+    def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
+        """`p'^T s_pp p'` [m/s^2], the part of the distance's second derivative that is due to curvature."""
+        return 0.0
+
+    def height(
+        self, xy: Float[np.ndarray, "times 2"]
+    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+        """Height [m] above the surface's middle, its gradient and its Hessian [1/m] in x and y."""
+        slope = -self.upward[:2] / self.upward[2]
+        return (xy - self.middle[:2]) @ slope, np.broadcast_to(slope, xy.shape), np.zeros((len(xy), 2, 2))
+
+    def surface(self) -> forcegp.mechanics.Surface:
+        """The same for a `Contact`."""
+        x, y, z = self.upward.tolist()
+        return forcegp.mechanics.Plane((x, y, z), self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class SphericalTable:
+    """The top of a sphere with `center` (3,) and `radius` [m]."""
+
+    center: Float[np.ndarray, "3"]
+    radius: float
+
+    def distance(self, p: Float[np.ndarray, "3"]) -> float:
+        """As of a plane."""
+        return float(np.linalg.norm(p - self.center) - self.radius)
+
+    def normal(self, p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """As of a plane."""
+        ray = p - self.center
+        return ray / np.linalg.norm(ray)
+
+    def curvature(self, p: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "3"]) -> float:
+        """`(|p'|^2 - (n . p')^2) / |p - center|`."""
+        return float((velocity @ velocity - (self.normal(p) @ velocity) ** 2) / np.linalg.norm(p - self.center))
+
+    def height(
+        self, xy: Float[np.ndarray, "times 2"]
+    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+        """`h = sqrt(R^2 - r^2) - R`, `h_x = -r / (h + R)`, `h_xx = -(1 + h_x h_x^T) / (h + R)`."""
+        ray = xy - self.center[:2]
+        rise = np.sqrt(self.radius**2 - (ray**2).sum(axis=1))
+        gradient = -ray / rise[:, None]
+        hessian = -(np.eye(2) + gradient[:, :, None] * gradient[:, None, :]) / rise[:, None, None]
+        return rise - self.radius, gradient, hessian
+
+    def surface(self) -> forcegp.mechanics.Surface:
+        """As of a plane."""
+        x, y, z = self.center.tolist()
+        return forcegp.mechanics.Sphere((x, y, z), self.radius)
+
+
+Table = FlatTable | SphericalTable
+
+
+def table_of(config: KukaSurfaceConfig) -> Table:
+    """The table of a scenario; for `surface="none"` the plane that way-points keep above."""
+    middle = np.array([np.mean(config.waypoint_x), np.mean(config.waypoint_y), config.surface_height])
+    if config.surface == "sphere":
+        return SphericalTable(middle - (0.0, 0.0, config.sphere_radius), config.sphere_radius)
+    upward = np.array([0.0, 0.0, 1.0])
+    if config.surface == "tilted":
+        angle, (x, y) = np.deg2rad(config.tilt_degrees), np.array(config.tilt_axis) / np.hypot(*config.tilt_axis)
+        # Rodrigues' formula for the vertical unit vector about the horizontal axis (x, y, 0).
+        upward = np.array([y * np.sin(angle), -x * np.sin(angle), np.cos(angle)])
+    return FlatTable(upward, middle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,3 +206,63 @@ def random_path(
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     accelerations = np.maximum(config.least_acceleration, 4.0 * lengths / times**2)
     return SegmentPath(corners, times, accelerations)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskSpaceController:
+    """Resolved-acceleration control (Siciliano et al., Robotics, section 8.6.2) with a null-space posture.
+
+    With `e` the error of the tool (translation; rotation vector), the commanded joint acceleration is
+    `J^+ (x_ref'' + 2 zeta omega e' + omega^2 e - Jdot v) + (I - J^+ J) S (K (q_0 - q) - D v)`; `S` selects joints.
+    It compensates inertia, gravity and joint damping, but neither the surface nor its friction.
+
+    omega [rad/s], zeta: error dynamics; orientation: (4,) quaternion (x, y, z, w) of the tool frame that is held;
+    posture: (nv,) `q_0` [rad]; selected: (nv,) diagonal of `S`; stiffness `K` [1/s^2]; damping `D` [1/s].
+    """
+
+    omega: float
+    zeta: float
+    orientation: Float[np.ndarray, "4"]
+    posture: Float[np.ndarray, " nv"]
+    selected: Float[np.ndarray, " nv"]
+    stiffness: float
+    damping: float
+
+    def joint_acceleration(
+        self,
+        q: Float[np.ndarray, " nv"],
+        v: Float[np.ndarray, " nv"],
+        jacobian: Float[np.ndarray, "6 nv"],
+        bias_acceleration: Float[np.ndarray, "6"],
+        position: Float[np.ndarray, "3"],
+        quaternion: Float[np.ndarray, "4"],
+        reference: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+    ) -> Float[np.ndarray, " nv"]:
+        """Commanded joint acceleration [rad/s^2]; `reference` is the aimed position, velocity and acceleration."""
+        aim, aim_velocity, aim_acceleration = reference
+        velocity = jacobian @ v
+        task = np.empty(6)
+        gain = 2.0 * self.zeta * self.omega
+        task[:3] = aim_acceleration + gain * (aim_velocity - velocity[:3]) + self.omega**2 * (aim - position)
+        task[3:] = -gain * velocity[3:] + self.omega**2 * rotation_vector(self.orientation, quaternion)
+        posture = self.selected * (self.stiffness * (self.posture - q) - self.damping * v)
+        # J^+ (task - Jdot v) + (I - J^+ J) posture, with J^+ = J^T (J J^T)^-1
+        residual = task - bias_acceleration - jacobian @ posture
+        return posture + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, residual)
+
+
+def rotation_vector(aim: Float[np.ndarray, "4"], present: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3"]:
+    """World-frame rotation vector [rad] that turns `present` into `aim` (quaternions x, y, z, w) by the shorter way.
+
+    `q` and `-q` are the same orientation; without choosing the sign the tool would turn the long way round.
+    """
+    x, y, z, w = aim.tolist()
+    a, b, c, d = (present * (-1.0, -1.0, -1.0, 1.0)).tolist()  # the conjugate
+    real = w * d - x * a - y * b - z * c
+    imaginary = np.array([w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a, w * c + x * b - y * a + z * d])
+    if real < 0:
+        real, imaginary = -real, -imaginary
+    sine = math.sqrt(float(imaginary @ imaginary))
+    if sine < 1e-12:
+        return 2.0 * imaginary
+    return 2.0 * math.atan2(sine, real) / sine * imaginary

@@ -3,10 +3,11 @@ from .candidates import (
 )
 from .comparison import Comparison as Comparison
 from .figures import figures_of as figures_of
-from .identified_systems import IDENTIFICATIONS as IDENTIFICATIONS, Identification as Identification
+from .jobs import (
+    IDENTIFICATIONS as IDENTIFICATIONS, Identification as Identification, training_subset as training_subset,
+)
 from .run import Validation as Validation, validate as validate
 from .splits import (
     Split as Split, Stretch as Stretch, hold_out_blocks as hold_out_blocks, hold_out_episodes as hold_out_episodes,
     hold_out_fraction as hold_out_fraction, leave_one_episode_out as leave_one_episode_out, split_named as split_named,
 )
-from .training_subsets import training_subset as training_subset

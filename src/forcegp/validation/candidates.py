@@ -21,7 +21,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, named_prior
-from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, IDENTIFICATIONS
+from forcegp.validation.comparison import DEFAULT_IDENTIFICATION, IDENTIFICATIONS
 
 Kind = Literal["given", "identified", "yardstick", "black box", "force prior"]
 """Parametric physics as given or identified, or identified from more rows than others see and therefore in no verdict,

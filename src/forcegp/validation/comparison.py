@@ -3,21 +3,98 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from forcegp.data import Dataset
+from forcegp.analytical import NoiseLevels, held_out_noise, identify_analytical
+from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise
-from forcegp.validation.horizons import HORIZONS, STARTS, HeldOutMotions, held_out_motions
-from forcegp.validation.identified_systems import DEFAULT_IDENTIFICATION, FRICTION, IDENTIFICATIONS
+from forcegp.validation.scores import HORIZONS, STARTS, HeldOutMotions, held_out_motions
 from forcegp.validation.splits import Split
-from forcegp.validation.training_subsets import training_subset
+
+SHARE = 2 / 3
+"""Of the training rows among which the points of one seed are chosen."""
+
+
+def training_subset(train: Dataset, points: int, seed: int) -> Dataset:
+    """`points` rows that lie far apart in (q, v, u) among two thirds of the rows, which `seed` draws at random.
+
+    Farthest-point sampling of all rows begins with the same extremes whatever row it starts at, so seeds would hardly
+    differ. Among a random two thirds they do, and each choice still covers the states.
+    Raises InvalidInput where two thirds of the rows are fewer than `points`.
+    """
+    if seed < 0:
+        raise InvalidInput(f"seed is {seed}; it must be at least 0.")
+    among = int(np.ceil(SHARE * len(train)))
+    if not 2 <= points <= among:
+        raise InvalidInput(
+            f"points is {points}; with {len(train)} training rows it must be from 2 to {among}, two thirds of them."
+        )
+    generator = np.random.default_rng(seed)
+    drawn = np.sort(generator.choice(len(train), size=among, replace=False))
+    return farthest_rows(train.rows(drawn), points, start=int(generator.integers(among)))
+
+
+@dataclass(frozen=True)
+class Identification:
+    """One way to identify a system.
+
+    Fields
+    ------
+    summary: how, as a part of a sentence.
+    identify: (given system, training rows, friction laws) -> identified system.
+    all_rows: from all training rows, not from those few that every model learns from.
+    noise: (given system, training rows, friction laws) -> the noise about it, for models that rest on it; None where
+        these learn theirs.
+    """
+
+    summary: str
+    identify: Callable[[MechanicalSystem, Dataset, Sequence[str]], MechanicalSystem]
+    all_rows: bool = False
+    noise: Callable[[MechanicalSystem, Dataset, Sequence[str]], NoiseLevels] | None = None
+
+
+def _identified(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> MechanicalSystem:
+    return identify_analytical(rows, system, friction=friction, **how).system
+
+
+def _noise(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **how: Any) -> NoiseLevels:
+    return held_out_noise(rows, system, friction=friction, **how)
+
+
+def _consistent(likelihood: str, rows: str, all_rows: bool) -> Identification:
+    how = {"inertias": "consistent", "likelihood": likelihood}
+    method = {"torque": "least squares of joint forces", "acceleration": "maximum likelihood of accelerations"}
+    summary = f"{method[likelihood]}{rows}, physically consistent"
+    noise = partial(_noise, **how) if all_rows else None
+    return Identification(summary, partial(_identified, **how), all_rows, noise)
+
+
+IDENTIFICATIONS: dict[str, Identification] = {
+    "least-squares": Identification(
+        "ordinary least squares of joint forces, whose inertias need not belong to a body",
+        partial(_identified, inertias="free", likelihood="torque"),
+    ),
+    "torque": _consistent("torque", "", False),
+    "acceleration": _consistent("acceleration", "", False),
+    "torque-all": _consistent("torque", " of ALL training rows", True),
+    "acceleration-all": _consistent("acceleration", " of ALL training rows", True),
+}
+"""By name. Add your own: IDENTIFICATIONS["mine"] = Identification("how", identify_mine)."""
+
+FRICTION = ("viscous", "coulomb")
+"""Laws that are identified where nothing else is asked for."""
+
+DEFAULT_IDENTIFICATION = "acceleration"
+"""What `@identified` and the mass matrix of force errors take where nothing else is asked for."""
 
 
 @dataclass(frozen=True, eq=False)

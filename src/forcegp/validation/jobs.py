@@ -23,12 +23,9 @@ from forcegp.jobs import Job, JobStore
 from forcegp.mechanics import MechanicalSystem
 from forcegp.parallel import Shared
 from forcegp.validation.candidates import Candidate, Training
-from forcegp.validation.comparison import Comparison
-from forcegp.validation.horizons import motion_scores
-from forcegp.validation.identified_systems import IDENTIFICATIONS, Identification
-from forcegp.validation.scores import acceleration_scores, mass_matrices
+from forcegp.validation.comparison import IDENTIFICATIONS, Comparison, Identification, training_subset
+from forcegp.validation.scores import acceleration_scores, mass_matrices, motion_scores
 from forcegp.validation.splits import Split
-from forcegp.validation.training_subsets import training_subset
 
 IDENTIFICATION, MODEL = "identification", "model"
 

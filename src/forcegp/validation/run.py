@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,17 +11,160 @@ import forcegp.evaluation
 import forcegp.validation
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
-from forcegp.errors import InvalidInput, require_type
+from forcegp.data import preparation_report
+from forcegp.errors import FileFormatError, InvalidInput, require_type
+from forcegp.evaluation.summary_statistics import median_and_range
 from forcegp.jobs import JobStore, Progress, run_jobs
-from forcegp.jobs.machine import machine
+from forcegp.jobs.job import machine
 from forcegp.parallel import Backend, backend_for
-from forcegp.validation.candidates import DEFAULT_MODELS, candidates
+from forcegp.validation.candidates import DEFAULT_MODELS, Candidate, candidates
 from forcegp.validation.comparison import Comparison
 from forcegp.validation.jobs import jobs_of, kept
 from forcegp.validation.page import page
 from forcegp.validation.paired_tests import against_baseline, conclusions
-from forcegp.validation.preparation_summary import preparation_lines
-from forcegp.validation.summary import summary_of
+from forcegp.validation.scores import over_joints
+
+
+def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
+    """`metadata["preparation"]` of a Dataset (`data.Preparation`) as sentences, the last step first."""
+    report = preparation_report(metadata)
+    if not report:
+        return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
+    lines = [f"Preparation: {_step(report)}"]
+    removed = report.get("power_removed")
+    if isinstance(removed, Mapping) and removed.get("a"):
+        shares = ", ".join("–" if share is None else f"{100.0 * share:.3g} %" for share in removed["a"])
+        lines.append(
+            f"The filter took {shares} of the variance of the joints' acceleration; scores are against the rest."
+        )
+    for quantity, reason in dict(report.get("why") or {}).items():
+        lines.append(f"Chosen automatically, {quantity}: {_reason(reason)}")
+    earlier = report.get("earlier")
+    return lines + (preparation_lines({"preparation": earlier}) if preparation_report({"preparation": earlier}) else [])
+
+
+def _step(report: Mapping[str, Any]) -> str:
+    parts = []
+    delay = [float(value) for value in report.get("delay") or []]
+    if any(delay):
+        same = len(set(delay)) == 1
+        delays = f"{1e3 * delay[0]:.3g}" if same else ", ".join(f"{1e3 * value:.3g}" for value in delay)
+        parts.append(f"u taken from {delays} ms later")
+    cutoff = report.get("cutoff")
+    if cutoff is None:
+        parts.append("no filter")
+    else:
+        source = report.get("differentiate")
+        made = "v and a from it by central differences" if source == "q" else "a from v by central differences"
+        what = "q and u" if source == "q" else "q, v and u"
+        parts.append(
+            f"zero-phase Butterworth low-pass of order {report.get('order')} at {cutoff:g} Hz on {what}, {made}"
+        )
+    if report.get("every", 1) > 1:
+        every = report["every"]
+        ending = "th" if every % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(every % 10, "th")
+        parts.append(f"every {every}{ending} row")
+    if report.get("trim"):
+        parts.append(f"{report['trim']:g} s dropped at both ends of every episode")
+    return "; ".join(parts) + "."
+
+
+def _reason(reason: object) -> str:
+    if isinstance(reason, Mapping):
+        return "; ".join(f"{name} {value}" for name, value in reason.items())
+    return str(reason)
+
+
+Result = Mapping[str, Any]
+
+
+def summary_of(runs: Mapping[str, Sequence[Mapping[str, Any]]], models: Mapping[str, Candidate]) -> dict[str, Any]:
+    """By model: what it is, spreads of its scores, and why runs failed.
+
+    `runs` holds what was kept of every model, one for each split and seed. Over joints see `scores.over_joints`.
+    Raises FileFormatError where runs used different mass matrices for their force errors.
+    """
+    for split in {run["split"] for each in runs.values() for run in each}:
+        used = {
+            run["result"]["mass_matrix"]
+            for each in runs.values()
+            for run in each
+            if run["result"] is not None and run["split"] == split
+        }
+        if len(used) > 1:
+            raise FileFormatError(
+                f"force errors of split {split!r} rest on different mass matrices ({'; '.join(sorted(used))}); "
+                "delete the folder of jobs and run the same command again."
+            )
+    return {name: _model(runs[name], models[name]) for name in models}
+
+
+def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str, Any]:
+    results = [run["result"] for run in runs if run["result"] is not None]
+    failures = [
+        {"split": run["split"], "seed": run["seed"], "error": run["error"]} for run in runs if run["result"] is None
+    ]
+    out: dict[str, Any] = {
+        "kind": candidate.kind,
+        "summary": candidate.summary,
+        "runs": len(results),
+        "failures": failures,
+        "warnings": sorted({warning for run in runs for warning in run["warnings"]}),
+    }
+    if not results:
+        return out
+    for score in ("nrmse", "rmse", "mae", "force_rms", "force_mae"):
+        out[score] = median_and_range(over_joints(score, result[score]) for result in results)
+        out[f"{score}_per_joint"] = _per_joint(results, lambda result, score=score: result[score])
+    if all("force_rms_at_rest" in result for result in results):
+        out["force_rms_at_rest_per_joint"] = _per_joint(results, lambda result: result["force_rms_at_rest"])
+    for score in ("nlpd", "cpu_seconds"):
+        out[score] = median_and_range(result[score] for result in results)
+    out["nlpd_per_joint"] = _per_joint(results, lambda result: result["nlpd_per_joint"])
+    levels = results[0]["levels"]
+    for level in (0.5, 0.95):
+        place = levels.index(level)
+        name = f"coverage_{round(100 * level)}"
+        out[name] = median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
+        out[f"{name}_per_joint"] = _per_joint(results, lambda result, place=place: result["coverage"][place])
+    out["calibration"] = {
+        "levels": levels,
+        "covered": [
+            median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
+            for place in range(len(levels))
+        ],
+    }
+    out["motions"] = _motions([result["motions"] for result in results])
+    return out
+
+
+def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
+    """Spreads at every horizon that all runs have; `diverged` counts over runs, of `motions` in all."""
+    given = [run for run in runs if run is not None]
+    if not given or len(given) < len(runs):
+        return None
+    horizons = [h for h in given[0]["horizons"] if all(h in run["horizons"] for run in given)]
+    places = [[run["horizons"].index(h) for run in given] for h in horizons]
+    return {
+        "horizons": horizons,
+        "motions": sum(run["motions"] for run in given),
+        "integrator": given[0]["integrator"],
+        "dt": given[0]["dt"],
+        "rms": [median_and_range(run["rms"][at] for run, at in zip(given, here, strict=True)) for here in places],
+        "rms_per_joint": [
+            [
+                median_and_range(run["rms_per_joint"][at][joint] for run, at in zip(given, here, strict=True))
+                for joint in range(len(given[0]["rms_per_joint"][0]))
+            ]
+            for here in places
+        ],
+        "diverged": [sum(run["diverged"][at] for run, at in zip(given, here, strict=True)) for here in places],
+    }
+
+
+def _per_joint(results: Sequence[Result], values: Callable[[Result], Sequence[float | None]]) -> list[Any]:
+    return [median_and_range(values(result)[joint] for result in results) for joint in range(len(values(results[0])))]
+
 
 KIND = "forcegp validate"
 RESULTS, PAGE = "results.json", "report.md"

@@ -212,7 +212,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
             return (hold_out_fraction(dataset, float(fraction), int(seed or 0)),)
         if kind == "blocks":
             count, _, numbers = rest.partition(":")
-            return (hold_out_blocks(dataset, int(count), _numbers(numbers), guard),)
+            return (hold_out_blocks(dataset, int(count), [int(part) for part in numbers.split(",")], guard),)
     except InvalidInput:
         raise
     except ValueError:
@@ -251,10 +251,6 @@ def _logs(dataset: Dataset) -> dict[int, str]:
 def _called(dataset: Dataset, number: int) -> str:
     name = _logs(dataset).get(number)
     return f"episode {number}" if name is None else f"episode {number}, {name}"
-
-
-def _numbers(text: str) -> list[int]:
-    return [int(part) for part in text.split(",")]
 
 
 def _listed(parts: Sequence[int | str]) -> str:

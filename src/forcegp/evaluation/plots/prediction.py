@@ -1,13 +1,20 @@
-"""Plot: the predicted acceleration of every joint with its 2-sigma band, and its error on a scale of its own."""
+"""Plots: predicted accelerations and normal forces against the truth, and the course of the search."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
+import torch
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
 from forcegp.evaluation.plots import style
+from forcegp.evaluation.plots.style import NORMAL, SERIES, SMALL, new_figure, quiet
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models.protocol import Posterior
 
@@ -62,3 +69,146 @@ def draw_error(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) 
     limit = 2.0 * float(np.median(outer))
     if np.abs(mean - rows.a[:, joint]).max() < 1.5 * limit:  # equal scales where the model is right
         axes.set_ylim(-limit, limit)
+
+
+def likelihood_figure(
+    histories: Mapping[str, Sequence[float]], *, objective: str = "negative log likelihood with hyperpriors [nats]"
+) -> Figure:
+    """One curve per model, `{name: posterior.result.history}`; the last value of each is written beside it.
+
+    `objective` names the values, with their unit in brackets: `posterior.objective`.
+    Raises InvalidInput without any history.
+    """
+    if not histories or not all(len(history) for history in histories.values()):
+        raise InvalidInput("no history to plot; give {name: posterior.result.history}.")
+    figure = new_figure(7.0, 3.6)
+    axes = figure.subplots()
+    for color, (name, history) in zip(SERIES, histories.items(), strict=False):
+        last = len(history) - 1
+        axes.plot(history, color=color, linewidth=1.6, label=name)
+        axes.plot(last, history[-1], "o", color=color, markersize=4)
+        axes.annotate(
+            f"{history[-1]:.1f}" if abs(history[-1]) >= 10.0 else f"{history[-1]:.3g}",
+            (last, history[-1]),
+            xytext=(6, 0),
+            textcoords="offset points",
+            color=color,
+            fontsize=SMALL,
+            va="center",
+        )
+    axes.margins(x=0.08)
+    what, _, unit = objective.partition(" [")
+    quiet(axes, title=f"What the search lowers: {what}", x="iteration", y=unit.removesuffix("]"))
+    axes.legend(fontsize=NORMAL, frameon=False)
+    return figure
+
+
+QUANTILE = 1.959963984540054
+"""Of the standard normal distribution at 97.5 %."""
+LARGEST_ERROR = 5.0
+"""Standard deviations at which the histogram of errors ends; what lies beyond is counted at the ends."""
+ERROR_ROWS = 2000
+
+
+def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
+    """One row per contact: force over `seconds` of the first episode; errors in standard deviations beside it.
+
+    The force is |s_p| lambda in N, positive where the surface pushes along its gradient. Where the Dataset holds
+    "lambda", it is drawn, with a histogram of (prediction - truth) / standard deviation over up to ERROR_ROWS rows of
+    the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
+    Raises InvalidInput without contacts, and for models without forces.
+    """
+    if not posterior.system.contacts or not posterior.predicts_forces:
+        raise InvalidInput(
+            f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
+            "forces."
+        )
+    rows = style.window(dataset, start, seconds)
+    contacts = len(posterior.system.contacts)
+    known = "lambda" in dataset.truth and dataset.truth["lambda"].shape[1] == contacts
+    figure = style.new_figure(11.0 if known else 8.0, 1.2 + 2.4 * contacts)
+    grid = figure.subplots(contacts, 2 if known else 1, squeeze=False, width_ratios=(2.4, 1.0) if known else None)
+    forces = _normal_forces(posterior, rows)
+    every = None
+    if known:
+        spread = np.unique(np.linspace(0, len(dataset) - 1, ERROR_ROWS).astype(int))
+        every = _normal_forces(posterior, dataset.rows(spread))
+    for index, contact in enumerate(posterior.system.contacts):
+        name = f"{type(contact.surface).__name__.lower()} at {contact.frame}"
+        title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
+        _draw_force(grid[index, 0], rows, forces, index, known)
+        style.quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
+        if every is not None:
+            _draw_errors(grid[index, 1], every, index)
+            style.quiet(grid[index, 1], title=_summary(every, index), x="error / standard deviation", y="density")
+    style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
+    style.heading(figure, f"Normal force after {len(posterior.training)} training points")
+    return figure
+
+
+@dataclass(frozen=True, eq=False)
+class _Forces:
+    """Normal forces (rows, m) in N: prediction, its standard deviation, the known forces alone, and the truth."""
+
+    mean: Float[np.ndarray, "rows m"]
+    std: Float[np.ndarray, "rows m"]
+    nominal: Float[np.ndarray, "rows m"]
+    truth: Float[np.ndarray, "rows m"] | None
+
+
+def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
+    q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
+    with torch.no_grad():
+        multiplier = posterior.predict(q, v, u).multiplier
+        assert multiplier is not None, "models with forces predict lambda"
+        dynamics = posterior.dynamics(q, v, u)
+        size = torch.linalg.vector_norm(dynamics.normals, dim=-1)
+        own = size if rows.system is None else torch.linalg.vector_norm(rows.system.dynamics(q, v, u).normals, dim=-1)
+        truth = rows.truth.get("lambda")
+        if truth is not None:
+            truth = own.numpy() * truth if truth.shape == own.shape == size.shape else None
+        parts = (size * multiplier.mean, size * multiplier.std, size * dynamics.multiplier_map().offset)
+    mean, std, nominal = (part.cpu().numpy() for part in parts)
+    return _Forces(mean, std, nominal, truth)
+
+
+def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: bool) -> None:
+    time, mean, spread = rows.time, forces.mean[:, index], QUANTILE * forces.std[:, index]
+    axes.plot(time, forces.nominal[:, index], color=style.KNOWN_PHYSICS, linewidth=1.1, label="known physics alone")
+    if known and forces.truth is not None:
+        axes.plot(time, forces.truth[:, index], color=style.TRUTH, linewidth=3.5, alpha=0.3, label="true")
+    style.draw_band(axes, time, mean, spread, alpha=0.3, label="95 % band")
+    axes.plot(time, mean, color=style.PREDICTION, linewidth=1.3, label="predicted")
+    axes.margins(x=0)
+
+
+def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
+    assert forces.truth is not None, "errors are drawn where the truth is known"
+    errors = (forces.mean - forces.truth)[:, index] / np.maximum(forces.std[:, index], np.finfo(float).tiny)
+    bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
+    # half a bin inside of the ends, so that the errors beyond them are seen
+    kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
+    axes.hist(kept, bins=list(bins), density=True, color=style.PREDICTION, alpha=0.45, linewidth=0)
+    at = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 201)
+    axes.plot(
+        at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=style.TRUTH, linewidth=1.0, label="standard normal"
+    )
+    axes.set_xlim(-LARGEST_ERROR, LARGEST_ERROR)
+    inside = float((np.abs(errors) <= QUANTILE).mean())
+    axes.annotate(
+        f"{100.0 * inside:.0f} % inside\nthe 95 % band",
+        (0.98, 0.95),
+        xycoords="axes fraction",
+        ha="right",
+        va="top",
+        fontsize=style.SMALL,
+        color=style.TRUTH,
+    )
+
+
+def _summary(forces: _Forces, index: int) -> str:
+    assert forces.truth is not None, "errors are drawn where the truth is known"
+    truth = forces.truth[:, index]
+    error, size = (float(np.sqrt(np.square(x).mean())) for x in (forces.mean[:, index] - truth, truth))
+    relative = f" ({100.0 * error / size:.2g} %)" if size else ""
+    return f"Errors: root mean square {error:.2g} N{relative}"

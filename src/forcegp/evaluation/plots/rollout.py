@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.recorded_segments import RecordedMotions
-from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors
+from forcegp.evaluation.rollout_scores import INTERVAL, RecordedMotions, RolloutErrors
 from forcegp.models.rollout import Rollout
 
 COLUMNS = 4

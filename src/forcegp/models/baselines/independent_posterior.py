@@ -30,7 +30,7 @@ from forcegp.models.protocol import Model, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
 from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
-from forcegp.priors.expressed_kernels import kernels_of
+from forcegp.priors.force_prior import kernels_of
 
 
 def joint_part(parameters: Mapping[str, Tensor], joint: int) -> dict[str, Tensor]:

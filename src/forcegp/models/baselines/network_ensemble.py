@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -17,9 +17,14 @@ from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.baselines.network_layers import ResidualLayers, check_numbers, initial_weights
-from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, fit_settings, inputs
-from forcegp.models.baselines.network_training import Batches, held_out_rows
+from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, inputs
+from forcegp.models.baselines.neural_network import (
+    Batches,
+    ResidualLayers,
+    check_numbers,
+    held_out_rows,
+    initial_weights,
+)
 from forcegp.models.noise import Noise
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
@@ -95,10 +100,9 @@ class NetworkEnsemble(NetworkModel):
         with threadpool_limits(1):  # products this small do not gain from threads, and lose where cores are shared
             search = _Training(self, training, rows, seed)
             search.run(progress)
-        parameters = search.best
         steps = search.best_step.tolist()
         result = OptimizationResult(
-            parameters,
+            search.best,
             value=float(search.best_loss.mean()),
             history=tuple(search.history),
             status=f"the held-out rows of the members were predicted best at steps {min(steps)} to {max(steps)} of "
@@ -107,16 +111,7 @@ class NetworkEnsemble(NetworkModel):
             evaluations=search.step,
             cpu_seconds=time.process_time() - start_time,
         )
-        fitted = replace(self, noise=self.resolved_noise(rows))
-        numbers = {name: getattr(self, name) for name in fitted.numbers}
-        return fitted.condition(
-            training, parameters, result, fit_settings(rows, dataset, seed, fitted.noise, **numbers)
-        )
-
-    @property
-    def numbers(self) -> tuple[str, ...]:
-        """The names of the fields that are plain numbers."""
-        return tuple(name for name in self.__dataclass_fields__ if name not in ("system", "noise"))
+        return self.trained(rows, dataset, training, seed, result)
 
     @override
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:

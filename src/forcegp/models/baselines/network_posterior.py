@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -75,6 +75,16 @@ class NetworkModel(Model):
         rows = training_rows(self.system.robot.joint_names, dataset, points)
         check_search_numbers(1, seed)
         return rows, TrainingData.of(rows, self.system.robot.device)
+
+    def trained(
+        self, rows: Dataset, dataset: Dataset, training: TrainingData, seed: int, result: OptimizationResult
+    ) -> NetworkPosterior:
+        """The posterior of a training, whose settings hold every field that is a plain number."""
+        noise = self.resolved_noise(rows)
+        settings = described_rows(rows, dataset) | {"seed": seed, "noise": None if noise is None else noise.to_dict()}
+        settings |= {name: value for name, value in vars(self).items() if name not in ("system", "noise")}
+        fitted = replace(self, noise=noise)  # type: ignore[type-var]  # every network is a dataclass
+        return fitted.condition(training, result.parameters, result, settings)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,13 +168,3 @@ class NetworkPosterior(Posterior):
 def inputs(q: Rows, v: Rows, u: Rows) -> Float[Tensor, "rows d"]:
     """What a network sees of a state."""
     return torch.cat([q, v, u], dim=-1)
-
-
-def fit_settings(rows: Dataset, dataset: Dataset, seed: int, noise: Noise | None, **numbers: Any) -> dict[str, Any]:
-    """The resolved configuration of a fit, as plain JSON values."""
-    return {
-        **described_rows(rows, dataset),
-        "seed": seed,
-        "noise": None if noise is None else noise.to_dict(),
-        **numbers,
-    }

@@ -2,27 +2,158 @@
 
 from __future__ import annotations
 
+import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 from torch import Tensor
+from torch.nn import functional
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import FitError
+from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.baselines.network_layers import SigmoidLayer, check_numbers, initial_weights
-from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, fit_settings, inputs
-from forcegp.models.baselines.network_training import Batches
+from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, inputs
 from forcegp.models.noise import Noise
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
 from forcegp.models.training_data import Standardization, TrainingData
+
+SMALLEST_VARIANCE = 1e-6
+"""Of a standardised output: keeps the logarithm of the predicted variance finite."""
+
+
+@dataclass(frozen=True)
+class SigmoidLayer:
+    """One hidden layer with sigmoid activation: inputs - `width` - outputs, as in Rath et al. (2021), section 5."""
+
+    width: int = 80
+
+    def shapes(self, members: int, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the weights and biases."""
+        return layer_shapes(members, {"hidden": (inputs, self.width), "output": (self.width, outputs)})
+
+    def __call__(
+        self, weights: Mapping[str, Tensor], x: Float[Tensor, "#members rows inputs"]
+    ) -> Float[Tensor, "members rows outputs"]:
+        """The output of every member."""
+        return _linear(weights, "output", torch.sigmoid(_linear(weights, "hidden", x)))
+
+
+@dataclass(frozen=True)
+class ResidualLayers:
+    """`depth` residual layers h + W silu(h) between a linear input and a linear output layer; no normalisation.
+
+    Identity shortcuts after He et al. (2016), "Identity mappings in deep residual networks", with one linear map per
+    block. The outputs are a mean and a positive variance for every joint.
+    """
+
+    width: int = 128
+    depth: int = 3
+
+    def shapes(self, members: int, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the weights and biases; `outputs` counts the means."""
+        blocks = {f"block{k}": (self.width, self.width) for k in range(self.depth)}
+        return layer_shapes(members, {"input": (inputs, self.width), **blocks, "output": (self.width, 2 * outputs)})
+
+    def __call__(
+        self, weights: Mapping[str, Tensor], x: Float[Tensor, "#members rows inputs"]
+    ) -> tuple[Float[Tensor, "members rows outputs"], Float[Tensor, "members rows outputs"]]:
+        """Mean and variance of every member."""
+        h = _linear(weights, "input", x)
+        for block in range(self.depth):
+            h = h + _linear(weights, f"block{block}", functional.silu(h))
+        mean, spread = _linear(weights, "output", functional.silu(h)).chunk(2, dim=-1)
+        return mean, functional.softplus(spread) + SMALLEST_VARIANCE
+
+
+def layer_shapes(members: int, layers: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
+    """`<layer>.weight` (members, in, out) and `<layer>.bias` (members, 1, out)."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, (width_in, width_out) in layers.items():
+        shapes[f"{name}.weight"] = (members, width_in, width_out)
+        shapes[f"{name}.bias"] = (members, 1, width_out)
+    return shapes
+
+
+def initial_weights(shapes: Mapping[str, tuple[int, ...]], generator: torch.Generator) -> dict[str, Tensor]:
+    """Uniform in +-1/sqrt(inputs of the layer), as torch.nn.Linear has it, drawn from `generator` alone."""
+    weights: dict[str, Tensor] = {}
+    for name, shape in shapes.items():
+        layer = name.rsplit(".", 1)[0]
+        bound = 1.0 / math.sqrt(shapes[f"{layer}.weight"][1])
+        weights[name] = (2.0 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1.0) * bound
+    return weights
+
+
+def check_numbers(counts: Mapping[str, object], rate: object) -> None:
+    """Raises InvalidInput naming the first count that is not a whole number above 0, or a rate that is not above 0."""
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < 2**31:
+            raise InvalidInput(f"{name}={value!r} must be a whole number above 0 (and below 2**31)")
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
+        raise InvalidInput(f"rate={rate!r} must be above 0 and finite")
+
+
+def _linear(weights: Mapping[str, Tensor], layer: str, x: Tensor) -> Tensor:
+    weight, bias = weights[f"{layer}.weight"], weights[f"{layer}.bias"]
+    return torch.baddbmm(bias, x.expand(len(weight), -1, -1), weight)
+
+
+BLOCKS = 20
+"""Stretches of time that a recording is cut into; a share of them is held out."""
+
+
+class Batches:
+    """Batches of row numbers, for several members at once: each goes through its own rows in its own random order."""
+
+    def __init__(self, rows: Sequence[Int[Tensor, " rows"]], size: int, generator: torch.Generator) -> None:
+        self.rows = list(rows)
+        self.size = min(size, *(len(each) for each in rows)) if len(rows) > 1 else min(size, len(rows[0]))
+        self.generator = generator
+        self.orders = [each[:0] for each in self.rows]
+
+    def draw(self) -> Int[Tensor, "members size"]:
+        """The next batch of every member; the rest of a pass that fills no batch is left out."""
+        chosen = []
+        for member, rows in enumerate(self.rows):
+            if len(self.orders[member]) < self.size:
+                self.orders[member] = rows[torch.randperm(len(rows), generator=self.generator)]
+            chosen.append(self.orders[member][: self.size])
+            self.orders[member] = self.orders[member][self.size :]
+        return torch.stack(chosen)
+
+
+def held_out_rows(
+    rows: Dataset, members: int, share: float, seed: int
+) -> tuple[list[Int[Tensor, " train"]], list[Int[Tensor, " held"]]]:
+    """Rows to train on and rows held out, for every member: other stretches of time, of about `share` of the rows.
+
+    Neighbours in time are nearly equal, so single rows that are held out would be known by heart. Lengths are equal
+    for all members.
+    """
+    order = np.lexsort((rows.time, rows.episode))
+    blocks = np.array_split(order, min(BLOCKS, len(order) // 2))
+    count = max(1, round(share * len(blocks)))
+    training, held_out = [], []
+    for member in range(members):
+        chosen = set(np.random.default_rng((seed, member)).permutation(len(blocks))[:count].tolist())
+        held_out.append(np.concatenate([block for k, block in enumerate(blocks) if k in chosen]))
+        training.append(np.concatenate([block for k, block in enumerate(blocks) if k not in chosen]))
+    return _equal_lengths(training), _equal_lengths(held_out)
+
+
+def _equal_lengths(parts: Sequence[np.ndarray]) -> list[Tensor]:
+    shortest = min(len(part) for part in parts)  # blocks differ by one row
+    return [torch.tensor(part[:shortest]) for part in parts]
+
 
 RESIDUAL = "residual.std"
 REPORTS = 200
@@ -88,11 +219,7 @@ class NeuralNetwork(NetworkModel):
             evaluations=self.steps,
             cpu_seconds=time.process_time() - start_time,
         )
-        fitted = replace(self, noise=self.resolved_noise(rows))
-        numbers = {name: getattr(self, name) for name in ("width", "steps", "batch", "rate")}
-        return fitted.condition(
-            training, parameters, result, fit_settings(rows, dataset, seed, fitted.noise, **numbers)
-        )
+        return self.trained(rows, dataset, training, seed, result)
 
     def _descend(
         self, weights: dict[str, Tensor], x: Tensor, a: Tensor, generator: torch.Generator, progress: FitProgress | None

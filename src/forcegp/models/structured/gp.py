@@ -38,7 +38,7 @@ from forcegp.models.structured.widening import widened
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior
-from forcegp.priors.stored_priors import described_prior
+from forcegp.priors.named import described_prior
 
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.integration.newton import find_roots, rows_jacobian
+from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import Actuation
 from forcegp.models.prediction import Gaussian
 from forcegp.robots.real_numbers import real_tensor, require_finite

@@ -15,8 +15,8 @@ import torch
 from forcegp.errors import NumericalWarning
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.priors import ForcePrior
+from forcegp.priors.contact_friction import refined_loads
 from forcegp.priors.expected_friction import JAMMING, TabulatedCurve
-from forcegp.priors.refined_loads import refined_loads
 
 ROUNDS = 8
 """Most fits after the first; measured on the `stribeck` scenario, 3 to 5 are enough."""

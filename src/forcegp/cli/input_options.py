@@ -1,4 +1,4 @@
-"""`--robot`, `--inertias`, `--lock`, `--armature`, `--gravity` and `--identified`: which robot a command works with."""
+"""Which robot a command works with, and how it prepares a raw log."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from typing_extensions import override
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
+import forcegp.evaluation
+import forcegp.models
+from forcegp.atomic_files import require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command, unless_given
+from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.file_digests import require_unchanged
 
+ROBOT_OPTIONS = ("robot", "inertias", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""
 
@@ -84,19 +89,6 @@ class RobotOptions(Command):
             return found
         return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
 
-    def robot_words(self) -> list[str]:
-        """The options that chose the robot, as words of a command that is to work with the same one."""
-        words = [] if self.robot is None else ["--robot", str(self.robot)]
-        words += [] if self.inertias == "strict" else ["--inertias", self.inertias]
-        words += [
-            word
-            for name, given in (("lock", self.lock), ("armature", self.armature))
-            for value in given
-            for word in (f"--{name}", value)
-        ]
-        words += [] if self.gravity is None else [f"--gravity={self.gravity}"]
-        return words + ([] if self.identified is None else ["--identified", str(self.identified)])
-
     def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
         """A robot from a URDF file, or from the recorded one's text, with what the options change."""
         if recorded is not None:
@@ -121,7 +113,7 @@ class RobotOptions(Command):
             words = self.gravity.split(",")
             if len(words) != 3:
                 raise InvalidInput(f"--gravity {self.gravity} holds {len(words)} numbers; write --gravity 0,0,-9.81.")
-            changes["gravity"] = [_number(word, f"--gravity {self.gravity}") for word in words]
+            changes["gravity"] = [_finite(word, f"--gravity {self.gravity}") for word in words]
         if self.lock:
             changes["locked"] = _named(self.lock, "--lock", "JOINT=RAD")
         if self.armature:
@@ -159,11 +151,11 @@ def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
             raise InvalidInput(f"{option} {word} is not {syntax}.")
         if name in out:
             raise InvalidInput(f"{option} names {name} twice; give each joint once.")
-        out[name] = _number(text, f"{option} {word}")
+        out[name] = _finite(text, f"{option} {word}")
     return out
 
 
-def _number(text: str, what: str) -> float:
+def _finite(text: str, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -171,3 +163,74 @@ def _number(text: str, what: str) -> float:
     if not math.isfinite(value):
         raise InvalidInput(f"{what}: {text!r} is not a finite number.")
     return value
+
+
+SystemChoice = Literal["model", "data"]
+
+
+def carried_over(
+    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, choice: SystemChoice
+) -> forcegp.models.Posterior:
+    """The posterior for the chosen system.
+
+    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data,
+    which is reported on stderr. Raises InvalidInput where the data carry no system or the model cannot move there.
+    """
+    if choice == "model":
+        return posterior
+    if dataset.system is None:
+        raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
+    system = forcegp.evaluation.moved_system(posterior, dataset.system)
+    if system is not dataset.system:
+        terminal.note("--system data: contacts of the data; the robot stays the identified one")
+    return posterior.with_system(system)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutoffOptions(Command):
+    """What every command asks that filters a log."""
+
+    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
+    """Low-pass filter q and u without delay, and compute v and a anew. auto: where the spectrum shows that motion ends
+    and noise begins."""
+    differentiate: Annotated[Literal["q", "v"], arg(metavar="q|v")] = "q"
+    """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
+
+    def _preparation(self) -> forcegp.Preparation:
+        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
+        if self.cutoff in ("none", "auto"):
+            cutoff = None if self.cutoff == "none" else "auto"
+        else:
+            cutoff = _number("--cutoff", self.cutoff, "a frequency in Hz, auto or none")
+        return forcegp.Preparation(cutoff=cutoff, differentiate=self.differentiate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparationOptions(CutoffOptions):
+    """What every command asks that makes rows to learn from out of a raw log."""
+
+    delay: Annotated[str, arg(metavar="S|auto")] = "0"
+    """How much later than it acts u was logged, in s: one number, or one per joint with commas. auto: estimated for all
+    joints together, which needs the robot."""
+    every: Annotated[int, arg(metavar="N")] = 1
+    """Keep every N-th row, after the filter."""
+    trim: Annotated[float, arg(metavar="S")] = 0.0
+    """Drop so many seconds at both ends of each episode, after the filter."""
+
+    @override
+    def _preparation(self) -> forcegp.Preparation:
+        delay: float | tuple[float, ...] | Literal["auto"]
+        if self.delay == "auto":
+            delay = "auto"
+        else:
+            allowed = "seconds, one per joint with commas, or auto"
+            each = tuple(_number("--delay", word, allowed) for word in self.delay.split(","))
+            delay = each[0] if len(each) == 1 else each
+        return replace(super()._preparation(), delay=delay, every=self.every, trim=self.trim)
+
+
+def _number(option: str, word: str, allowed: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise InvalidInput(f"{option} is {word!r}; give {allowed}.") from None

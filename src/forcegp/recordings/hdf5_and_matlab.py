@@ -1,4 +1,4 @@
-"""MATLAB files: versions 5 to 7 by scipy, version 7.3 (which is HDF5) by h5py."""
+"""HDF5 files of any layout, MATLAB files of version 7.3 (which are HDF5), and those of versions 5 to 7 by scipy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -13,9 +14,70 @@ from typing_extensions import override
 
 from forcegp.errors import FileFormatError
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.hdf5_arrays import HDF5Arrays
-from forcegp.recordings.size_limits import require_plausible_size
-from forcegp.recordings.source import reading
+from forcegp.recordings.source import reading, require_plausible_size
+
+HDF5 = "an HDF5 file"
+
+
+class HDF5Arrays(ArrayFile):
+    """The datasets of an HDF5 file, which must lie in the file itself: links to other files are never followed.
+
+    With `transposed`, arrays are stored column by column, as MATLAB does in its files of version 7.3.
+    """
+
+    transposed: ClassVar[bool] = False
+
+    @cached_property
+    def _arrays(self) -> dict[str, tuple[int, ...]]:
+        with reading(self.path, HDF5), h5py.File(self.path, "r") as file:
+            found: dict[str, tuple[int, ...]] = {}
+            self._collect(file, "", found)
+        return found
+
+    def _collect(self, group: h5py.Group, prefix: str, found: dict[str, tuple[int, ...]]) -> None:
+        for name in map(str, group):
+            path = prefix + name
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                raise FileFormatError(
+                    f"{self.path}: {path!r} is a link to {link.filename}, and links to other files are not followed; "
+                    "give that file, or copy the data into one."
+                )
+            if not isinstance(link, h5py.HardLink):
+                continue  # a soft link is another name for what is in the file anyway
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                if prefix.count("/") > 32:
+                    raise FileFormatError(f"{self.path}: its groups are nested more than 32 deep.")
+                if not name.startswith("#"):  # MATLAB keeps the contents of cells and objects there
+                    self._collect(item, f"{path}/", found)
+            elif isinstance(item, h5py.Dataset) and self._counts(path, item):
+                found[path] = tuple(reversed(item.shape)) if self.transposed else tuple(item.shape)
+
+    def _counts(self, name: str, stored: h5py.Dataset) -> bool:
+        if stored.external or stored.is_virtual:
+            raise FileFormatError(
+                f"{self.path}: {name!r} is stored in another file, which is not followed; copy the data into this one."
+            )
+        if stored.dtype.kind not in "fiu" or stored.shape is None:
+            return False
+        declared = stored.size * stored.dtype.itemsize
+        require_plausible_size(self.path, repr(name), declared, stored.id.get_storage_size())
+        return True
+
+    @override
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        return self._arrays
+
+    @override
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        with reading(self.path, HDF5), h5py.File(self.path, "r") as file:
+            stored = file[name]
+            assert isinstance(stored, h5py.Dataset)
+            for start in range(0, self._arrays[name][0], rows):
+                piece = stored[..., start : start + rows].T if self.transposed else stored[start : start + rows]
+                yield piece
+
 
 WHAT = "a MATLAB file"
 NOT_NUMBERS = {"cell", "object", "opaque", "function", "unknown"}
@@ -34,7 +96,7 @@ class MatlabHDF5(HDF5Arrays):
             cells = [name for name, item in named if item.attrs.get("MATLAB_class", b"") == b"cell"]
         if cells and not arrays:
             raise _cell(self.path, cells[0])
-        return {name: _as_rows(shape) for name, shape in arrays.items()}
+        return {name: (shape[1], 1) if _is_row(shape) else shape for name, shape in arrays.items()}
 
     @override
     def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
@@ -102,10 +164,6 @@ def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:
 
 def _is_row(shape: tuple[int, ...]) -> bool:
     return len(shape) == 2 and shape[0] == 1 and shape[1] > 1
-
-
-def _as_rows(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (shape[1], 1) if _is_row(shape) else shape
 
 
 def _cell(path: Path, name: str) -> FileFormatError:

@@ -1,0 +1,218 @@
+"""What a Dataset is made of: checked read-only columns, units, frozen metadata; and its columns as a pandas frame."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Any, NoReturn
+
+import numpy as np
+
+import forcegp.robots
+from forcegp.errors import DatasetError, MissingExtra
+from forcegp.robots.real_numbers import real_array
+
+
+class FrozenDict(dict[str, Any]):
+    """`dict` whose mutating methods raise TypeError. Being a dict, `json.dumps` and `dict(...)` take it as it is."""
+
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
+        raise TypeError("this mapping belongs to a frozen value; change a copy: dict(mapping)")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
+    clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
+
+    def __reduce__(
+        self,
+    ) -> tuple[type[FrozenDict], tuple[dict[str, Any]]]:  # the default would fill through __setitem__
+        return FrozenDict, (dict(self),)
+
+    def copy(self) -> dict[str, Any]:
+        """An ordinary dictionary with the same items."""
+        return dict(self)
+
+
+def frozen_json(metadata: Mapping[str, Any]) -> FrozenDict:
+    """Copy of a JSON-able mapping, frozen at every level (lists become tuples).
+
+    Raises DatasetError where JSON has no such value: arrays, NaN, keys that are not text.
+    """
+    try:
+        _require_text_keys(metadata)
+        plain = json.loads(json.dumps(metadata, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise DatasetError(
+            f"metadata cannot be written as JSON: {error}. "
+            "Allowed: text, finite numbers, True, False, None, and lists or mappings of them."
+        ) from error
+    return _freeze(plain)
+
+
+def _require_text_keys(value: object) -> None:
+    """json.dumps turns the key 1 into "1" without a word; the file would then differ from what was given."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise TypeError(f"key {key!r} is not text")
+            _require_text_keys(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _require_text_keys(item)
+
+
+def _freeze(value: Any) -> Any:
+    if isinstance(value, dict):
+        return FrozenDict({key: _freeze(item) for key, item in value.items()})
+    if isinstance(value, list):
+        return tuple(_freeze(item) for item in value)
+    return value
+
+
+def finite_columns(
+    name: str, given: object, columns: Sequence[str] | None, rows: int | None = None, *, what: str = "rows"
+) -> np.ndarray:
+    """float64, C-contiguous, read-only copy of a table of finite numbers.
+
+    `columns` None asks for a vector, names for one column each, and an empty sequence for any number of columns.
+    Raises DatasetError naming the first row and column that are not finite, or the shape that was expected.
+    """
+    values = real_array(name, given, error=DatasetError).astype(np.float64)  # astype always copies
+    expected = f"({what},)" if columns is None else f"({what}, {len(columns) or 'any'})"
+    wrong_columns = columns is not None and values.ndim == 2 and columns and values.shape[1] != len(columns)
+    if values.ndim != (1 if columns is None else 2) or wrong_columns:
+        raise DatasetError(f"{name} has shape {values.shape}; expected {expected}.")
+    if rows is not None and len(values) != rows:
+        raise DatasetError(f"{name} has {len(values)} {what}; expected {rows}.")
+    if values.shape[0] == 0:
+        raise DatasetError(f"{name} has no {what}; at least one is needed.")
+    bad = ~np.isfinite(values)
+    if bad.any():
+        position = np.argwhere(bad)[0]
+        column = ""
+        if columns is not None:
+            column = f", column {position[1]}" + (f" ({columns[position[1]]})" if columns else "")
+        raise DatasetError(
+            f"{name} is {values[tuple(position)]} at row {position[0]}{column}; "
+            f"{int(bad.sum())} values are not finite. Drop or repair these rows first."
+        )
+    return _read_only(values)
+
+
+def integer_column(name: str, given: object, rows: int) -> np.ndarray:
+    """int64, read-only copy of a vector of integers. Raises DatasetError for anything else."""
+    values = real_array(name, given, "iu", DatasetError)
+    if values.shape != (rows,):
+        raise DatasetError(f"{name} has shape {values.shape}; expected ({rows},).")
+    return _read_only(values.astype(np.int64))
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    values = np.ascontiguousarray(values)
+    values.flags.writeable = False
+    return values
+
+
+ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}
+"""Units of a revolute or continuous joint."""
+
+TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}
+"""Units of a prismatic joint."""
+
+REVOLUTE_UNITS = FrozenDict({**ROTATION, "time": "s"})
+"""Units of a robot whose joints all rotate."""
+
+
+def units_for(robot: forcegp.robots.Robot) -> FrozenDict:
+    """The units that a Dataset of this robot has: one text where all joints agree, else one per joint."""
+    return _per_quantity([TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints])
+
+
+def validated_units(units: Mapping[str, str | Sequence[str]], joint_names: Sequence[str]) -> FrozenDict:
+    """Check that every quantity has a unit that forcegp computes in, and that each joint's four units fit each other.
+
+    Raises DatasetError naming the quantity, the joint and the allowed units.
+    """
+    wanted = {*ROTATION, "time"}
+    if not isinstance(units, Mapping) or set(units) != wanted:
+        given = sorted(units) if isinstance(units, Mapping) else type(units).__name__
+        raise DatasetError(
+            f"units must name exactly {sorted(wanted)}; given: {given}. "
+            f"For a robot whose joints all rotate: {dict(REVOLUTE_UNITS)}."
+        )
+    if units["time"] != "s":
+        raise DatasetError(f"units['time'] is {units['time']!r}; only 's' is allowed. Convert the time stamps first.")
+    per_quantity = {name: _per_joint(name, units[name], len(joint_names)) for name in ROTATION}
+    per_joint: list[dict[str, str]] = []
+    for column, joint in enumerate(joint_names):
+        own = {name: per_quantity[name][column] for name in ROTATION}
+        if own not in (ROTATION, TRANSLATION):
+            raise DatasetError(
+                f"joint {joint!r} has units {own}; allowed are {ROTATION} or, for a prismatic joint, {TRANSLATION}. "
+                "Convert the columns first (np.deg2rad for degrees)."
+            )
+        per_joint.append(own)
+    return _per_quantity(per_joint)
+
+
+def _per_joint(name: str, unit: str | Sequence[str], nv: int) -> tuple[str, ...]:
+    if isinstance(unit, str):
+        return (unit,) * nv
+    texts = tuple(unit)
+    if len(texts) != nv or not all(isinstance(text, str) for text in texts):
+        raise DatasetError(f"units[{name!r}] must be one text or {nv} of them, one per joint; given: {unit!r}.")
+    return texts
+
+
+def _per_quantity(per_joint: Sequence[Mapping[str, str]]) -> FrozenDict:
+    columns = {name: tuple(own[name] for own in per_joint) for name in ROTATION}
+    merged = {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in columns.items()}
+    return FrozenDict({**merged, "time": "s"})
+
+
+TRUTH = "truth."
+
+
+def frame_of(arrays: Mapping[str, np.ndarray], joint_names: tuple[str, ...]) -> Any:
+    """Arrays (rows,) and (rows, columns) by name. Raises MissingExtra without pandas."""
+    pandas = _pandas()
+    columns = {}
+    for name, values in arrays.items():
+        if values.ndim == 1:
+            columns[name] = values
+            continue
+        labels = joint_names if values.shape[1] == len(joint_names) else range(values.shape[1])
+        columns |= {f"{name}.{label}": values[:, k] for k, label in enumerate(labels)}
+    return pandas.DataFrame(columns)
+
+
+def arrays_of(frame: Any) -> dict[str, Any]:
+    """Arguments of a Dataset from the columns of `frame_of`, the joints in the order of q."""
+    _pandas()
+    joints = tuple(column[2:] for column in map(str, frame.columns) if column.startswith("q."))
+    columns: dict[str, dict[str, np.ndarray]] = {}
+    for column in map(str, frame.columns):
+        ends = [joint for joint in joints if column.endswith(f".{joint}")]  # names may hold dots
+        label = max(ends, key=len, default=column.rpartition(".")[2] if column.startswith(TRUTH) else "")
+        columns.setdefault(column.removesuffix(f".{label}"), {})[label] = frame[column].to_numpy()
+    missing = [name for name in ("q", "v", "u", "a", "time") if name not in columns]
+    if missing:
+        raise DatasetError(
+            f"the frame lacks columns of {', '.join(missing)}; it needs time, and q.JOINT, v.JOINT, u.JOINT, "
+            "a.JOINT of every joint, as to_pandas() writes them."
+        )
+    arrays: dict[str, Any] = {"joint_names": joints, "truth": {}}
+    for name, parts in columns.items():
+        labels = joints if set(parts) == set(joints) else tuple(parts)
+        values = parts[""] if "" in parts else np.column_stack([parts[label] for label in labels])
+        if name in ("q", "v", "u", "a", "noise_std") and labels != joints:
+            raise DatasetError(f"the frame has {name} of {', '.join(parts)}, but q of {', '.join(joints)}.")
+        (arrays["truth"] if name.startswith(TRUTH) else arrays)[name.removeprefix(TRUTH)] = values
+    return arrays
+
+
+def _pandas() -> Any:
+    try:
+        return import_module("pandas")
+    except ImportError as error:
+        raise MissingExtra("pandas is not installed; install it with: pip install 'forcegp[pandas]'") from error

@@ -1,0 +1,179 @@
+"""Which rows: stretches of time, whole episodes, and few rows that cover the visited states evenly.
+
+Neighbouring rows of one motion are nearly equal: a random split of rows tests memory, not prediction. Splits are
+therefore by episode, and `require_disjoint` refuses a pair that overlaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from forcegp.data.dataset import Dataset
+from forcegp.errors import DatasetError, InvalidInput
+
+
+def time_blocks(
+    time: Float[np.ndarray, " rows"], episode: Int[np.ndarray, " _"], seconds: float
+) -> tuple[tuple[int, ...], ...]:
+    """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
+
+    To leave whole blocks out tests the prediction of a part of the motion that was not seen (block cross-validation;
+    Burman, Chow & Nolan 1994, "A cross-validatory method for dependent data").
+
+    `time` [s] and `episode` may come in any order, such as that of `farthest_rows`. Stretches are counted from the
+    first of these rows in every episode; those without rows give no block, so that every row is in exactly one.
+    Raises InvalidInput for a length that is not positive and finite, and for columns of different lengths.
+    """
+    if not 0.0 < seconds < float("inf"):
+        raise InvalidInput(f"seconds is {seconds}; it must be positive and finite.")
+    if time.shape != episode.shape:
+        raise InvalidInput(f"time has {len(time)} rows and episode {len(episode)}; give both for the same rows.")
+    blocks: dict[tuple[int, int], list[int]] = {}
+    first = {int(number): float(time[episode == number].min()) for number in np.unique(episode)}
+    for row in np.lexsort((time, episode)):
+        number = int(episode[row])
+        stretch = int((time[row] - first[number]) / seconds)
+        blocks.setdefault((number, stretch), []).append(int(row))
+    return tuple(tuple(rows) for rows in blocks.values())
+
+
+def train_test_split(
+    dataset: Dataset,
+    *,
+    test_episodes: Iterable[int] | None = None,
+    test_fraction: float | None = None,
+    seed: int | None = None,
+) -> tuple[Dataset, Dataset]:
+    """`(train, test)` of whole episodes: the ones named, or a fraction of them drawn by `seed`.
+
+    A fraction is of the number of episodes, rounded, at least one on either side. Raises InvalidInput if not exactly
+    one of `test_episodes` and `test_fraction` is given, if the fraction comes without a seed, or with fewer than two
+    episodes.
+    """
+    if (test_episodes is None) == (test_fraction is None):
+        raise InvalidInput("give either test_episodes or test_fraction.")
+    if len(dataset.episodes) < 2:
+        raise InvalidInput(
+            "this Dataset has one episode; splitting inside it would test on the training trajectory. "
+            "Record or simulate another one (another seed)."
+        )
+    if test_episodes is not None:
+        return dataset.split_by_episode(test_episodes)
+    if seed is None:
+        raise InvalidInput("test_fraction draws episodes at random; give a seed.")
+    assert test_fraction is not None
+    if not 0 < test_fraction < 1:
+        raise InvalidInput(f"test_fraction is {test_fraction}; it must be between 0 and 1, both excluded.")
+    total = len(dataset.episodes)
+    count = min(max(round(test_fraction * total), 1), total - 1)
+    chosen = np.random.default_rng(seed).choice(dataset.episodes, size=count, replace=False)
+    return dataset.split_by_episode(chosen.tolist())
+
+
+def require_disjoint(train: Dataset, test: Dataset) -> None:
+    """Refuse a pair of Datasets in which the test repeats the training.
+
+    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both were simulated or recorded with
+    the same `metadata` (same seed, same configuration) and share an episode: two samples of one trajectory.
+    """
+    if train.nv == test.nv:
+        repeated = _common_rows(train, test)
+        if repeated.size:
+            raise DatasetError(
+                f"{repeated.size} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
+                "Test on another trajectory: another episode, recording or seed."
+            )
+    shared = sorted(set(train.episodes) & set(test.episodes))
+    if train.metadata and train.metadata == test.metadata and shared:
+        raise DatasetError(
+            f"training and test rows come from the same trajectory: equal metadata, episodes {shared} in both. "
+            "Test on another episode, recording or seed."
+        )
+
+
+def _common_rows(train: Dataset, test: Dataset) -> np.ndarray:
+    def keys(data: Dataset) -> np.ndarray:
+        inputs = (
+            np.hstack([data.q, data.v, data.u]) + 0.0
+        )  # + 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes
+        return np.ascontiguousarray(inputs).view(np.dtype((np.void, inputs.itemsize * inputs.shape[1]))).ravel()
+
+    return np.flatnonzero(np.isin(keys(test), keys(train)))
+
+
+ROUNDING = 1e-13
+"""Standard deviation, relative to the largest entry, below which a column is constant but for rounding."""
+
+
+def farthest_point_sampling(
+    points: Float[np.ndarray, "rows features"], count: int, *, start: int | None = None, seed: int | None = None
+) -> Int[np.ndarray, " count"]:
+    """Numbers of `count` rows of which each is the farthest from all rows chosen before it.
+
+    Greedy k-centre (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance") with Euclidean distances
+    on columns standardised to zero mean and unit standard deviation. The first row is `start`, or drawn by `seed`, or
+    row 0. The result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are
+    the sample of size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
+    Time O(rows * count * features), memory O(rows * features).
+
+    Raises InvalidInput if `points` is not a finite table, or for a `count` or `start` outside the rows.
+    """
+    table = np.asarray(points)
+    if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():
+        raise InvalidInput(
+            f"points must be a (rows, features) table of finite numbers; given: {table.dtype} {table.shape}."
+        )
+    rows = table.shape[0]
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= rows:
+        raise InvalidInput(f"count is {count!r}; it must be an integer from 1 to {rows}, the number of rows.")
+    columns = _standardized_columns(table)
+    distance = np.full(rows, np.inf)
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = _first_row(rows, start, seed)
+    for position in range(count):
+        if position:
+            chosen[position] = np.argmax(distance)  # the lowest row number among equals
+        row = chosen[position]
+        # Differences, not |x|^2 - 2 x.y + |y|^2: a repeated row must have distance exactly 0.
+        squared = np.zeros(rows)
+        for column in columns:
+            difference = column - column[row]
+            squared += difference * difference
+        np.minimum(distance, squared, out=distance)
+        distance[row] = -1.0  # never chosen again, not even among repeated rows
+    return chosen
+
+
+def farthest_rows(dataset: Dataset, count: int, *, start: int | None = None, seed: int | None = None) -> Dataset:
+    """The `count` rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`.
+
+    A model trained on fewer points takes the first ones: `farthest_rows(data, 1000).rows(slice(100))`.
+    """
+    points = np.hstack([dataset.q, dataset.v, dataset.u])
+    return dataset.rows(farthest_point_sampling(points, count, start=start, seed=seed))
+
+
+def _standardized_columns(table: np.ndarray) -> np.ndarray:
+    """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
+    columns = np.ascontiguousarray(table.T, dtype=np.float64)
+    scale = np.abs(columns).max(axis=1, keepdims=True)
+    columns = columns / np.where(scale > 0, scale, 1.0)  # so that squaring in std cannot overflow or underflow
+    spread = columns.std(axis=1, keepdims=True)
+    spread[spread < ROUNDING] = 0.0
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)
+
+
+def _first_row(rows: int, start: int | None, seed: int | None) -> int:
+    if start is not None and seed is not None:
+        raise InvalidInput("give start (a row number) or seed (which draws one), not both.")
+    if seed is not None:
+        return int(np.random.default_rng(seed).integers(rows))
+    if start is None:
+        return 0
+    if not 0 <= start < rows:
+        raise InvalidInput(f"start is {start}; it must be a row number from 0 to {rows - 1}.")
+    return int(start)

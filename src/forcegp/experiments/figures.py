@@ -1,0 +1,229 @@
+"""Figures of the experiments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+from forcegp.evaluation.plots.style import (
+    LARGE,
+    MEASUREMENT,
+    QUIET,
+    SERIES,
+    TRUTH,
+    draw_band,
+    legend_below,
+    new_figure,
+    quiet,
+)
+from forcegp.experiments import published
+from forcegp.experiments.extrapolation_jobs import REGIONS
+from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS
+from forcegp.experiments.fig2c_jobs import MODELS as ESTIMATING_MODELS
+from forcegp.experiments.fits import MODELS, NETWORKS
+
+COLORS = dict(
+    zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET, SERIES[3], SERIES[5]), strict=True)
+)
+"""One colour per model, the same in every figure."""
+
+PANELS = (
+    ("mae", "MAE against noisy accelerations [rad/s²]"),
+    ("mae_noise_free", "MAE against noise-free accelerations [rad/s²]"),
+    ("constraint_error", "mean constraint error |A a − b| [m/s²]"),
+)
+
+
+def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
+    """Figure 2b: ours as solid lines with the range over seeds, the paper's as dashed lines."""
+    figure = new_figure(11.0, 4.4)
+    panels = figure.subplots(1, len(PANELS))
+    counts = sorted({int(count) for curve in summary["curves"].values() for count in curve})
+    for axes, (score, heading) in zip(panels, PANELS, strict=True):
+        for model, curve in summary["curves"].items():
+            _draw_ours(axes, curve, score, model)
+        _draw_published(axes, summary, score)
+        axes.set(xscale="log", yscale="log")
+        axes.set_xticks(counts, [str(count) for count in counts])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        if score != "constraint_error":
+            axes.yaxis.set_major_formatter(ScalarFormatter())
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        quiet(axes, title=heading, x="training points N", y="")
+    panels[0].axhline(summary["noise_floor"], color=QUIET, linewidth=0.8)
+    panels[0].annotate(
+        "noise floor", (counts[0], summary["noise_floor"]), (0, -9), textcoords="offset points", fontsize=7, color=QUIET
+    )
+    panels[0].plot([], [], color=QUIET, linestyle="--", linewidth=1.0, label="published (2021)")
+    legend_below(figure, panels[0], columns=5)
+    return figure
+
+
+def _draw_ours(axes: Axes, curve: Mapping[str, Any], score: str, model: str) -> None:
+    counts = [int(count) for count in curve]
+    values = {part: [scores[score][part] for scores in curve.values()] for part in ("median", "min", "max")}
+    color = COLORS[model]
+    axes.fill_between(counts, values["min"], values["max"], color=color, alpha=0.15, linewidth=0)
+    axes.plot(counts, values["median"], color=color, marker="o", markersize=3.5, label=MODELS[model].label)
+
+
+def _draw_published(axes: Axes, summary: Mapping[str, Any], score: str) -> None:
+    curves = {"mae": published.FIG2B_MAE, "constraint_error": published.FIG2B_CONSTRAINT_ERROR}.get(score, {})
+    for model, values in curves.items():
+        if model in summary["curves"]:
+            axes.plot(
+                list(values), list(values.values()), color=COLORS[model], linestyle="--", linewidth=1.0, alpha=0.8
+            )
+
+
+ESTIMATES = (
+    ("mass_error", "|mass error| of the tool [kg]", MASS_BOUND),
+    ("center_error", "error of its centre of mass [m]", CENTER_BOUND),
+    ("mae", "MAE against noisy accelerations [rad/s²]", None),
+)
+LINES = {"analytical": "-", "zero": ":"}
+
+
+def estimation_figure(summary: Mapping[str, Any]) -> Figure:
+    """Figure 2c: ours as lines, the published values as crosses."""
+    figure = new_figure(11.0, 4.0)
+    panels = figure.subplots(1, len(ESTIMATES))
+    for axes, (name, title, bound) in zip(panels, ESTIMATES, strict=True):
+        for model, means in summary["traces"].items():
+            for mean, trace in means.items():
+                values = [abs(value) for value in trace[name]]
+                label = f"{ESTIMATING_MODELS[model]} {MEANS[mean]}"
+                axes.plot(values, color=COLORS[model], linestyle=LINES[mean], linewidth=1.4, label=label)
+        if bound is not None:
+            axes.axhline(bound, color=QUIET, linewidth=0.8)
+        for model, values in published.FIG2C.items():
+            points = values.get(name, {})
+            errors = [abs(value) for value in points.values()]
+            axes.plot(list(points), errors, "x", color=COLORS[model], markersize=6)
+        axes.set_yscale("log")
+        axes.set_xscale("symlog", linthresh=10)
+        axes.set_xlim(0, 450)
+        axes.set_xticks([0, 5, 10, 40, 100, 400], ["0", "5", "10", "40", "100", "400"])
+        quiet(axes, title=title, x="iteration")
+    panels[0].plot([], [], "x", color=QUIET, label="published (2021)")
+    legend_below(figure, panels[0], columns=5)
+    return figure
+
+
+def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
+    """One panel per region: for each model the MAE inside (hollow) and outside (filled), with the range over seeds."""
+    figure = new_figure(10.0, 3.8)
+    panels = figure.subplots(1, len(REGIONS), sharey=True, sharex=True)
+    for axes, (region, label) in zip(panels, REGIONS.items(), strict=True):
+        models = summary["regions"][region]
+        for place, (model, scores) in enumerate(models.items()):
+            _draw_model(axes, -place, scores, COLORS[model])
+        axes.set_yticks([-place for place in range(len(models))], [_label(model, models[model]) for model in models])
+        axes.set_xscale("log")
+        quiet(axes, title=f"tested in the {label}", x="MAE against noise-free accelerations [rad/s²]")
+        axes.tick_params(axis="y", length=0)
+    panels[0].plot([], [], "o", color=QUIET, markerfacecolor="white", label="inside: where it was trained")
+    panels[0].plot([], [], "o", color=QUIET, label="outside")
+    legend_below(figure, panels[0])
+    return figure
+
+
+def _label(model: str, scores: Mapping[str, Any]) -> str:
+    points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
+    return f"{MODELS[model].label} ({points})"
+
+
+def _draw_model(axes: Axes, place: int, scores: Mapping[str, Any], color: str) -> None:
+    inside, outside = (scores[side]["mae_noise_free"] for side in ("inside", "outside"))
+    axes.plot([inside["median"], outside["median"]], [place, place], color=color, linewidth=1.0, alpha=0.5)
+    for value, face in ((inside, "white"), (outside, color)):
+        axes.plot([value["min"], value["max"]], [place, place], color=color, linewidth=3.0, alpha=0.35)
+        axes.plot(value["median"], place, "o", color=color, markerfacecolor=face, markersize=6)
+
+
+SHOWN_JOINTS = (0, 3, 6)
+INTERVAL = 1.96
+
+
+def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """Models side by side, joints 1, 4 and 7 below each other, all of one joint on the same scale."""
+    figure = new_figure(11.0, 6.0)
+    panels = figure.subplots(len(SHOWN_JOINTS), len(arrays), sharex=True, sharey="row", squeeze=False)
+    for column, (model, stored) in enumerate(arrays.items()):
+        for row, joint in enumerate(SHOWN_JOINTS):
+            axes = panels[row, column]
+            time, mean, std = stored["time"], stored["mean"][:, joint], stored["std"][:, joint]
+            measured, color = stored["measured"][:, joint], COLORS[model]
+            axes.plot(time, measured, ".", color=MEASUREMENT, markersize=1.5, label="measured", rasterized=True)
+            draw_band(axes, time, mean, INTERVAL * std, color=color, alpha=0.3, label="95 % interval")
+            axes.plot(time, mean, color=color, linewidth=1.2, label="prediction")
+            axes.plot(time, stored["truth"][:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="truth")
+            margin = 0.25 * (measured.max() - measured.min())
+            axes.set_ylim(measured.min() - margin, measured.max() + margin)
+            quiet(
+                axes,
+                title=MODELS[model].label if row == 0 else "",
+                x="time [s]" if row == len(SHOWN_JOINTS) - 1 else "",
+                y=f"joint {joint + 1} [rad/s²]" if column == 0 else "",
+            )
+    legend_below(figure, panels[0, -1])
+    return figure
+
+
+Arrays = Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]
+TITLES = {
+    "baumgarte": "with Baumgarte (black boxes: none)",
+    "none": "not stabilised",
+    "projected": "projecting integrator",
+}
+
+
+MOST_DRAWN = 300
+"""Points of a curve, about: more than the eye sees would make megabytes of vector graphics."""
+
+
+def rollouts_figure(arrays: Arrays, title: str) -> Figure:
+    """Joint error above (diverged: infinite), distance from the surface below (of those that have not diverged)."""
+    figure = new_figure(11.0, 6.0)
+    figure.suptitle(title, fontsize=LARGE, x=0.01, ha="left")
+    panels = figure.subplots(2, len(TITLES), sharex=True, sharey="row")
+    for column, (variant, heading) in enumerate(TITLES.items()):
+        shown = dict(arrays[variant])
+        if variant == "baumgarte":
+            shown = {model: each for model, each in arrays["none"].items() if model not in shown} | shown
+        for model, whole in shown.items():
+            every = max(1, len(whole["time"]) // MOST_DRAWN)
+            stored = {name: rows[..., ::every] for name, rows in whole.items()}
+            gone = np.isnan(stored["joint_error"])
+            _draw_motions(panels[0, column], stored["time"], np.where(gone, np.inf, stored["joint_error"]), model)
+            _draw_motions(panels[1, column], stored["time"], _of_the_living(stored["constraint"], gone), model)
+        quiet(panels[0, column], title=heading, y="mean |q − q recorded| [rad]" if column == 0 else "")
+        quiet(panels[1, column], x="time [s]", y="|c(q)| [m]" if column == 0 else "")
+    for axes in panels.flat:
+        axes.set_yscale("log")
+    panels[0, 0].set_ylim(1e-6, 1e1)
+    panels[1, 0].set_ylim(1e-17, 1e0)
+    legend_below(figure, panels[0, 0])
+    return figure
+
+
+def _of_the_living(values: np.ndarray, gone: np.ndarray) -> np.ndarray:
+    """The values of motions that have not diverged; where fewer than half are left, of none."""
+    few = gone.mean(axis=0) > 0.5
+    left = np.where(gone, np.nan, values)
+    filled = np.where(gone, np.nanmedian(np.where(few, 0.0, left), axis=0), left)
+    return np.where(few, np.nan, filled)
+
+
+def _draw_motions(axes: Axes, time: np.ndarray, values: np.ndarray, model: str) -> None:
+    """Median over the motions, and the range from the 10th to the 90th percentile."""
+    low, middle, high = np.quantile(np.maximum(values, 1e-18), (0.1, 0.5, 0.9), axis=0, method="nearest")
+    high, middle = np.where(np.isinf(high), 1e3, high), np.where(np.isinf(middle), np.nan, middle)
+    axes.fill_between(time, low, high, color=COLORS[model], alpha=0.12, linewidth=0)
+    axes.plot(time, middle, color=COLORS[model], linewidth=1.2, label=MODELS[model].label)
