@@ -1,7 +1,8 @@
-"""What does the dynamics that is compiled for one robot cost, against Pinocchio in C++?
+"""What does the dynamics that is compiled for one robot cost, against Pinocchio in C++ and the C that CasADi generates?
 
-One process, one thread, both sides in turn, CPU seconds, medians; the robot is the KUKA iiwa, 10,000 random states.
-Both sides are first checked to agree. The Pinocchio side is a C++ loop over the states (see `benchmarks.rigid_body`),
+One process, one thread, all sides in turn, CPU seconds, medians; the robot is the KUKA iiwa, 1,000 and 10,000 random
+states. All sides are first checked to agree. CasADi's is in `benchmarks.casadi_dynamics`, and the stronger of the two.
+The Pinocchio side is a C++ loop over the states (see `benchmarks.rigid_body`),
 and for the gradient of ``sum(w * a)``, a the accelerations under given forces, with respect to the ten inertial
 parameters of each of the seven moving links, the faster of two loops that a user of Pinocchio could write. Both compute
 ``a = aba(q, v, tau)`` and ``l = M^-1 w`` (`crba` and its sparse Cholesky factor); the gradient of a state is ``-Y' l``
@@ -12,6 +13,7 @@ with Y the torque regressor at (q, v, a):
   l (`forwardKinematics`), which is faster.
 
 Our side goes further, to the log-Cholesky parameters, and takes the time of a forward and a backward pass of torch.
+`pin.abaInParallel` is in the table as well, with one thread and with two (wall-clock time there).
 
 "Cold" is the time to compile into an empty folder, "warm" the time in a new process from ``robot.compile(folder)`` to
 the first result of forward dynamics, with torch and the robot loaded (wall-clock time both).
@@ -25,6 +27,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -33,9 +36,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import torch
 from threadpoolctl import threadpool_limits
 
+from benchmarks.casadi_dynamics import QUANTITIES, CasadiLoops
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot, physical_from_parameters
 from forcegp.robots.compiled import CompiledRobot
@@ -58,7 +63,7 @@ extern "C" void inertial_gradient(PyObject* m, PyObject* d, PyObject* o, int cou
   Out sum(gradient, 10 * n);
   sum.setZero();
   for (int i = 0; i < count; i++) {
-    const Vector qi = row(q, i, n), vi = row(v, i, n), ti = row(tau, i, n);
+    const Row qi = row(q, i, n), vi = row(v, i, n), ti = row(tau, i, n);
     const Vector a = aba(model, data, In(qi), In(vi), In(ti));
     crba(model, data, In(qi), Convention::WORLD);
     cholesky::decompose(model, data);
@@ -115,9 +120,9 @@ class Ours:
     def forward(self) -> torch.Tensor:
         return self.of.forward_dynamics(*self.states.tensors)
 
-    def inertial_gradient(self) -> torch.Tensor:
-        total = (self.weights * self.of.forward_dynamics(*self.states.tensors, self.inertials)).sum()
-        return torch.stack(torch.autograd.grad(total, list(self.inertials.values())))
+    def inertial_gradient(self) -> tuple[torch.Tensor, ...]:
+        a = self.of.forward_dynamics(*self.states.tensors, self.inertials)
+        return torch.autograd.grad(a, list(self.inertials.values()), self.weights)
 
 
 def chained(gradient: np.ndarray, inertials: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -138,6 +143,39 @@ def largest_error(ours: torch.Tensor, theirs: np.ndarray | torch.Tensor) -> floa
     return float((ours - expected).abs().max() / expected.abs().max())
 
 
+def against_casadi(states: States, weights: np.ndarray, mine: Ours, folder: Path) -> dict[str, float]:
+    """Our time over that of CasADi's C for each quantity, after a check that both agree."""
+    folder.mkdir()
+    loops, count = CasadiLoops(states.robot, folder, states.q, states.v, states.tau, weights), len(weights)
+    mass, bias = mine.mass_and_bias()
+    M, h = loops.mass_bias()
+    errors = [largest_error(mass.flatten(1), M), largest_error(bias, h), largest_error(mine.forward(), loops.fd()[0])]
+    a, gradient = loops.inertial_gradient()
+    errors += [largest_error(mine.forward(), a)]
+    errors += [largest_error(torch.stack(mine.inertial_gradient()), chained(gradient, mine.inertials))]
+    assert max(errors) < 1e-9, errors
+    found = {}
+    pairs = zip((mine.mass_and_bias, mine.forward, mine.inertial_gradient), QUANTITIES, strict=True)
+    for ours, quantity in pairs:
+        own, theirs = in_turn(
+            ours, getattr(loops, quantity), repetitions=20 * REPETITIONS if count < BATCH else REPETITIONS
+        )
+        found[f"compiled_{quantity}_vs_casadi_b{count}"] = own / theirs
+        times = f"{1e6 * own:8.0f} us, CasADi's C {1e6 * theirs:8.0f} us, {own / theirs:.2f}"
+        print(f"{quantity:20s}{count:7d} states: {times}")
+    return found
+
+
+def aba_in_parallel(states: States) -> list[float]:
+    """Wall-clock seconds of `pin.abaInParallel`, one thread and two."""
+    pool, given = pin.ModelPool(states.model, 2), [np.asfortranarray(x.T) for x in (states.q, states.v, states.tau)]
+    out = np.zeros_like(given[0], order="F")
+    return [
+        statistics.median(seconds(lambda: pin.abaInParallel(threads, pool, *given, out)) for _ in range(20))  # noqa: B023
+        for threads in (1, 2)
+    ]
+
+
 def agreement(mine: Ours, loops: Loops) -> float:
     """Largest error of all three results."""
     mass, bias = mine.mass_and_bias()
@@ -147,7 +185,7 @@ def agreement(mine: Ours, loops: Loops) -> float:
         errors += [largest_error(mass.tril(), np.tril(loops.M)), largest_error(bias, loops.bias)]
     loops.forward()
     errors.append(largest_error(mine.forward(), loops.a))
-    gradient = mine.inertial_gradient()
+    gradient = torch.stack(mine.inertial_gradient())
     for loop in loops.inertial_gradient:
         loop()
         errors.append(largest_error(gradient, chained(loops.gradient, mine.inertials)))
@@ -264,13 +302,23 @@ def run() -> dict[str, float]:
             results[f"compiled_{key}_vs_pinocchio_b10000"] = own / min(others)
             rows.append((label, own, slow, others))
         one = tuple(x[0] for x in states.tensors)
-        (single,) = in_turn(lambda: mine.of.forward_dynamics(*one), repetitions=1000)
-        results["compiled_fd_single_ms"] = 1e3 * single
+        single, alone = in_turn(
+            lambda: mine.of.forward_dynamics(*one),
+            lambda: pin.aba(states.model, states.data, states.q[0], states.v[0], states.tau[0]),
+            repetitions=1000,
+        )
+        results["compiled_fd_single_us"] = 1e6 * single
+        for count in (1000, BATCH):
+            fewer = States(count)
+            own = Ours(fewer, weights[:count], mine.of)
+            results |= against_casadi(fewer, weights[:count], own, folder / str(count))
+        parallel = aba_in_parallel(states)
     print(f"\n{f'CPU ms, medians, {BATCH} states':56s}{'compiled':>10s}{'eager':>10s}{'C++ loops':>18s}{'ratio':>8s}")
     for label, own, slow, others in rows:
         listed = " / ".join(f"{1e3 * other:.1f}" for other in others)
         print(f"{label:56s}{1e3 * own:10.2f}{1e3 * slow:10.1f}{listed:>18s}{own / min(others):8.3f}")
-    print(f"{'forward dynamics, 1 state':56s}{1e3 * single:10.3f}")
+    print(f"{'forward dynamics, 1 state (pin.aba)':56s}{1e3 * single:10.4f}{1e3 * alone:28.4f}")
+    print("pin.abaInParallel, one thread and two, wall-clock ms: " + ", ".join(f"{1e3 * x:.1f}" for x in parallel))
     return results
 
 

@@ -35,12 +35,14 @@ def plain_matrices(kernels: LatentKernels, features) -> list[torch.Tensor]:
     return [kernel(z, z).to_dense() for kernel, z in zip(kernels.kernels, features, strict=True)]
 
 
-def assert_same_value_and_gradients(given_problem: Problem, noise_of=lambda problem: (problem.noise, [problem.noise])):
+def assert_same_value_and_gradients(
+    given_problem: Problem, noise_of=lambda problem: (problem.noise, [problem.noise]), fixed=()
+):
     """Compare with the dense oracle with respect to everything: W, residual, noise, features and kernel parameters."""
-    for tensor in (given_problem.W, given_problem.residual, given_problem.noise, *given_problem.features):
+    data = {name: getattr(given_problem, name) for name in ("W", "residual") if name not in fixed}
+    for tensor in (*data.values(), given_problem.noise, *given_problem.features):
         tensor.requires_grad_()
     noise, noise_leaves = noise_of(given_problem)
-    data = {"W": given_problem.W, "residual": given_problem.residual}
     data |= {f"noise {k}": leaf for k, leaf in enumerate(noise_leaves)}
     data |= {f"features {c}": z for c, z in enumerate(given_problem.features)}
     data |= dict(given_problem.kernels.named_parameters())
@@ -60,6 +62,16 @@ def assert_same_value_and_gradients(given_problem: Problem, noise_of=lambda prob
 def test_value_and_all_gradients_with_noise_variances(shape, panel_bytes, monkeypatch):
     monkeypatch.setattr(likelihood, "PANEL_BYTES", panel_bytes)
     assert_same_value_and_gradients(problem(**shape))
+
+
+@pytest.mark.parametrize("inner", [1, 7, 256])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_mixing_that_no_parameter_moves(shape, inner, monkeypatch):
+    """Most fits: the gradients come from the inverse of the factor, in panels of any height."""
+    monkeypatch.setattr(likelihood, "INNER", inner)
+    given_problem = problem(**shape)
+    given_problem.W[0] *= 0.0  # a point of lower rank than the others
+    assert_same_value_and_gradients(given_problem, fixed=("W",))
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)

@@ -185,6 +185,24 @@ def test_the_rank_keeps_the_tolerance_and_no_more(posterior):
     assert 1.0 - 1e-6 < float(ratio.min()) <= float(ratio.max()) < 1.02
 
 
+def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch):
+    posterior = fitted(StructuredGP(arm_system(), JointFriction()), rows=60)
+    monkeypatch.setattr("forcegp.models.structured.predictor_preparation.SAMPLES", 30)
+    predictor = posterior.predictor(compile=False)  # without a warning; of ten rows it is 97 times too large at others
+    rows = posterior.training
+    ratio = predictor(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
+    assert float((ratio / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt().max()) < 1.05
+
+
+def test_large_data_are_compressed_by_subspace_iteration(posterior, monkeypatch):
+    by_all = posterior.predictor(compile=False).rank
+    monkeypatch.setattr("forcegp.inference.compressed_covariance.SMALL", 4)
+    monkeypatch.setattr("forcegp.inference.compressed_covariance.FEWEST", 4)  # grows until it suffices
+    predictor = posterior.predictor(compile=False)
+    assert float(predictor.inflation.max()) <= 0.01
+    assert by_all <= predictor.rank <= 1.2 * by_all
+
+
 def test_many_states_are_one_by_one(compressed):
     predictor = compressed
     data = arm_data(3000, 3)  # more than one block

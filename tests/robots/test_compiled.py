@@ -149,15 +149,21 @@ def test_every_number_of_states(robot, compiled, count):
 @pytest.mark.parametrize(("lanes", "statements"), [(1, 500), (2, 500), (8, 500), (4, 40), (4, 10**6)])
 def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
     """What is written for other processors runs here, too, only slower; parts of any length do the same."""
-    request = Request("forward_dynamics", free_inertias=True, states=True, inertias=True)
-    source = write_program(trace_dynamics(UnrolledRobot(robot), request), lanes, statements)
-    library = compile_library(source, ("-std=gnu11", "-O1", "-fPIC", "-shared"), tmp_path / "x.so", "evaluate", PURPOSE)
     q, v, tau, weights = random(4, 13, 3)
-    inertias = robot.tree.inertias[..., 0][:, *zip(*INERTIA_ENTRIES, strict=True)].reshape(1, -1)
-    inputs = [q, v, tau, inertias, weights]
-    outputs = [torch.full_like(x, torch.nan) for x in inputs[:4]]
-    sizes = [x.shape[1] for x in inputs]
-    assert RowFunction(library, sizes, sizes[:4]).rows(13, inputs, outputs) == 0
+    inputs = [q, v, tau, robot.tree.inertias[..., 0][:, *zip(*INERTIA_ENTRIES, strict=True)].reshape(1, -1)]
+    for derivatives in (False, True):  # which take what the value has kept
+        request = Request("forward_dynamics", True, derivatives, derivatives, keeps=not derivatives)
+        source = write_program(trace_dynamics(UnrolledRobot(robot), request), lanes, statements)
+        options, path = ("-std=gnu11", "-O1", "-fPIC", "-shared"), tmp_path / f"{derivatives}.so"
+        sizes = request.sizes(UnrolledRobot(robot))
+        outputs = [
+            torch.full((1 if name == "inertias" else 13, sizes[name]), torch.nan, dtype=torch.float64)
+            for name in request.outputs
+        ]
+        library = compile_library(source, options, path, "evaluate", PURPOSE)
+        given, made = ([x.shape[1] for x in vectors] for vectors in (inputs, outputs))
+        assert RowFunction(library, given, made).rows(13, inputs, outputs) == 0
+        inputs += [outputs[-1], weights]
     leaves = [x.requires_grad_() for x in (q, v, tau)]
     expected = torch.autograd.grad((robot.forward_dynamics(q, v, tau) * weights).sum(), leaves)
     torch.testing.assert_close(outputs[:3], list(expected))
@@ -169,6 +175,10 @@ def test_batches_broadcast_as_those_of_the_robot(robot, compiled):
     assert ours.shape == (4, 2, 3)
     torch.testing.assert_close(ours, theirs)
     assert compiled.mass_matrix(q).shape == (3, 3)
+    inertials = {"cart": 0.3 * random(5, 10), "tool": 0.3 * random(10)}
+    for states in (random(3, 3), random(3, 1, 3), random(3, 0, 1, 3)):  # every state serves all sets of inertias
+        ours, theirs = (of.forward_dynamics(*states, inertials) for of in (compiled, robot))
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_large_batches_by_several_threads(robot, compiled):

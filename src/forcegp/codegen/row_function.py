@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -44,29 +44,29 @@ class RowFunction:
         the sum over the states. Large batches take as many threads as torch has.
         """
         threads = max(1, min(torch.get_num_threads(), count // STATES_PER_THREAD))
+        if threads == 1:
+            return self._evaluate(0, count, self._tables, *_pointers(count, (*inputs, *outputs)))
         # each thread has sums of its own
-        sums = {k: x.new_zeros(threads, 1, x.shape[1]) for k, x in enumerate(outputs) if len(x) != count}
+        sums = {k: x.new_zeros(threads, 1, x.shape[1]) for k, x in enumerate(outputs) if x.shape[0] != count}
         bounds = [count * k // threads for k in range(threads + 1)]
 
         def part(thread: int) -> int:
             filled = [sums[k][thread] if k in sums else x for k, x in enumerate(outputs)]
-            pointers = [
-                argument
-                for x in (*inputs, *filled)
-                for argument in (x.data_ptr(), x.shape[1] if len(x) == count else 0)
-            ]
+            pointers = _pointers(count, (*inputs, *filled))
             return self._evaluate(bounds[thread], bounds[thread + 1], self._tables, *pointers)
 
-        if threads == 1:
-            found = part(0)
-        else:
-            found = 0
-            with ThreadPoolExecutor(threads) as pool:  # ctypes lets other threads run meanwhile
-                for bits in pool.map(part, range(threads)):
-                    found |= bits
+        found = 0
+        with ThreadPoolExecutor(threads) as pool:  # ctypes lets other threads run meanwhile
+            for bits in pool.map(part, range(threads)):
+                found |= bits
         for k, values in sums.items():
             outputs[k].copy_(values.sum(0))
         return found
+
+
+def _pointers(count: int, rows: Iterable[Tensor]) -> list[int]:
+    """Addresses and strides from one state to the next."""
+    return [number for x in rows for number in (x.data_ptr(), x.shape[1] if x.shape[0] == count else 0)]
 
 
 def are_plain(given: Sequence[object], size: int) -> bool:

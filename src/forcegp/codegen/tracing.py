@@ -107,10 +107,11 @@ class _Recording(TorchDispatchMode):
     @override
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
         kwargs = kwargs or {}
-        with self:
-            found = _decompositions().get(func, func.decompose)(*args, **kwargs)  # type: ignore[reportOptionalCall]  # it is a method
-        if found is not NotImplemented:
-            return found
+        if _name(func) not in HANDLERS or _name(func) == "full_like":  # a constant, which may be filled in place
+            with self:
+                found = _decompositions().get(func, func.decompose)(*args, **kwargs)  # type: ignore[reportOptionalCall]  # it is a method
+            if found is not NotImplemented:
+                return found
         result = func(*args, **kwargs)
         given = _pytree.tree_map(self.numbers_of, (args, kwargs))
         if any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(given)):
@@ -131,6 +132,10 @@ def _decompositions() -> dict[Any, Callable[..., Any]]:
     return getattr(_decomp, "_core_aten_decompositions_post_autograd", _decomp.core_aten_decompositions)()
 
 
+def _name(target: Any) -> str:
+    return getattr(target, "__name__", str(target)).split(".")[0]
+
+
 class _Numbers:
     """A tensor of numbers that depend on the inputs, as the numbers of their nodes."""
 
@@ -147,7 +152,7 @@ def _numbers(graph: Graph, value: _Numbers | Tensor | float | int) -> _Numbers:
 
 def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     """One operation of torch on constants or node numbers."""
-    name = getattr(target, "__name__", str(target)).split(".")[0]
+    name = _name(target)
     known = not any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(args[1:]))
     if name in MOVING and (known or name not in INDEXED):
         return _moved(graph, target, args, kwargs, name in INDEXED)
@@ -199,6 +204,11 @@ def _looked_up(graph: Graph, values: Any, indices: list[Any]) -> _Numbers:
 
 def _filled(graph: Graph, x: _Numbers, value: Any) -> _Numbers:
     return _Numbers(torch.full_like(x.nodes, graph.constant(value)))
+
+
+def _added_multiple(graph: Graph, x: Any, y: Any, z: Any, value: Any = 1.0) -> _Numbers:
+    """addcmul. The decomposition that torch has of it takes a second to import what it needs."""
+    return _binary("add")(graph, x, _binary("multiply")(graph, y, z), value)
 
 
 def _padded(graph: Graph, x: _Numbers, pad: list[int], value: Any = 0.0) -> _Numbers:
@@ -317,6 +327,7 @@ def _added_product(graph: Graph, bias: Any, x: Any, y: Any, beta: Any = 1.0, alp
 HANDLERS: dict[str, Callable[..., Any]] = {
     "full_like": _filled,
     "constant_pad_nd": _padded,
+    "addcmul": _added_multiple,
     **{name: _binary(NAMES[name]) for name in ("add", "sub", "mul", "div")},
     "rsub": lambda graph, x, y, alpha=1.0: _binary("subtract")(graph, y, _binary("multiply")(graph, x, float(alpha))),
     "atan2": _binary("atan2"),

@@ -102,8 +102,9 @@ INLINE real turned(real x, int quarter) {
   const real y = WHERE((n & 1) == 0, s, c);
   return (real)((bits)y ^ ((n & 2) << 62));
 }
-static APART real r_sin(real x) { if (any(~(r_absolute(x) < 1e5))) return by_lane(sin, x); return turned(x, 0); }
-static APART real r_cos(real x) { if (any(~(r_absolute(x) < 1e5))) return by_lane(cos, x); return turned(x, 1); }
+/* inline, and the rare case last: so the compiler computes what sine and cosine of one argument share only once */
+INLINE real r_sin(real x) { const real y = turned(x, 0); return any(~(r_absolute(x) < 1e5)) ? by_lane(sin, x) : y; }
+INLINE real r_cos(real x) { const real y = turned(x, 1); return any(~(r_absolute(x) < 1e5)) ? by_lane(cos, x) : y; }
 """.replace("@EXPM1@", _EXPM1)
     .replace("@SIN@", _SIN)
     .replace("@COS@", _COS)

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.linalg import lapack
@@ -52,16 +53,25 @@ class CholeskyFactor:
         """L^-T right."""
         return torch.linalg.solve_triangular(self.lower.mT, right, upper=True)
 
+    def into_inverse_factor(self) -> Float[Tensor, "n n"]:
+        """L^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
+        if not _is_for_lapack(self.lower):
+            return torch.linalg.inv(self.lower.tril_())
+        return self._in_place(lapack.dtrtri, "dtrtri")
+
     def into_inverse(self) -> Float[Tensor, "n n"]:
         """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
         if not _is_for_lapack(self.lower):
             return torch.cholesky_inverse(self.lower.tril_(), out=self.lower)
+        return self._in_place(lapack.dpotri, "dpotri")
+
+    def _in_place(self, function: Callable[..., tuple[np.ndarray, int]], name: str) -> Float[Tensor, "n n"]:
         # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a
         # copy.
-        inverse, info = lapack.dpotri(self.lower.numpy().T, lower=0, overwrite_c=1)
+        inverse, info = function(self.lower.numpy().T, lower=0, overwrite_c=1)
         if info != 0:
             raise NumericalError(
-                f"inverting the covariance from its Cholesky factor failed (LAPACK dpotri info={info})"
+                f"inverting the covariance from its Cholesky factor failed (LAPACK {name} info={info})"
             )
         return torch.from_numpy(inverse.T)
 

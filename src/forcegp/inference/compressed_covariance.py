@@ -24,6 +24,8 @@ from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior
 
 ROUNDING = 1e-7
 """Standard deviations below this fraction of the prior's are rounding: nothing there can be uncertain."""
+FEWEST, SMALL, ITERATIONS = 256, 1000, 2
+"""Singular vectors that are tried first, rows of a matrix of which all are computed at once, and power iterations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +71,16 @@ def compress(
     """
     with torch.no_grad():
         D, _ = _directions(latent, sample)
-        B = _leading(D, min(largest, *D.shape))
         at, total = _directions(latent, check)
-        seen = (B.mT @ at).square_().cumsum_(0)
-        excess = (total - seen).clamp_min_(0.0)  # in units of the exact variance
-        enough = torch.nonzero((1.0 + excess.amax(1)).sqrt() - 1.0 <= tolerance)
-        rank = int(enough[0]) + 1 if len(enough) else len(seen)
+        most, count = min(largest, *D.shape), FEWEST
+        while True:
+            B = _leading(D, min(count, most))
+            excess = (total - (B.mT @ at).square_().cumsum_(0)).clamp_min_(0.0)  # in units of the exact variance
+            enough = torch.nonzero((1.0 + excess.amax(1)).sqrt() - 1.0 <= tolerance)
+            if len(enough) or count >= most:
+                break
+            count *= 2
+        rank = int(enough[0]) + 1 if len(enough) else most
         S = latent.system.factor.solve_upper(B[:, :rank].contiguous())
         C = latent.system.deflation.C
         factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], rank))
@@ -83,17 +89,18 @@ def compress(
 
 
 def _leading(D: Float[Tensor, "n m"], count: int) -> Float[Tensor, "n count"]:
-    """The leading left singular vectors of D, from its smaller Gram matrix."""
-    if len(D) <= D.shape[1]:
-        return torch.linalg.eigh(D @ D.mT)[1].flip(-1)[:, :count]
-    columns = D @ torch.linalg.eigh(D.mT @ D)[1].flip(-1)[:, :count]
-    for _ in range(2):  # Cholesky's QR: nearly orthogonal the first time, orthogonal to rounding the second
-        columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp_min(1e-300)
-        lower, failed = torch.linalg.cholesky_ex(columns.mT @ columns)
-        if int(failed):
-            return torch.linalg.qr(columns)[0]
-        columns = torch.linalg.solve_triangular(lower.mT, columns, upper=True, left=False)
-    return columns
+    """Leading left singular vectors of D; where D is large, nearly, by subspace iteration.
+
+    Halko, Martinsson & Tropp, "Finding structure with randomness" (2011), algorithms 4.4 and 5.3.
+    """
+    if len(D) > max(SMALL, 2 * count):
+        X = torch.randn(D.shape[1], count, dtype=D.dtype, generator=torch.Generator().manual_seed(0)).to(D.device)
+        for _ in range(ITERATIONS):
+            X = D.mT @ torch.linalg.qr(D @ X)[0]
+        X = torch.linalg.qr(D @ X)[0]
+        return X @ _leading(X.mT @ D, count)
+    # not of D D^T: squared, what matters where nearly all is known would hide the rest
+    return torch.linalg.svd(torch.linalg.qr(D.mT, mode="r")[1].mT)[0][:, :count]
 
 
 def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "n _"], Float[Tensor, " _"]]:

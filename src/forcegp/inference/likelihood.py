@@ -24,11 +24,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.deflation import Deflation, deflate, whiten
+from forcegp.inference.deflation import RANK_TOLERANCE, Deflation, deflate, whiten
 from forcegp.inference.memory import return_freed_memory
 
 PANEL_BYTES = 4 * 2**20
 """Working memory of one panel of rows; measured flat between 2 and 8 MiB, slower outside."""
+
+INNER = 256
+"""Rows of L^-1 that are multiplied at once, the inner dimension of products of N x N matrices."""
 
 LARGE = 2000
 """Rows of a covariance from which on it matters what else is held beside it (32 MB)."""
@@ -49,7 +52,7 @@ def negative_log_likelihood(
     """
     count, outputs, _ = W.shape
     W_white, y_white, log_noise = whiten(W, residual, noise)
-    quadratic_and_logdet = _DeflatedNLL.apply(W_white, y_white, *kernel_matrices)
+    quadratic_and_logdet = _DeflatedNLL.apply(W.requires_grad, W_white, y_white, *kernel_matrices)
     return quadratic_and_logdet + log_noise + 0.5 * count * outputs * math.log(2.0 * math.pi)
 
 
@@ -121,23 +124,26 @@ class _DeflatedNLL(torch.autograd.Function):
     """1/2 y~^T S~^-1 y~ + 1/2 log|S~|; the gradients are computed in the forward pass while T^-1 is in memory."""
 
     @staticmethod
-    def forward(ctx, W_white: Tensor, y_white: Tensor, *kernel_matrices: Tensor) -> Tensor:  # type: ignore[override]  # the base takes *args
+    def forward(ctx, W_varies: bool, W_white: Tensor, y_white: Tensor, *kernel_matrices: Tensor) -> Tensor:  # type: ignore[override]  # the base takes *args
         deflation = deflate(W_white, y_white)
         system = solve_deflated(deflation, kernel_matrices)
         alpha, beta = system.alpha, system.beta
         value = 0.5 * (
             (deflation.t * alpha).sum() + system.factor.log_determinant() + deflation.remainder.square().sum()
         )
-        W_needed, y_needed, *K_needed = ctx.needs_input_grad
+        W_needed, y_needed, *K_needed = ctx.needs_input_grad[1:]
         gradients: list[Tensor | None] = [None] * (2 + len(kernel_matrices))
         if y_needed:
             gradients[1] = (deflation.U @ alpha[..., None])[..., 0] + deflation.remainder
         if not kernel_matrices:
             gradients[0] = torch.zeros_like(W_white)
         elif W_needed or any(K_needed):
-            C_gradient, K_gradients = _inverse_contractions(system, kernel_matrices, W_needed, K_needed)
+            if W_varies:
+                C_gradient, K_gradients = _inverse_contractions(system, kernel_matrices, W_needed, K_needed)
+            else:
+                C_gradient, K_gradients = _factor_contractions(system, K_needed)
             gradients[2:] = K_gradients
-            if C_gradient is not None:
+            if C_gradient is not None and W_needed:
                 latent_mean = torch.stack([K @ beta[:, c] for c, K in enumerate(kernel_matrices)], dim=-1)
                 C_gradient = C_gradient - alpha[..., None] * latent_mean[:, None, :]
                 gradients[0] = deflation.U @ C_gradient - deflation.remainder[..., None] * latent_mean[:, None, :]
@@ -146,7 +152,7 @@ class _DeflatedNLL(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
-        return scaled_gradients("the deflated likelihood", upstream, ctx.gradients)
+        return None, *scaled_gradients("the deflated likelihood", upstream, ctx.gradients)
 
 
 def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
@@ -156,6 +162,34 @@ def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | N
             f"{what} has first derivatives only; for a Hessian take finite differences of its gradient"
         )
     return tuple(None if g is None else upstream * g for g in gradients)
+
+
+def _factor_contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
+    """As `_inverse_contractions`, where only the noise moves W~: from L^-1, a fifth faster than from T^-1.
+
+    With V_c = L^-1 C_c, dNLL/dK_c = 1/2 (V_c^T V_c - beta_c beta_c^T). Noise moves W~_i to E W~_i, so of dNLL/dC_i only
+    the part in the space of the rows of C_i counts; and since T = 1 + C K C^T,
+    ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii``.
+    """
+    C, beta = system.deflation.C, system.beta
+    count, rank, _ = C.shape
+    inverse = system.factor.into_inverse_factor()
+    K_gradients = [torch.outer(beta[:, c], -0.5 * beta[:, c]) if need else None for c, need in enumerate(K_needed)]
+    diagonal = torch.zeros(count, rank, rank, dtype=C.dtype, device=C.device)
+    height = max(1, INNER // max(1, rank))
+    for start in range(0, count, height):
+        stop = min(count, start + height)
+        rows = inverse[start * rank : stop * rank, : stop * rank]
+        rows[:, start * rank :].tril_()  # LAPACK leaves the upper triangle as it is
+        X = rows.view((stop - start) * rank, stop, rank).permute(1, 2, 0)
+        diagonal[:stop] += torch.bmm(X, X.mT)
+        V = torch.bmm(C[:stop].mT, X)  # (j, c, rows)
+        for c, K_gradient in enumerate(K_gradients):
+            if K_gradient is not None:
+                K_gradient[:stop, :stop].addmm_(V[:, c], V[:, c].mT, alpha=0.5)
+    squares = C.square().sum(-1, keepdim=True)  # the rows of C_i are orthogonal
+    dual = torch.where(squares > RANK_TOLERANCE**2 * squares.sum(1, keepdim=True), C / squares, torch.zeros_like(C))
+    return dual - (1.0 + system.factor.jitter) * diagonal @ dual, K_gradients
 
 
 def _inverse_contractions(

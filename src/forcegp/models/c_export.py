@@ -170,7 +170,7 @@ def named_refusal(posterior: StructuredPosterior, error: InvalidInput) -> Invali
 def _checks(export: CFiles) -> list[Check]:
     """Every function at states; derivatives, which may jump at training rows, and steps between these only."""
     training, made = export.posterior.training, export.reference
-    sampled = torch.cat(sample_states(training, STATES, 0), dim=-1)
+    sampled = torch.cat(sample_states(training, STATES, 0, STATES // 3), dim=-1)
     finite = export.posterior.predict(*sampled.chunk(3, dim=-1), covariance=False).mean.isfinite().all(-1)
     rows = min(STATES // 3, len(training.q))  # of the data themselves; then as many moved ones
     away = torch.randn(len(sampled), 1, generator=torch.Generator().manual_seed(0)).double()

@@ -150,7 +150,7 @@ class Posterior(Summary, ABC):
         raise InvalidInput(f"a {self.description} has no latent forces, so it has no curves; use a StructuredGP.")
 
     def predictor(
-        self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 512, compile: bool = True
+        self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 1536, compile: bool = True
     ) -> Predictor:
         """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
 

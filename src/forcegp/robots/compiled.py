@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -18,7 +17,7 @@ from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
 from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, check_mapping
 from forcegp.robots.compiled_programs import compiled_program
-from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, MERGED, Request
+from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
 
@@ -75,6 +74,8 @@ class CompiledRobot:
         for name in functions or ARGUMENTS:
             for states, inertias in kinds:
                 self.program(Request(name, inertials, states, inertias))
+            if derivatives and name == KEEPING:
+                self.program(Request(name, inertials, keeps=True))
         return self
 
     # ------------------------------------------------------------------ dynamics
@@ -122,95 +123,146 @@ class CompiledRobot:
         return found
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
-        nv, given = self.robot.nv, tuple(arguments.values())
-        if not inertials and are_plain(given, nv):
-            require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
-            batch = given[0].shape[:-1]
-            if batch:
-                return _shaped(run(self, Request(function), len(given[0]), given), batch, function, nv)
+        nv, given = self.robot.nv, list(arguments.values())
+        parameters = self._checked_parameters(inertials) if inertials else []
+        plain = are_plain(given, nv)
+        if not plain:
+            given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
+        require_plain((*given, *parameters), "compiled dynamics", INSTEAD_OF_TRANSFORMS)
+        batch, own = given[0].shape[:-1], torch.Size()
+        if plain and not parameters and not batch:
             bits, found = self.program(Request(function)).single(*given)
             if bits & NOT_POSITIVE:
                 raise NumericalError(NOT_POSITIVE_DEFINITE)
             return _shaped(found, (), function, nv)
-        arguments = {name: self.robot.checked_input(name, value) for name, value in arguments.items()}
-        shapes = {name: value.shape[:-1] for name, value in arguments.items()}
-        tensors = list(arguments.values())
-        if inertials:
-            tensors.append(self._merged(inertials))
-            shapes["inertials"] = tensors[-1].shape[:-1]
-        require_plain(tensors, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
-        batch = broadcast_batch(shapes)
-        flat = [
-            value.reshape(1, -1)
-            if position == len(arguments) and value.dim() == 1  # one set of inertias serves all states
-            else value.expand(*batch, -1).reshape(batch.numel(), value.shape[-1]).contiguous()
-            for position, value in enumerate(tensors)
-        ]
-        results = self._run(Request(function, bool(inertials)), batch.numel(), flat)
-        return _shaped(results, batch, function, self.robot.nv)
+        simple = plain and all(x.dim() == 1 for x in parameters)
+        if not simple:
+            named = zip(inertials or (), parameters, strict=True)
+            own = broadcast_batch({f"inertials[{name!r}]": values.shape[:-1] for name, values in named})
+            parameters = [values.expand(*own, 10) for values in parameters]
+            shapes = {name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)}
+            batch = broadcast_batch(shapes | ({"inertials": own} if parameters else {}))
+            given = [value.expand(*batch, nv) for value in given]
+        if not simple or len(batch) != 1:
+            given = [value.reshape(batch.numel(), nv).contiguous() for value in given]
+        call, tensors = _Call(function, tuple(inertials or ()), batch, own), (*given, *parameters)
+        if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
+            results = _Value.apply(self, call, *tensors)
+        else:
+            results, _ = values_of(self, call, tensors)
+        return _shaped(results, batch, function, nv)  # type: ignore[arg-type]  # torch does not type `apply`
 
-    def _merged(self, inertials: Inertials) -> Tensor:
-        """The inertias of the bodies (..., 10 nv) from the parameters of links."""
+    def _checked_parameters(self, inertials: Inertials) -> list[Tensor]:
         check_mapping(inertials)
         for name in inertials:
             self.robot.layout.require_moving(name, self.robot.name)
-        given = [self.robot.checked_parameters(name, values) for name, values in inertials.items()]
-        require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
-        named = zip(inertials, given, strict=True)
-        own = broadcast_batch({f"inertials[{name!r}]": values.shape[:-1] for name, values in named})
-        joined = torch.cat([values.expand(*own, 10) for values in given], dim=-1).reshape(own.numel(), -1)
-        (found,) = self._run(Request(MERGED, links=tuple(inertials)), own.numel(), [joined])
-        return found.reshape(*own, -1)
-
-    def _run(self, request: Request, count: int, flat: list[Tensor]) -> tuple[Tensor, ...]:
-        if torch.is_grad_enabled() and any(value.requires_grad for value in flat):
-            return _Value.apply(self, request, count, *flat)  # type: ignore[return-value]  # torch does not type `apply`
-        return run(self, request, count, flat)
+        return [self.robot.checked_parameters(name, values) for name, values in inertials.items()]
 
 
 def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:
     dimensions = DIMENSIONS.get(function, (1,))
-    return tuple(x.reshape(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True))
+    return tuple(
+        x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True)
+    )
 
 
-def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+class _Call(NamedTuple):
+    """A function at (batch) states with parameters (own, 10) of links, whose batch broadcasts to that of the states."""
+
+    function: str
+    links: tuple[str, ...]
+    batch: torch.Size
+    own: torch.Size
+
+    def joined(self, parameters: Sequence[Tensor]) -> Tensor:
+        """The parameters of all links, a row for each set."""
+        return torch.cat(list(parameters), dim=-1).view(self.own.numel(), -1)
+
+
+def values_of(
+    owner: CompiledRobot, call: _Call, tensors: Sequence[Tensor], keeps: bool = False
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Results (count, size), and what derivatives take beside states and cotangents: the inertias and what was kept."""
+    states, parameters = (list(part) for part in _split(call, tensors))
+    if parameters:
+        rows = call.joined(parameters)
+        (inertias,) = run(owner, Request(MERGED, links=call.links), len(rows), [rows])
+        if call.own:
+            size = inertias.shape[1]
+            inertias = inertias.view(*call.own, size).expand(*call.batch, size).reshape(-1, size)
+        states.append(inertias)
+    request = Request(call.function, bool(parameters), keeps=keeps and call.function == KEEPING)
+    made = run(owner, request, call.batch.numel(), states)
+    results = len(request.results)
+    return made[:results], [*states[len(ARGUMENTS[call.function]) :], *made[results:]]
+
+
+def derivatives_of(
+    owner: CompiledRobot, call: _Call, request: Request, held: Sequence[Tensor], tensors: Sequence[Tensor]
+) -> list[Tensor | None]:
+    """Derivatives in the states and the parameters of links, None for those not asked for; `tensors` as in `_Value`."""
+    states, (*parameters,) = _split(call, tensors[: len(ARGUMENTS[call.function]) + len(call.links)])
+    cotangents = tensors[len(states) + len(parameters) :]
+    found: list[Tensor | None] = [*run(owner, request, call.batch.numel(), [*states, *held, *cotangents])]
+    if not request.states:
+        found = [*[None] * len(states), *found]
+    if not request.inertias:
+        return [*found, *[None] * len(parameters)]
+    inertias, rows = found.pop(), call.joined(parameters)
+    assert inertias is not None  # the last that was asked for
+    if call.own:
+        size = inertias.shape[1]
+        inertias = inertias.view(*call.batch, size).sum_to_size(*call.own, size).reshape(-1, size)
+    merging = Request(MERGED, states=True, links=call.links)
+    (gradient,) = run(owner, merging, len(rows), [rows, inertias])
+    return [*found, *gradient.view(*call.own, len(parameters), 10).unbind(-2)]
+
+
+def _split(call: _Call, tensors: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    count = len(ARGUMENTS[call.function])
+    return tensors[:count], tensors[count:]
+
+
+def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> list[Tensor]:
     """Results of a request, (count, size) each, from its inputs in order."""
     program = owner.program(request)
-    if request.is_value:
-        outputs = tuple(torch.empty(count, size, dtype=torch.float64) for size in program.outputs)
-    else:
-        inputs = dict(zip(request.inputs, tensors, strict=True))
-        outputs = tuple(torch.empty_like(inputs[name]) for name in request.wanted)
+    outputs = [torch.empty(count, size, dtype=torch.float64) for size in program.outputs]
+    if request.inertias:  # the last; one set of inertias receives the sum over all states
+        outputs[-1] = torch.empty_like(tensors[len(request.arguments) - 1])
     if program.rows(count, tensors, outputs) & NOT_POSITIVE:
         raise NumericalError(NOT_POSITIVE_DEFINITE)
     return outputs
 
 
 class _Value(torch.autograd.Function):
-    """A function of the robot; its backward pass is the program of its derivatives."""
+    """A function of the robot, of states and parameters of links; its backward pass is the program of derivatives."""
 
     @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, request: Request, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.owner, ctx.request, ctx.count = owner, request, count
+    def forward(ctx: Any, owner: CompiledRobot, call: _Call, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.owner, ctx.call = owner, call
+        results, ctx.held = values_of(owner, call, tensors, keeps=True)
         ctx.save_for_backward(*tensors)
-        return run(owner, request, count, list(tensors))
+        return tuple(results)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        needed = dict(zip(ctx.request.inputs, ctx.needs_input_grad[3:], strict=True))
-        inertias = needed.pop("inertias", False)
-        request = replace(ctx.request, states=any(needed.values()), inertias=inertias)
+        states, inertias = (any(part) for part in _split(ctx.call, ctx.needs_input_grad[2:]))
+        request = Request(ctx.call.function, bool(ctx.call.links), states, inertias)
         tensors = *ctx.saved_tensors, *(cotangent.contiguous() for cotangent in cotangents)
-        found = dict(zip(request.wanted, _Derivative.apply(ctx.owner, request, ctx.count, *tensors), strict=True))
-        return None, None, None, *(found.get(name) for name in ctx.request.inputs)
+        given = ctx.owner, ctx.call, request, ctx.held
+        if torch.is_grad_enabled():
+            return None, None, *_Derivative.apply(*given, *tensors)
+        return None, None, *derivatives_of(*given, tensors)
 
 
 class _Derivative(torch.autograd.Function):
     """Derivatives of a function of the robot, which have none themselves."""
 
     @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, request: Request, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return run(owner, request, count, list(tensors))
+    def forward(
+        ctx: Any, owner: CompiledRobot, call: _Call, request: Request, held: Sequence[Tensor], *tensors: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        return tuple(derivatives_of(owner, call, request, held, tensors))
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:

@@ -34,6 +34,5 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
         constants += [body.tolist() for body in unrolled.inertias]
     key = f"{constants!r}\0{request!r}"
     library, _ = load_library(f"{unrolled.robot.name[:40]}-{request.function}", key, write, folder, PURPOSE)
-    sizes = request.sizes(unrolled.nv)
-    made = request.results if request.is_value else request.wanted
-    return RowFunction(library, [sizes[name] for name in request.inputs], [sizes[name] for name in made])
+    sizes = request.sizes(unrolled)
+    return RowFunction(library, [sizes[name] for name in request.inputs], [sizes[name] for name in request.outputs])

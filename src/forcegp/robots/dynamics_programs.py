@@ -7,15 +7,15 @@ the cotangent g of a,
 
 so that beyond the accelerations themselves they cost one more solution with the same factor and the derivative of
 inverse dynamics ID (implicit differentiation; Carpentier & Mansard, "Analytical derivatives of rigid body dynamics
-algorithms", RSS 2018).
+algorithms", RSS 2018). The factor and the accelerations are "kept" by the program of the value, if it is asked to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,6 +38,12 @@ ARGUMENTS = {
 }
 DIMENSIONS = {"mass_matrix": (2,), "mass_matrix_and_bias": (2, 1)}
 
+KEPT = ("kept",)
+"""L below its diagonal and the inverse of D, where ``M = L^T D L``, and the accelerations."""
+
+KEEPING = "forward_dynamics"
+"""The function whose value is more than half of its derivatives."""
+
 MERGED = "merged_inertias"
 """The function from log-Cholesky parameters of links to the inertias of bodies, which the others take."""
 
@@ -46,12 +52,12 @@ INERTIA_ENTRIES = tuple((row, column) for row in range(4) for column in range(ro
 ROWS, COLUMNS = (list(entries) for entries in zip(*INERTIA_ENTRIES, strict=True))
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """Which program: a function of the robot, with the inertias as inputs or as constants, its value or derivatives.
 
     ``states`` and ``inertias`` choose the derivatives: those in all arguments, those in the inertias, both; the value
-    if neither. ``links`` are those whose parameters `MERGED` takes.
+    if neither. ``links`` are those whose parameters `MERGED` takes. ``keeps``: the value of forward dynamics with what
+    its derivatives take.
     """
 
     function: str
@@ -59,6 +65,7 @@ class Request:
     states: bool = False
     inertias: bool = False
     links: tuple[str, ...] = ()
+    keeps: bool = False
 
     @property
     def arguments(self) -> tuple[str, ...]:
@@ -71,13 +78,20 @@ class Request:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """What the program takes, in order: the arguments and, for derivatives, the cotangents of the results."""
-        return self.arguments + (() if self.is_value else self.results)
+        """What the program takes: the arguments, for derivatives also what was kept and the results' cotangents."""
+        if self.is_value:
+            return self.arguments
+        return self.arguments + (KEPT if self.function == KEEPING else ()) + self.results
 
     @property
     def results(self) -> tuple[str, ...]:
         """Names of the results of the function, and of their cotangents."""
         return tuple(f"result {k}" for k in range(len(DIMENSIONS.get(self.function, (1,)))))
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What the program makes, in order."""
+        return self.results + (KEPT if self.keeps else ()) if self.is_value else self.wanted
 
     @property
     def wanted(self) -> tuple[str, ...]:
@@ -90,25 +104,33 @@ class Request:
         """Whether the program computes the function itself."""
         return not (self.states or self.inertias)
 
-    def sizes(self, nv: int) -> dict[str, int]:
+    def sizes(self, unrolled: UnrolledRobot) -> dict[str, int]:
         """Length of every input, result and derivative by name."""
+        nv = unrolled.nv
         results = {MERGED: (len(INERTIA_ENTRIES) * nv,)}.get(
             self.function, tuple(nv**d for d in DIMENSIONS.get(self.function, (1,)))
         )
         given = {"inertias": len(INERTIA_ENTRIES) * nv, "parameters": 10 * len(self.links)}
-        return {name: given.get(name, nv) for name in self.arguments} | dict(zip(self.results, results, strict=True))
+        kept = dict.fromkeys(KEPT, len(unrolled.pairs) + 2 * nv)
+        return (
+            {name: given.get(name, nv) for name in self.arguments}
+            | kept
+            | dict(zip(self.results, results, strict=True))
+        )
 
 
 def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
     """Write a program down."""
-    n, sizes = unrolled.nv, request.sizes(unrolled.nv)
+    n, sizes = unrolled.nv, request.sizes(unrolled)
     inputs = {name: sizes[name] for name in request.inputs}
     graph = Graph()
     given = {name: graph.more_inputs(size) for name, size in inputs.items() if name in request.arguments}
+    kept = scalars(graph.more_inputs(inputs["kept"])) if "kept" in inputs else None
     cotangents = [graph.more_inputs(inputs[name]) for name in request.results if not request.is_value]
     positive = scalars([])
     held: list[Scalars] = []
-    results: list[Scalars]
+    results: list[Scalars] = []
+    differentiated: list[Scalars] = []
     if request.function == MERGED:
         results = differentiated = [_merged(unrolled, request, graph, given["parameters"])]
     else:
@@ -116,12 +138,20 @@ def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
         if request.free_inertias:
             inertias = [_symmetric(given["inertias"][10 * body : 10 * body + 10]) for body in range(n)]
         at = UnrolledKinematics(unrolled, given["q"], given.get("v"))
-        if request.function == "forward_dynamics":  # for derivatives [l, a] are held, and inverse dynamics taken at a
-            factor, positive = factorize(at.mass_matrix(inertias))
-            a = solve_factorized(factor, positive, scalars(given["tau"]) - at.bias_forces(inertias))
-            results, differentiated = [a], []
-            if cotangents:
-                held = [solve_factorized(factor, positive, scalars(cotangents[0])), a]
+        if request.function == KEEPING:  # for derivatives [l, a] are held, and inverse dynamics taken at a
+            if kept is None:
+                L, positive = factorize(at.mass_matrix(inertias))
+                factor = L, 1.0 / positive
+                a = solve_factorized(*factor, scalars(given["tau"]) - at.bias_forces(inertias))
+                results = [a]
+                if request.keeps:
+                    results.append(np.concatenate([[L[pair] for pair in unrolled.pairs], factor[1], a]))
+            else:
+                L, pairs = scalars(np.eye(n).tolist()), len(unrolled.pairs)
+                for pair, entry in zip(unrolled.pairs, kept, strict=False):
+                    L[pair] = entry
+                a = kept[-n:]
+                held = [solve_factorized(L, kept[pairs:-n], scalars(cotangents[0])), a]
                 differentiated = [at.inverse_dynamics(a, inertias)]
         else:
             results = differentiated = _results(at, given, inertias, request.function)
@@ -130,7 +160,7 @@ def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
         return [node_of(graph, scalar) for array in arrays for scalar in array]
 
     if request.is_value:
-        outputs = {name: nodes(result) for name, result in zip(request.results, results, strict=True)}
+        outputs = {name: nodes(result) for name, result in zip(request.outputs, results, strict=True)}
         return Program(graph, inputs, outputs, nodes(positive))
     wanted = {name: nodes(given[name]) for name in request.wanted if name != "tau"}
     after = nodes(-held[0]) if held else nodes(*cotangents)

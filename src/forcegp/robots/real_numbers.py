@@ -43,6 +43,8 @@ def real_tensor(name: str, given: Any, device: torch.device) -> Tensor:
 
     Raises InvalidInput for what is no real number.
     """
+    if type(given) is Tensor and given.dtype is torch.float64 and given.layout is torch.strided:
+        return given
     if not isinstance(given, Tensor):
         return torch.tensor(real_array(name, given).astype(np.float64), device=device)
     if given.layout != torch.strided or given.dtype == torch.bool or given.is_complex():

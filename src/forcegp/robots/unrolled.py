@@ -9,11 +9,13 @@ robot's structure makes zero or one vanishes while the computation is written do
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 
+from forcegp.robots.layout import WORLD
 from forcegp.robots.structure import RobotStructure
 
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
@@ -62,6 +64,14 @@ class UnrolledRobot:
     def nv(self) -> int:
         """Number of movable joints."""
         return len(self.joints)
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Each joint with each of those above it, where the mass matrix has entries below its diagonal."""
+        above: list[list[int]] = []
+        for joint in self.joints:
+            above.append([] if joint.parent == WORLD else [*above[joint.parent], joint.parent])
+        return [(k, i) for k, found in enumerate(above) for i in found]
 
     def _scalars(self, values: torch.Tensor, scale: float = 1.0) -> Scalars:
         """The numbers, with 0.0 for what is rounding beside ``scale``."""

@@ -168,12 +168,12 @@ def factorize(matrix: Scalars) -> tuple[Scalars, Scalars]:
     return L, rest.diagonal()
 
 
-def solve_factorized(L: Scalars, D: Scalars, b: Scalars) -> Scalars:
-    """``(L^T D L)^-1 b`` for what :func:`factorize` returns."""
+def solve_factorized(L: Scalars, D_inverse: Scalars, b: Scalars) -> Scalars:
+    """``(L^T D L)^-1 b``, L as :func:`factorize` returns it."""
     n, x = len(L), b.copy()
     for i in reversed(range(n - 1)):  # L^T x = b
         x[i] = x[i] - L[i + 1 :, i] @ x[i + 1 :]
-    x = x / D
+    x = x * D_inverse
     for i in range(1, n):  # L x = ...
         x[i] = x[i] - L[i, :i] @ x[:i]
     return x

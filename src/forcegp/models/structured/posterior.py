@@ -170,7 +170,7 @@ class StructuredPosterior(Posterior):
         *,
         covariance: str = "auto",
         tolerance: float = 0.01,
-        largest_rank: int = 512,
+        largest_rank: int = 1536,
         compile: bool = True,
     ) -> Predictor:
         self._require_commanded_torques()

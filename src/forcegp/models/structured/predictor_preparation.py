@@ -110,14 +110,18 @@ def _compressed(
     tolerance: float,
     largest_rank: int,
 ) -> CompressedCovariance:
-    def sample(count: int, seed: int) -> Sample:
+    # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
+    rough = any(z.shape[-1] == 1 for z in latent.features)
+
+    def sample(count: int, seed: int, rows: int) -> Sample:
         with torch.no_grad():
-            _, W, *features = terms(*sample_states(training, count, seed))
+            _, W, *features = terms(*sample_states(training, count, seed, rows))
         usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
         return Sample([z[usable] for z in features], W[usable])
 
     latents = [group.latents for group in prepared.groups]
-    found = compress(latent, latents, sample(SAMPLES, 0), sample(CHECKS, 1), tolerance=tolerance, largest=largest_rank)
+    chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
+    found = compress(latent, latents, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
     reached = float(found.inflation.max()) if len(found.inflation) else 0.0
     if reached > tolerance:
         warnings.warn(
@@ -129,23 +133,20 @@ def _compressed(
     return found
 
 
-def sample_states(training: TrainingData, count: int, seed: int) -> list[Float[Tensor, "count nv"]]:
-    """q, v and u of `count` states, a third of each of three kinds.
+def sample_states(training: TrainingData, count: int, seed: int, rows: int) -> list[Float[Tensor, "_ nv"]]:
+    """q, v and u of states of three kinds: `rows` training rows, or all, and a third of `count` of the others each.
 
-    Training rows; rows moved by a fraction of the difference of two others; positions, velocities and forces of
+    These are rows moved by a fraction of the difference of two others; and positions, velocities and forces of
     different rows together.
     """
     generator = torch.Generator().manual_seed(seed)
-    rows = [training.q, training.v, training.u]
+    states = [training.q, training.v, training.u]
 
     def some(number: int) -> Tensor:
         return torch.randint(len(training.q), (number,), generator=generator)
 
-    own, apart = count // 3, count - 2 * (count // 3)
-    i, j, k = some(own), some(own), some(own)
-    mixed = [some(apart) for _ in rows]
-    return [
-        torch.cat([x[some_rows], x[i] + STEP * (x[j] - x[k]), x[other]])
-        for some_rows in [torch.randperm(len(rows[0]), generator=generator)[:own]]
-        for x, other in zip(rows, mixed, strict=True)
-    ]
+    own = torch.randperm(len(training.q), generator=generator)[:rows]
+    third = count // 3
+    i, j, k = some(third), some(third), some(third)
+    mixed = [some(count - 2 * third) for _ in states]
+    return [torch.cat([x[own], x[i] + STEP * (x[j] - x[k]), x[other]]) for x, other in zip(states, mixed, strict=True)]
