@@ -14,7 +14,7 @@ import pytest
 import torch
 from tests.models.arm import arm_data, arm_system
 
-from forcegp import export_c
+from forcegp import Dataset, MechanicalSystem, Robot, export_c
 from forcegp.codegen import native_code
 from forcegp.codegen.c_writer import write_function
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
@@ -64,6 +64,26 @@ def posterior() -> StructuredPosterior:
 @pytest.fixture(scope="module")
 def friction() -> StructuredPosterior:
     return fitted(JointFriction() + ContactFriction(load=True, expected=0.2))
+
+
+ONE = """<robot name="Größe */ 1"><link name="base"/><link name="l"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="*/ int" type="continuous"><parent link="base"/><child link="l"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+def test_one_joint_with_any_name_compiles_without_a_warning(tmp_path):
+    system = MechanicalSystem(Robot.from_urdf_text(ONE))
+    q, v, u = np.random.default_rng(0).normal(size=(3, 12, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        data = Dataset(q=q, v=v, u=u, a=u - v, time=np.arange(12.0), system=system, noise_std=[0.1])
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = StructuredGP(system, JointForces()).fit(data, **options)
+    made = export_c(model, tmp_path / "one", covariance=True, jacobian=True, steps=DT, integrator="implicit-midpoint")
+    function = compiled(tmp_path / "one", f"{made.name}.c", f"{made.name}_external.c").gr_e_1_mean_covariance
+    _, (a, spread) = call(function, [1, 1], q[0], v[0], u[0])
+    np.testing.assert_allclose(a, model.predict(q, v, u).mean[0], rtol=1e-10)
+    assert 0.0 < spread[0] < 1e3
 
 
 @pytest.fixture(scope="module")

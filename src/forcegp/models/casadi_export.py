@@ -106,8 +106,8 @@ def export_casadi(
             made = _evaluated(function, [x.numpy().T for x in (q, v, u)])
         except RuntimeError:  # many lines
             raise NumericalError(
-                f"CasADi's Newton method finds no step of {steps:g} s by {integrator} somewhere near the training "
-                "data, so nothing is written; give shorter steps, or export to C, whose steps are shortened."
+                f"CasADi finds no step of {steps:g} s by {integrator} somewhere near the training data, so nothing is "
+                "written; give shorter steps, or export to C, whose Newton method shortens what overshoots."
             ) from None
         worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
         if not worst <= (STEP_TOLERANCE if file != called else TOLERANCE):

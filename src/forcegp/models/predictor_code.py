@@ -58,7 +58,8 @@ static APART void covariance(const double *const *t, const double *y, double *ou
     for (; r < K; r += LANES) s += LOAD(x + r) * LOAD(z + r);
     s = (s + s1) + (s2 + s3);
     for (int c = 0; c < C; c++) prior += W[a * C + c] * d[c] * W[b * C + c];
-    out[a * N + b] = out[b * N + a] = WIDENED * (prior - TOTAL(s));
+    prior = WIDENED * (prior - TOTAL(s));
+    out[a * N + b] = prior; out[b * N + a] = prior; /* the same place with one joint */
   }
 }
 """
