@@ -34,7 +34,7 @@ from forcegp.inference.memory import free_memory, gib
 from forcegp.jobs.job import machine
 from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
 from forcegp.models.structured.posterior import StructuredPosterior
-from forcegp.robots.devices import usable_device
+from forcegp.robots.arguments import usable_device
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 RESULTS = Path(__file__).resolve().parent / "gpu_results.json"

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from benchmarks.solver_problem import Problem
 from forcegp.inference.cholesky import factorize
-from forcegp.inference.iterative import LowRankPlusDiagonal
-from forcegp.inference.kernel_panels import KernelPanels
+from forcegp.inference.iterative import KernelPanels, LowRankPlusDiagonal
 from forcegp.inference.likelihood import deflated_covariance
 
 Steps = Iterator[tuple[Tensor, Tensor | None]]

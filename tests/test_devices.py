@@ -25,7 +25,7 @@ from forcegp.models import (
 )
 from forcegp.models.noise import Noise
 from forcegp.priors.named import named_prior
-from forcegp.robots.devices import usable_device
+from forcegp.robots.arguments import usable_device
 
 QUICK = OptimizerOptions(iterations=2)
 PRIORS = ("joint", "load-friction + joint-friction", "tool-friction", "joint-ripple", "joint:kernel=deep")

@@ -8,7 +8,7 @@ import sys
 def test_a_wrong_shape_is_refused_where_that_was_asked_for(repository):
     code = (
         "import tests.conftest, torch; from jaxtyping import TypeCheckError\n"
-        "from forcegp.mechanics.tangent_frame import surface_axes\n"
+        "from forcegp.mechanics.surfaces import surface_axes\n"
         "try: surface_axes(torch.ones(4, dtype=torch.float64))\n"
         "except TypeCheckError as error: print('surface_axes' in str(error))\n"
     )

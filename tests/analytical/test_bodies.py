@@ -16,7 +16,7 @@ from forcegp.analytical.bodies import (
 )
 from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
 from forcegp.errors import NonPhysicalInertia
-from forcegp.models.structured.objective import squared_distance
+from forcegp.models.structured.search import squared_distance
 from forcegp.robots import Robot
 from forcegp.robots.inertia import parameters_from_physical, pseudo_inertia_of_standard
 

@@ -68,7 +68,7 @@ def no_work(monkeypatch) -> None:
     monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
     monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
     monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)
-    monkeypatch.setattr("forcegp.models.fit_arguments.farthest_rows", begun, raising=False)
+    monkeypatch.setattr("forcegp.models.search.farthest_rows", begun, raising=False)
     own = Dataset.load
     monkeypatch.setattr(Dataset, "load", lambda path: own(path) if "validate" in sys.argv else begun())
 

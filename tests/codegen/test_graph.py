@@ -9,11 +9,17 @@ import torch
 from forcegp.codegen.branch_free_linalg import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower
 from forcegp.codegen.c_writer import Program, write_program
 from forcegp.codegen.derivatives import gradients, jacobian
-from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Graph
-from forcegp.codegen.library import OPTIONS, VectorUnit
-from forcegp.codegen.native_code import Purpose, compile_library
-from forcegp.codegen.numerical import evaluated
-from forcegp.codegen.row_function import NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE, RowFunction
+from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Graph, evaluated
+from forcegp.codegen.library import (
+    NOT_FINITE,
+    NOT_POSITIVE,
+    OPTIONS,
+    RESULT_NOT_FINITE,
+    Purpose,
+    RowFunction,
+    VectorUnit,
+    compile_library,
+)
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 

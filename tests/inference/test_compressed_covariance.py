@@ -4,8 +4,8 @@ import pytest
 import torch
 from tests.inference.problems import normal, problem
 
-from forcegp.inference import ExactPosterior, compressed_covariance
-from forcegp.inference.compressed_covariance import CompressedCovariance, Sample, compress
+from forcegp.inference import ExactPosterior, prepared_kernels
+from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress
 
 GROUPS = [[0, 3], [1, 2, 4]]
 
@@ -63,10 +63,10 @@ def test_it_is_the_smallest_rank_of_the_tolerance_and_never_below_the_exact_cova
 
 def test_blocks_of_states_change_nothing(latent, monkeypatch):
     whole = compress(latent, GROUPS, sample(9, seed=50), sample(7, seed=90), tolerance=0.0, largest=12)
-    monkeypatch.setattr(compressed_covariance, "BLOCK_BYTES", 8 * 10 * 5 * 5 * 4)  # four states
+    monkeypatch.setattr(prepared_kernels, "BLOCK_BYTES", 8 * 10 * 5 * 5 * 4)  # four states
     blocks = compress(latent, GROUPS, sample(9, seed=50), sample(7, seed=90), tolerance=0.0, largest=12)
     torch.testing.assert_close(blocks.inflation, whole.inflation, rtol=1e-7, atol=1e-9)
-    monkeypatch.setattr(compressed_covariance, "BLOCK_BYTES", 1)  # less than a state needs
+    monkeypatch.setattr(prepared_kernels, "BLOCK_BYTES", 1)  # less than a state needs
     assert compress(latent, GROUPS, sample(3, seed=50), sample(2, seed=90), tolerance=0.0, largest=3).rank == 3
 
 

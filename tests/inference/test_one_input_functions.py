@@ -10,12 +10,17 @@ import pytest
 import torch
 from tests.inference.problems import normal
 
-from forcegp.codegen import native_code
+from forcegp.codegen.library import Purpose
 from forcegp.errors import CompilerError
 from forcegp.inference import ExactPosterior, LatentKernels
-from forcegp.inference.one_input_functions import drawn_form, one_input_form
+from forcegp.inference.one_input_functions import (
+    OneInputFunctions,
+    cubic_table,
+    drawn_form,
+    one_input_form,
+    value_and_slope,
+)
 from forcegp.inference.pathwise import draw_functions
-from forcegp.inference.piecewise_tables import OneInputFunctions, cubic_table, value_and_slope
 from forcegp.priors.kernels import kernel_of
 
 EXACT = [
@@ -272,7 +277,7 @@ extern void many(long n, const double *table, const double *s, double *f, double
 }
 """
     try:
-        compiler = native_code.Purpose("the test", "", "skip it").compiler()
+        compiler = Purpose("the test", "", "skip it").compiler()
     except CompilerError as error:
         pytest.skip(str(error))
     source, library = folder / "latent.c", folder / "latent.so"

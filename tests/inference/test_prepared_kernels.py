@@ -8,8 +8,7 @@ from tests.inference.problems import normal, problem
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Graph
-from forcegp.codegen.native_code import Purpose, compile_library
-from forcegp.codegen.row_function import RowFunction, aligned
+from forcegp.codegen.library import Purpose, RowFunction, aligned, compile_library
 from forcegp.inference import ExactPosterior, LatentKernels
 from forcegp.inference.prepared_kernels import PreparedKernels, SharedCenters
 

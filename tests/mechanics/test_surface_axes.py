@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from tests.mechanics.systems import normal
 
 from forcegp.mechanics import surface_axes
-from forcegp.mechanics.tangent_frame import TURNED_OVER
+from forcegp.mechanics.surfaces import TURNED_OVER
 
 STEP = 1e-6
 NEAR_DOWN = [(0.0, 0.0, -2.0), (1e-9, 0.0, -1.0), (0.0, -1e-5, -1.0), (0.1, 0.2, -1.0)]

@@ -15,7 +15,6 @@ import torch
 from tests.models.arm import arm_data, arm_system
 
 from forcegp import Dataset, MechanicalSystem, Robot, export_c
-from forcegp.codegen import native_code
 from forcegp.codegen.c_writer import write_function
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.inference import OptimizerOptions
@@ -393,7 +392,7 @@ def test_a_compiler_that_hangs_leaves_nothing(posterior, tmp_path, monkeypatch):
     hangs.chmod(0o700)
     folder.mkdir()
     monkeypatch.setenv("CC", str(hangs))
-    monkeypatch.setattr(native_code, "LONGEST", 0.5)
+    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
     with pytest.raises(CompilerError, match=r"hangs: it did not end within 0\.5 s; .*`unchecked=True`"):
         export_c(posterior, folder / "arm")
     assert list(folder.iterdir()) == []

@@ -11,7 +11,7 @@ import pytest
 import torch
 from tests.models.arm import arm_data, arm_system
 
-from forcegp.codegen.native_code import Purpose, compile_library
+from forcegp.codegen.library import Purpose, compile_library
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference import OptimizerOptions
 from forcegp.models import IndependentGP, StructuredGP, StructuredPosterior, casadi_function, export_casadi

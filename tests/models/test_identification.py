@@ -17,7 +17,7 @@ from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
 from forcegp.models import Coefficients, Noise, StructuredGP, load_posterior, save_posterior
 from forcegp.models.identification.identification import FLAT, curvature_about
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
-from forcegp.models.structured.objective import squared_distance, with_variance_priors
+from forcegp.models.structured.search import squared_distance, with_variance_priors
 from forcegp.priors import NoForces
 from forcegp.priors.kernels import squared_exponential_kernel
 from forcegp.robots import LinkInertia, pseudo_inertia_from_parameters

@@ -13,7 +13,7 @@ from forcegp.data import Dataset
 from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.inference import OptimizerOptions
 from forcegp.models import StructuredGP, load_posterior, save_posterior
-from forcegp.models.structured.load_refinement import SETTLED, fit_with_refined_loads
+from forcegp.models.structured.refinement import SETTLED, fit_with_refined_loads
 from forcegp.models.structured.search import Search
 from forcegp.parallel import Serial
 from forcegp.priors import ContactFriction, JointFriction, Payload, SumPrior

@@ -196,8 +196,8 @@ def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch)
 
 def test_large_data_are_compressed_by_subspace_iteration(posterior, monkeypatch):
     by_all = posterior.predictor(compile=False).rank
-    monkeypatch.setattr("forcegp.inference.compressed_covariance.SMALL", 4)
-    monkeypatch.setattr("forcegp.inference.compressed_covariance.FEWEST", 4)  # grows until it suffices
+    monkeypatch.setattr("forcegp.inference.prepared_kernels.SMALL", 4)
+    monkeypatch.setattr("forcegp.inference.prepared_kernels.FEWEST", 4)  # grows until it suffices
     predictor = posterior.predictor(compile=False)
     assert float(predictor.inflation.max()) <= 0.01
     assert by_all <= predictor.rank <= 1.2 * by_all

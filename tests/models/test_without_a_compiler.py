@@ -8,7 +8,6 @@ import pytest
 import torch
 from tests.models.arm import arm_data, arm_system
 
-from forcegp.codegen import native_code
 from forcegp.errors import NumericalWarning
 from forcegp.inference import OptimizerOptions
 from forcegp.models import StructuredGP, StructuredPosterior
@@ -65,7 +64,7 @@ def test_what_was_compiled_stays_and_what_cannot_be_is_done_by_torch(posterior, 
     hangs.write_text("#!/bin/sh\necho >> $0.called\nexec sleep 60\n")
     hangs.chmod(0o700)
     monkeypatch.setenv("CC", str(hangs))
-    monkeypatch.setattr(native_code, "LONGEST", 0.5)
+    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
     with pytest.warns(NumericalWarning, match=SLOWER + ".*did not end within"):
         linear = predictor.linearize(*states)
     with warnings.catch_warnings():

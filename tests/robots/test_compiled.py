@@ -14,12 +14,10 @@ import torch
 from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.codegen.c_writer import write_program
-from forcegp.codegen.native_code import compile_library
-from forcegp.codegen.row_function import RowFunction
+from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
-from forcegp.robots.compiled_programs import PURPOSE
-from forcegp.robots.dynamics_programs import INERTIA_ENTRIES, Request, trace_dynamics
+from forcegp.robots.dynamics_programs import INERTIA_ENTRIES, PURPOSE, Request, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them

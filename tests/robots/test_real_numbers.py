@@ -11,7 +11,7 @@ from tests.models.arm import arm_data
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
 from forcegp.models import IndependentGP, StructuredGP
 from forcegp.robots import Robot
-from forcegp.robots.real_numbers import whole_number
+from forcegp.robots.arguments import whole_number
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 TEXT = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow="revolute")

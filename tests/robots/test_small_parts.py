@@ -9,8 +9,13 @@ from tests.robots.robot_models import MODELS
 from forcegp.errors import InvalidInput
 from forcegp.robots import Robot
 from forcegp.robots.arguments import locked_positions
-from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_of_pseudo_inertia
-from forcegp.robots.spatial import inverse, rotation_about, transform
+from forcegp.robots.inertia import (
+    inverse,
+    pseudo_inertia_of_standard,
+    rotation_about,
+    standard_of_pseudo_inertia,
+    transform,
+)
 
 LINK = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 

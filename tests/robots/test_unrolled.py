@@ -6,11 +6,9 @@ import torch
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS, TREE
 
-from forcegp.codegen.graph import Graph, node_of
-from forcegp.codegen.numerical import evaluated
+from forcegp.codegen.graph import Graph, evaluated, node_of
 from forcegp.robots import Robot
-from forcegp.robots.unrolled import UnrolledRobot
-from forcegp.robots.unrolled_kinematics import UnrolledKinematics, factorize, solve_factorized
+from forcegp.robots.unrolled import UnrolledKinematics, UnrolledRobot, factorize, solve_factorized
 
 COUNT = 6
 

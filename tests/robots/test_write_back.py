@@ -10,7 +10,7 @@ from tests.robots.robot_models import CHAIN, MODELS, TREE
 
 from forcegp.errors import InvalidInput, UnknownJoint
 from forcegp.robots import Robot
-from forcegp.robots.urdf_writer import replace_dynamics
+from forcegp.robots.urdf_file import replace_dynamics
 
 
 def perturbed(robot: Robot, *links: str) -> dict[str, torch.Tensor]:

@@ -28,7 +28,7 @@ from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
 from forcegp.errors import NonPhysicalInertia
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia, standard_basis
-from forcegp.robots.urdf_writer import replace_dynamics, replace_inertial
+from forcegp.robots.urdf_file import replace_dynamics, replace_inertial
 
 # symmetric matrices Z = sum_k z_k E_k, orthonormal in the Frobenius norm
 _ROWS, _COLUMNS = np.triu_indices(4)

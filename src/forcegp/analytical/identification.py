@@ -18,7 +18,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import dataset_first, require_rows
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
-from forcegp.robots.real_numbers import whole_number
+from forcegp.robots.arguments import whole_number
 
 Inertias = Literal["consistent", "free"]
 Likelihood = Literal["torque", "acceleration"]

@@ -1,4 +1,4 @@
-"""C text as a loaded library: compiled once, kept in a folder, loaded from there by later processes.
+"""Programs made at run time: C text compiled, kept in a folder, loaded by later processes, called with tensors.
 
 A file of the folder is named by a hash of everything that decides what is in it. Loading such a file runs the code in
 it with the rights of the process. So only files of the folder are loaded, and only if the file, the folder and all
@@ -16,18 +16,115 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import stat
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
+from torch.autograd import forward_ad
 
 from forcegp.atomic_files import atomic_file
-from forcegp.codegen.native_code import Purpose, compile_library
-from forcegp.errors import CompilerError
+from forcegp.errors import CompilerError, InvalidInput
+
+VARIABLE = "CC"
+COMMANDS = ("cc", "gcc", "clang")
+PACKAGES = (
+    "Debian, Ubuntu: apt install gcc; Fedora: dnf install gcc; macOS: xcode-select --install; conda: conda install gcc"
+)
+LONGEST = 600.0
+"""Seconds after which a compiler hangs: our longest program takes it a fiftieth of that."""
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What errors name: what is compiled, how another folder is chosen, and what works without a compiler."""
+
+    what: str
+    elsewhere: str
+    instead: str
+
+    def compiler(self) -> list[str]:
+        """The command of the C compiler, with the options that the environment variable CC gives.
+
+        Raises :class:`~forcegp.errors.CompilerError` where there is none.
+        """
+        try:
+            chosen = shlex.split(os.environ.get(VARIABLE, ""))
+        except ValueError as error:
+            raise CompilerError(
+                f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command "
+                f"({error}); correct it, or {self.instead}, whose results are the same."
+            ) from None
+        for command in [chosen] if chosen else [[command] for command in COMMANDS]:
+            if shutil.which(command[0]):
+                return command
+        looked_for = f"{', '.join(COMMANDS[:-1])} or {COMMANDS[-1]}"
+        if chosen:
+            looked_for = f"{chosen[0]!r}, which the environment variable {VARIABLE} names"
+        raise CompilerError(
+            f"{self.what} needs a C compiler, and there is none here (looked for {looked_for}); install one "
+            f"({PACKAGES}), name it by {VARIABLE}, or {self.instead}, whose results are the same."
+        )
+
+
+def compile_library(source: str, options: Iterable[str], library: Path, function: str, purpose: Purpose) -> ctypes.CDLL:
+    """Compile a C text to the shared library ``library``, and load it, which shows that it has ``function``.
+
+    Raises :class:`~forcegp.errors.CompilerError` where there is no compiler, where it fails or does not end, and where
+    nothing may be run from the folder.
+    """
+    compiler = purpose.compiler()
+    command = [*compiler, *options, "-x", "c", "-", "-o", str(library), "-lm"]
+    try:
+        done = subprocess.run(
+            command, input=source, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST
+        )
+        lines = done.stderr.strip().splitlines()
+        named = next(
+            (line for line in lines if "error" in line), lines[-1] if lines else f"exit code {done.returncode}"
+        )
+        why = named if done.returncode else None
+    except OSError as error:  # not a program
+        why = str(error)
+    except subprocess.TimeoutExpired:
+        why = f"it did not end within {LONGEST:g} s"
+    if why is not None:
+        raise CompilerError(
+            f"the C compiler failed: {shlex.join(compiler)}: {why}; name another (GCC or Clang) by the "
+            f"environment variable {VARIABLE}, or {purpose.instead}, whose results are the same."
+        )
+    try:
+        loaded = ctypes.CDLL(str(library))
+        getattr(loaded, function)
+    except (OSError, AttributeError) as error:
+        raise CompilerError(
+            f"what the C compiler wrote cannot be loaded ({shlex.join(compiler)}: {error}): its linker "
+            f"is broken, or no program may be run from {library.parent}; choose another folder ({purpose.elsewhere}), "
+            f"name another compiler by {VARIABLE}, or {purpose.instead}, whose results are the same."
+        ) from None
+    return loaded
+
+
+def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
+    """Raise :class:`~forcegp.errors.InvalidInput` under transforms of torch.func and in forward-mode differentiation.
+
+    Machine code reads the numbers of a tensor. What these two carry along with the numbers would be lost without a
+    word; backward passes are recorded around the code instead.
+    """
+    transformed = torch._C._are_functorch_transforms_active()
+    dual = forward_ad._current_level >= 0 and any(forward_ad.unpack_dual(x).tangent is not None for x in tensors)
+    if transformed or dual:
+        kind = "transforms of torch.func (vmap, grad, jacrev, ...)" if transformed else "forward-mode differentiation"
+        raise InvalidInput(f"{what} does not support {kind}; {remedy}.")
+
 
 # Lanes and compiler options by the vector unit that torch found.
 VECTOR_UNITS = {
@@ -145,3 +242,85 @@ def _compile(source: str, options: tuple[str, ...], path: Path, purpose: Purpose
             f"the folder {path.parent} for {purpose.what} cannot be written to ({error.strerror}); choose another: "
             f"{purpose.elsewhere}."
         ) from error
+
+
+STATES_PER_THREAD = 2048  # fewer are done before another thread has started
+NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
+"""What a program reports of its states: bits of its return value."""
+
+
+class RowFunction:
+    """`evaluate` of a library, whose inputs and outputs have these lengths.
+
+    `tables` are the addresses of flat arrays, which the caller keeps alive.
+    """
+
+    def __init__(
+        self, library: ctypes.CDLL, inputs: Sequence[int], outputs: Sequence[int], tables: Sequence[Tensor] = ()
+    ) -> None:
+        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+        self._held = tuple(tables)
+        self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
+        self._evaluate = library.evaluate
+        vectors = len(inputs) + len(outputs)
+        self._evaluate.argtypes = [ctypes.c_long] * 2 + [ctypes.c_void_p, *[ctypes.c_void_p, ctypes.c_long] * vectors]
+
+    def single(self, *inputs: Tensor) -> tuple[int, list[Tensor]]:
+        """What is to be reported, and the outputs (size,) at one state (size,)."""
+        made = [torch.empty(size, dtype=torch.float64) for size in self.outputs]
+        given = [argument for x in (*inputs, *made) for argument in (x.data_ptr(), 1)]
+        return self._evaluate(0, 1, self._tables, *given), made
+
+    def rows(self, count: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> int:
+        """Fill `outputs` for `count` states; what is to be reported.
+
+        Inputs and outputs are contiguous tensors (count, size), or (1, size) for all states; such an output receives
+        the sum over the states. Large batches take as many threads as torch has.
+        """
+        threads = max(1, min(torch.get_num_threads(), count // STATES_PER_THREAD))
+        if threads == 1:
+            return self._evaluate(0, count, self._tables, *_pointers(count, (*inputs, *outputs)))
+        # each thread has sums of its own
+        sums = {k: x.new_zeros(threads, 1, x.shape[1]) for k, x in enumerate(outputs) if x.shape[0] != count}
+        bounds = [count * k // threads for k in range(threads + 1)]
+
+        def part(thread: int) -> int:
+            filled = [sums[k][thread] if k in sums else x for k, x in enumerate(outputs)]
+            pointers = _pointers(count, (*inputs, *filled))
+            return self._evaluate(bounds[thread], bounds[thread + 1], self._tables, *pointers)
+
+        found = 0
+        with ThreadPoolExecutor(threads) as pool:  # ctypes lets other threads run meanwhile
+            for bits in pool.map(part, range(threads)):
+                found |= bits
+        for k, values in sums.items():
+            outputs[k].copy_(values.sum(0))
+        return found
+
+
+def _pointers(count: int, rows: Iterable[Tensor]) -> list[int]:
+    """Addresses and strides from one state to the next."""
+    return [number for x in rows for number in (x.data_ptr(), x.shape[1] if x.shape[0] == count else 0)]
+
+
+def are_plain(given: Sequence[object], size: int) -> bool:
+    """Whether these are tensors (size,) or (n, size), all of one shape, that need neither conversion nor a graph."""
+    return all(
+        type(x) is Tensor
+        and x.shape == given[0].shape  # type: ignore[attr-defined]  # of a tensor, or they differ
+        and x.shape[-1:] == (size,)
+        and x.dim() <= 2
+        and x.dtype is torch.float64
+        and not x.requires_grad
+        and x.is_cpu
+        and x.is_contiguous()
+        for x in given
+    )
+
+
+def aligned(values: np.ndarray) -> Tensor:
+    """The numbers at an address that is a multiple of 64 bytes."""
+    held = torch.empty(values.size + 8, dtype=torch.float64)
+    start = (-held.data_ptr() // 8) % 8
+    held[start : start + values.size] = torch.from_numpy(np.ascontiguousarray(values))
+    return held[start : start + values.size]

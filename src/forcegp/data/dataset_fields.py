@@ -11,7 +11,7 @@ import numpy as np
 
 import forcegp.robots
 from forcegp.errors import DatasetError, MissingExtra
-from forcegp.robots.real_numbers import real_array
+from forcegp.robots.arguments import real_array
 
 
 class FrozenDict(dict[str, Any]):

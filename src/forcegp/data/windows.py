@@ -29,7 +29,7 @@ from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
 from forcegp.data.row_selection import farthest_point_sampling
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message, usable_arguments
-from forcegp.robots.real_numbers import whole_number
+from forcegp.robots.arguments import whole_number
 
 EXACT_DEGREE = 5
 """Weights are exact for polynomials of time up to this degree, however uneven the steps."""

@@ -33,8 +33,8 @@ from forcegp.inference import Exact, OptimizerOptions, ProblemSize
 from forcegp.inference.memory import require_memory
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise, StructuredGP, StructuredPosterior
-from forcegp.models.fit_arguments import training_rows
 from forcegp.models.noise import ACCELERATION
+from forcegp.models.search import training_rows
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, Mean
 from forcegp.models.structured.prior_checks import check_prior
 from forcegp.models.training_data import TrainingData

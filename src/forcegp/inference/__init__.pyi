@@ -15,4 +15,4 @@ from .optimization import (
     minimize_objective as minimize_objective,
 )
 from .posterior import ExactPosterior as ExactPosterior, LatentPosterior as LatentPosterior, exact as exact
-from .terms import Terms as Terms
+from .deflation import Terms as Terms

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -109,3 +110,20 @@ def _require_finite(values: Tensor, what: str, remedy: str) -> None:
     finite = torch.isfinite(values)
     if not bool(finite.all()):
         raise NumericalError(f"{what} of row {int(torch.nonzero(~finite)[0, 0])} are not finite; {remedy}")
+
+
+class Terms(NamedTuple):
+    """Features z_c (N, d_c) of every latent, W (N, D, C), residual y - m (N, D), and the noise.
+
+    `noise` holds variances (N or 1, D) or covariance matrices (N or 1, D, D).
+    """
+
+    features: list[Tensor]
+    W: Tensor
+    residual: Tensor
+    noise: Tensor
+
+    def deflated(self) -> Deflation:
+        """Whitened, and split into what depends on the latents and what does not."""
+        W_white, y_white, _ = whiten(self.W, self.residual, self.noise)
+        return deflate(W_white, y_white)

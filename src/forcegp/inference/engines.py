@@ -23,13 +23,12 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message, usable_arguments
-from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.deflation import Terms
 from forcegp.inference.inducing import InducingPosterior
-from forcegp.inference.iterative import IterativePosterior
+from forcegp.inference.iterative import Iteration, IterativePosterior
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
-from forcegp.inference.terms import Terms
 
 MOST_EXACT_ROWS = 1500
 """Rows up to which the exact engine is taken without a question, and all hyper-parameters are found on all of them."""

@@ -25,12 +25,10 @@ from torch.utils.checkpoint import checkpoint
 from typing_extensions import override
 
 from forcegp.errors import NumericalError
-from forcegp.inference.deflation import whiten
+from forcegp.inference.deflation import Terms, whiten
 from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.pivots import pivoted_cholesky
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.terms import Terms
-from forcegp.inference.weight_space import WeightSpace
+from forcegp.inference.weight_space import WeightSpace, pivoted_cholesky
 
 CHUNK_BYTES = 64 * 2**20
 """Working memory of one block of rows."""

@@ -9,7 +9,7 @@ covariance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -17,15 +17,144 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
-from forcegp.inference.conjugate_gradients import Iteration, Solved, conjugate_gradients
-from forcegp.inference.deflation import Deflation
-from forcegp.inference.kernel_panels import KernelPanels
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.inference.deflation import Deflation, Terms
 from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.pivots import Pivots, pivoted_cholesky
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.terms import Terms
-from forcegp.inference.weight_space import WeightSpace
+from forcegp.inference.weight_space import Pivots, WeightSpace, pivoted_cholesky
+
+Linear = Callable[[Tensor], Tensor]
+"""A symmetric positive definite operator on columns (n, S)."""
+
+Iteration = Callable[[int, float], None]
+"""Called as report(iteration, largest relative residual)."""
+
+REPLACEMENTS = 3
+"""How often the search starts again where the residual it carried along and the true one have drifted apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The solution, the iterations that it took and |right - T solution| / |right|, the largest over all columns."""
+
+    solution: Float[Tensor, "n S"]
+    iterations: int
+    residual: float
+
+
+def conjugate_gradients(
+    apply: Linear,
+    precondition: Linear,
+    right: Float[Tensor, "n S"],
+    *,
+    tolerance: float,
+    iterations: int,
+    start: Float[Tensor, "n S"] | None = None,
+    report: Iteration | None = None,
+) -> Solved:
+    """Solve T x = right to |right - T x| <= tolerance |right| in every column, beginning at `start` or 0.
+
+    What is compared at the end is the true residual, from T itself. Source: Saad (2003), "Iterative methods for sparse
+    linear systems", algorithm 9.1.
+    Raises NumericalError where the tolerance is not reached in so many iterations, with what was.
+    """
+    size = torch.linalg.vector_norm(right, dim=0)
+    size = torch.where(size > 0, size, torch.ones_like(size))
+    x = torch.zeros_like(right) if start is None else start.clone()
+    residual = right - apply(x) if start is not None else right.clone()
+    done, reached = 0, _largest(residual, size)
+    for _ in range(REPLACEMENTS):
+        z = precondition(residual)
+        direction = z
+        rho = (residual * z).sum(0)
+        while done < iterations and _largest(residual, size) > tolerance:
+            done += 1
+            step = apply(direction)
+            length = _ratio(rho, (direction * step).sum(0))
+            x = x + length * direction
+            residual = residual - length * step
+            z = precondition(residual)
+            previous, rho = rho, (residual * z).sum(0)
+            direction = z + _ratio(rho, previous) * direction
+            if report is not None:
+                report(done, _largest(residual, size))
+        residual = right - apply(x)
+        reached = _largest(residual, size)
+        if reached <= tolerance:
+            return Solved(x, done, reached)
+        if done >= iterations:
+            break
+    else:
+        raise NumericalError(
+            f"conjugate gradients stay at a relative residual of {reached:.1e} after {done} iterations, not "
+            f"{tolerance:.0e}: rounding does not let it fall; give a larger tolerance, or raise the noise level."
+        )
+    raise NumericalError(
+        f"conjugate gradients reached a relative residual of {reached:.1e} in {done} iterations, not {tolerance:.0e}; "
+        "allow more iterations, give the preconditioner more points, or raise the noise level."
+    )
+
+
+def _largest(residual: Tensor, size: Tensor) -> float:
+    relative = torch.linalg.vector_norm(residual, dim=0) / size
+    return float(relative.max()) if relative.numel() else 0.0
+
+
+def _ratio(over: Tensor, under: Tensor) -> Tensor:
+    """over / under, 0 for columns that are solved already."""
+    return torch.where(
+        under != 0, over / torch.where(under != 0, under, torch.ones_like(under)), torch.zeros_like(over)
+    )
+
+
+PANEL_BYTES = 8 * 2**20
+"""Largest size of one panel of one latent: it is read twice, and the second time it should still be in the cache."""
+
+
+class KernelPanels:
+    """x -> K_c x_c for all latents c, from the lower triangles of the K_c.
+
+    A panel holds rows start..stop of K_c against columns 0..stop. Those that fit into `memory` bytes are kept from the
+    first product on; the others are made again for every product.
+    """
+
+    def __init__(self, kernels: LatentKernels, features: Sequence[Float[Tensor, "N _"]], memory: int) -> None:
+        self.kernels = kernels.dense
+        self.features = features
+        self.count = len(features[0])
+        self.memory = memory
+        self.kept: dict[tuple[int, int], Tensor] = {}
+        self.bytes_kept = 0
+
+    def __call__(self, x: Float[Tensor, "C N S"]) -> Float[Tensor, "C N S"]:
+        """K_c x_c."""
+        out = torch.zeros_like(x)
+        start = 0
+        while start < self.count:
+            stop = min(self.count, start + max(1, PANEL_BYTES // (8 * self.count)))
+            for c in range(len(self.kernels)):
+                panel = self._panel(c, start, stop)
+                out[c, start:stop] += panel @ x[c, :stop]
+                out[c, :start] += panel[:, :start].mT @ x[c, start:stop]
+            start = stop
+        return out
+
+    def release(self) -> None:
+        """Give the memory of the panels back; the next product makes them anew."""
+        self.kept.clear()
+        self.bytes_kept = 0
+
+    def _panel(self, c: int, start: int, stop: int) -> Float[Tensor, "rows stop"]:
+        found = self.kept.get((c, start))
+        if found is not None:
+            return found
+        z = self.features[c]
+        panel = self.kernels[c].cross(z[start:stop], z[:stop])
+        size = panel.numel() * panel.element_size()
+        if self.bytes_kept + size <= self.memory:
+            self.kept[c, start] = panel
+            self.bytes_kept += size
+        return panel
 
 
 @dataclass(frozen=True, eq=False)

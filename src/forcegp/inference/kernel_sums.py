@@ -25,8 +25,7 @@ from torch import Tensor
 
 from forcegp.codegen.c_writer import c_value
 from forcegp.codegen.derivatives import gradients
-from forcegp.codegen.graph import ONE, Graph, Slopes
-from forcegp.codegen.numerical import evaluated
+from forcegp.codegen.graph import ONE, Graph, Slopes, evaluated
 from forcegp.codegen.tracing import trace
 
 PADDING = 8

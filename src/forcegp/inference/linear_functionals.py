@@ -25,12 +25,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.deflation import whiten
+from forcegp.inference.deflation import Terms, whiten
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.likelihood import scaled_gradients
 from forcegp.inference.memory import require_memory
 from forcegp.inference.posterior import FactorizedPosterior
-from forcegp.inference.terms import Terms
 
 REMEDY = "use fewer points (windows), or fewer nodes in each"
 

@@ -11,13 +11,11 @@ import numpy as np
 import torch
 
 from forcegp.codegen.graph import Graph
-from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.kernel_sums import PADDING, KernelSum
-from forcegp.inference.one_input_functions import drawn_form, markov_functions, one_input_form
+from forcegp.inference.one_input_functions import OneInputFunctions, drawn_form, markov_functions, one_input_form
 from forcegp.inference.pathwise import draw_functions
-from forcegp.inference.piecewise_tables import OneInputFunctions
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 
 FEW_CENTERS = 128
 """Kernels without an exact form in pieces are summed over so few centres as fast as a table is looked up."""

@@ -29,11 +29,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import NumericalError
-from forcegp.inference.deflation import whiten
+from forcegp.inference.deflation import Terms, whiten
 from forcegp.inference.inducing import InducingPosterior
 from forcegp.inference.kernels import LatentKernels
 from forcegp.inference.optimization import OptimizationResult
-from forcegp.inference.terms import Terms
 
 JITTER = 1e-8
 """Added to the kernel matrix of the inducing points and to that of a batch, in the latents' units squared."""

@@ -16,8 +16,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
-from forcegp.mechanics.state import State
-from forcegp.mechanics.stored_objects import object_from_dict
+from forcegp.mechanics.gauss_principle import State
+from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.robots import Robot
 
 PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor

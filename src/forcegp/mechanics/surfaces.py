@@ -10,17 +10,36 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import ContactError, InvalidInput
-from forcegp.mechanics.stored_objects import object_from_dict
+from forcegp.errors import ContactError, FileFormatError, InvalidInput
+
+Kind = TypeVar("Kind")
+
+
+def object_from_dict(what: str, registry: Mapping[str, type[Kind]], stored: object) -> Kind:
+    """The object that `stored` describes, its lists as tuples; `what` names its kind in messages.
+
+    Raises FileFormatError for anything but a mapping, an unknown type or wrong fields.
+    """
+    if not isinstance(stored, Mapping):
+        raise FileFormatError(f"a stored {what} is {stored!r}; expected an object with a type")
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
+    name = values.pop("type", None)
+    if not isinstance(name, str) or name not in registry:
+        raise FileFormatError(f"unknown {what} {name!r}; known: {', '.join(registry)}")
+    try:
+        return registry[name](**values)
+    except TypeError as error:
+        raise FileFormatError(f"{what} {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
+
 
 Vector = tuple[float, float, float]
 
@@ -231,3 +250,24 @@ def _direction(name: str, values: object) -> tuple[Vector, float]:
     if abs(length - 1.0) < 1e-15:
         return entries, 1.0
     return tuple(entry / length for entry in entries), length  # type: ignore[return-value]  # three of them, as the others
+
+
+TURNED_OVER = -0.9
+"""z component of a normal below which the axes are turned from -z instead of z, where turning from z is ill-defined."""
+
+
+def surface_axes(gradients: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Columns t1, t2, n of the rotation that turns the world's z axis the shortest way onto the normal n.
+
+    `gradients` are surface gradients of any positive length. On a table the tangents are x and y; they vary smoothly
+    with the normal wherever it does not point nearly straight down (there they start from -z, and t2 is -y). With
+    axis w = z x n and c = n_z, the rotation is I + [w] + [w]^2 / (1 + c) (Rodrigues' formula).
+    """
+    n = gradients / torch.linalg.vector_norm(gradients, dim=-1, keepdim=True)
+    down = n[..., 2] < TURNED_OVER
+    flip = torch.where(down, -1.0, 1.0)
+    x, y, z = n[..., 0], n[..., 1], n[..., 2] * flip  # turned over: mirrored at z = 0, then t2 is mirrored back
+    shrink = 1.0 / (1.0 + z)
+    t1 = torch.stack([1.0 - x * x * shrink, -x * y * shrink, -x * flip], dim=-1)
+    t2 = torch.stack([-x * y * shrink, 1.0 - y * y * shrink, -y * flip], dim=-1) * flip[..., None]
+    return torch.stack([t1, t2, n], dim=-1)

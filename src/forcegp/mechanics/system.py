@@ -13,8 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
-from forcegp.mechanics.contacts import Baumgarte, Contact
-from forcegp.mechanics.gauss_principle import ConstrainedDynamics
+from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
 from forcegp.mechanics.known_forces import (
     KNOWN_FORCES,
     Actuation,
@@ -23,7 +22,6 @@ from forcegp.mechanics.known_forces import (
     known_force_from_dict,
     known_force_to_dict,
 )
-from forcegp.mechanics.state import State
 from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues

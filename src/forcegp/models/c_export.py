@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from forcegp.atomic_files import atomic_folder, require_writable
-from forcegp.codegen.native_code import Purpose, compile_library
+from forcegp.codegen.library import Purpose, compile_library
 from forcegp.codegen.tracing import trace
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.inference.one_input_calls import latent_calls

@@ -24,11 +24,19 @@ from safetensors.torch import save
 from torch import Tensor
 
 from forcegp.atomic_files import atomic_file
-from forcegp.codegen.library import VectorUnit, code_digest, default_folder, opened_library, own_file, own_folder
-from forcegp.codegen.row_function import RowFunction, aligned
+from forcegp.codegen.library import (
+    RowFunction,
+    VectorUnit,
+    aligned,
+    code_digest,
+    default_folder,
+    opened_library,
+    own_file,
+    own_folder,
+)
 from forcegp.errors import CompilerError, ForceGPError
-from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.models.fused_rollouts import STEPS, FusedLoop
 from forcegp.models.predictor_code import PURPOSE, PredictorCode
 

@@ -1,7 +1,7 @@
 """`Predictor`: a posterior prepared for control rates, where a prediction is due every millisecond.
 
 Rigid-body terms, constraints, prior, features and processes become one C program (`predictor_code`), and the covariance
-uses few combinations of the data (`inference.compressed_covariance`). `structured.predictor_preparation` makes one.
+uses few combinations of the data (`inference.prepared_kernels`). `structured.predictor_preparation` makes one.
 """
 
 from __future__ import annotations
@@ -17,23 +17,19 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.codegen.native_code import require_plain
-from forcegp.codegen.row_function import NOT_FINITE, RowFunction, are_plain
+from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
-from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.discrete_steps import StepLinearization, linearized_step, stepped
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
 from forcegp.models.kept_code import KeptCode
 from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_code import TermsFunction
-from forcegp.models.rollout import by_sample, checked_start
-from forcegp.models.structured.components import Components
-from forcegp.models.structured.inverse_dynamics import inverse_dynamics
-from forcegp.robots.real_numbers import real_tensor, require_finite, whole_number
+from forcegp.models.rollout import StepLinearization, by_sample, checked_start, linearized_step, stepped
+from forcegp.models.structured.components import Components, inverse_dynamics
+from forcegp.robots.arguments import real_tensor, require_finite, whole_number
 from forcegp.summary import Summary
 
 INSTEAD_OF_TRANSFORMS = (

@@ -18,15 +18,13 @@ from torch import Tensor
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Graph
-from forcegp.codegen.library import VectorUnit, default_folder, load_library
-from forcegp.codegen.native_code import Purpose
-from forcegp.codegen.row_function import aligned
+from forcegp.codegen.library import Purpose, VectorUnit, aligned, default_folder, load_library
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
-from forcegp.inference.compressed_covariance import CompressedCovariance
 from forcegp.inference.kernel_sums import PADDING
 from forcegp.inference.one_input_calls import LatentCall, drawn_calls
 from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]

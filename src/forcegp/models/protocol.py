@@ -26,7 +26,7 @@ from forcegp.models.search import FitProgress
 from forcegp.models.structured.components import Components, Curve
 from forcegp.models.training_data import TrainingData
 from forcegp.robots import Robot
-from forcegp.robots.real_numbers import real_tensor, require_finite
+from forcegp.robots.arguments import real_tensor, require_finite
 from forcegp.summary import Summary, rounded
 
 ROWS_PER_BLOCK = 4096
@@ -43,7 +43,7 @@ class Posterior(Summary, ABC):
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
     (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
     training data); `result` is the history of the search and why it ended. A subclass is a frozen dataclass with these
-    four and the abstract members; an entry in `forcegp.models.stored_models.KINDS` lets it be stored.
+    four and the abstract members; an entry in `forcegp.models.storage.KINDS` lets it be stored.
     """
 
     model: Any  # the Model, of which every subclass names its own

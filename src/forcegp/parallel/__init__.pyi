@@ -1,4 +1,5 @@
-from .backend import MOST_DEATHS as MOST_DEATHS, Backend as Backend, Pool as Pool, Serial as Serial, Shared as Shared
+from .backend import (
+    MOST_DEATHS as MOST_DEATHS, Backend as Backend, Joblib as Joblib, Pool as Pool, Serial as Serial, Shared as Shared,
+)
 from .choice import backend_for as backend_for, backend_of as backend_of
 from .cluster import Ray as Ray
-from .processes import Joblib as Joblib

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 
 from forcegp.errors import InvalidInput
-from forcegp.parallel.backend import Backend, Serial, check_jobs
+from forcegp.parallel.backend import Backend, Joblib, Serial, check_jobs
 from forcegp.parallel.cluster import Ray
-from forcegp.parallel.processes import Joblib
 
 BACKENDS: dict[str, type[Backend]] = {kind.name: kind for kind in (Serial, Joblib, Ray)}
 

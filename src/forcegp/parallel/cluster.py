@@ -20,8 +20,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.errors import BackendError, InvalidInput, MissingExtra
-from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, Shared, Workers, check_jobs
-from forcegp.parallel.processes import replayed
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, Shared, Workers, check_jobs, replayed
 
 ANSWER_SECONDS = 10
 """So long a machine is given to answer."""
@@ -276,7 +275,7 @@ def _portable_work() -> Callable[..., Any]:
         other = [f"{name} {found[name]}, not {expected[name]}" for name in expected if found[name] != expected[name]]
         if other:
             return f"machine {platform.node()} of the Ray cluster has {'; '.join(other)}: install the same", None, None
-        from forcegp.parallel.processes import recorded, use_one_thread
+        from forcegp.parallel.backend import recorded, use_one_thread
 
         use_one_thread()
         arguments = pickle.loads(own)

@@ -10,7 +10,7 @@ from typing import Any
 
 from forcegp.errors import FileFormatError, InvalidInput, unknown_name_message, usable_arguments
 from forcegp.mechanics import MechanicalSystem
-from forcegp.mechanics.stored_objects import object_from_dict
+from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.priors.contact_friction import ContactFriction
 from forcegp.priors.force_prior import ForcePrior, SumPrior
 from forcegp.priors.joint_forces import JointAccelerations, JointForces, JointFriction, NoForces, PeriodicJointForces

@@ -1,8 +1,8 @@
-from .devices import usable_device as usable_device
+from .arguments import usable_device as usable_device
 from .inertia import (
     parameters_from_physical as parameters_from_physical, physical_from_parameters as physical_from_parameters,
     pseudo_inertia_from_parameters as pseudo_inertia_from_parameters,
 )
 from .kinematics import Kinematics as Kinematics
-from .parts import Joint as Joint, Link as Link, LinkInertia as LinkInertia
+from .structure import Joint as Joint, Link as Link, LinkInertia as LinkInertia
 from .robot import Robot as Robot

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.robots.tree import Tree
+from forcegp.robots.layout import Tree
 
 Bodies = Float[Tensor, "n 4 4 batch"]
 """A 4x4 matrix of every body: its pose or its pseudo-inertia."""

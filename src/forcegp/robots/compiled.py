@@ -10,14 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.codegen.library import default_folder
-from forcegp.codegen.native_code import require_plain
-from forcegp.codegen.row_function import NOT_POSITIVE, RowFunction, are_plain
+from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
 from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, check_mapping
-from forcegp.robots.compiled_programs import compiled_program
-from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request
+from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request, compiled_program
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
 

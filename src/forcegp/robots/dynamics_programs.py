@@ -13,19 +13,28 @@ algorithms", RSS 2018). The factor and the accelerations are "kept" by the progr
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.codegen.c_writer import Program
+from forcegp.codegen.c_writer import Program, write_program
 from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import Expression, Graph, node_of
+from forcegp.codegen.library import Purpose, RowFunction, VectorUnit, load_library
 from forcegp.codegen.tracing import trace
-from forcegp.robots.tree import merged_inertias
-from forcegp.robots.unrolled import Scalars, UnrolledRobot, scalars
-from forcegp.robots.unrolled_kinematics import UnrolledKinematics, factorize, solve_factorized, symmetric
+from forcegp.robots.layout import merged_inertias
+from forcegp.robots.unrolled import (
+    Scalars,
+    UnrolledKinematics,
+    UnrolledRobot,
+    factorize,
+    scalars,
+    solve_factorized,
+    symmetric,
+)
 
 # Arguments of each function, and the shapes of its results in joints.
 ARGUMENTS = {
@@ -202,3 +211,30 @@ def _symmetric(entries: list[Expression]) -> Scalars:
     P = scalars([[0.0] * 4 for _ in range(4)])
     P[COLUMNS, ROWS] = entries
     return symmetric(P)
+
+
+PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the robot itself")
+
+
+def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) -> RowFunction:
+    """The program of a request: from ``folder`` if it is there, else compiled into it.
+
+    Raises :class:`~forcegp.errors.CompilerError` as `load_library`.
+    """
+
+    def write(unit: VectorUnit) -> str:
+        return write_program(trace_dynamics(unrolled, request), unit.lanes)
+
+    constants: list[object] = [(joint.parent, joint.revolute) for joint in unrolled.joints]
+    constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
+    constants += [unrolled.gravity.tolist(), unrolled.armature.tolist()]
+    if request.links:
+        tree = unrolled.robot.tree
+        constants = [unrolled.robot.layout.moving]
+        constants += [x.tolist() for x in (tree.link_inertias, tree.link_offsets, tree.carried)]
+    elif not request.free_inertias:
+        constants += [body.tolist() for body in unrolled.inertias]
+    key = f"{constants!r}\0{request!r}"
+    library, _ = load_library(f"{unrolled.robot.name[:40]}-{request.function}", key, write, folder, PURPOSE)
+    sizes = request.sizes(unrolled)
+    return RowFunction(library, [sizes[name] for name in request.inputs], [sizes[name] for name in request.outputs])

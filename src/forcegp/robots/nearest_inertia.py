@@ -19,7 +19,7 @@ from forcegp.errors import DataWarning, InvalidInput
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
 from forcegp.robots.urdf import RobotDescription, parse_urdf
-from forcegp.robots.urdf_writer import replace_inertial
+from forcegp.robots.urdf_file import replace_inertial
 
 InertiaChoice = Literal["strict", "nearest"]
 """What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""

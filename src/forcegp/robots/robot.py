@@ -23,13 +23,11 @@ from forcegp.robots.arguments import (
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import check_inertias, lay_out
+from forcegp.robots.layout import check_inertias, compile_tree, lay_out
 from forcegp.robots.nearest_inertia import InertiaChoice, with_chosen_inertias
 from forcegp.robots.structure import RobotStructure
-from forcegp.robots.tree import compile_tree
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import read_text, write_text
-from forcegp.robots.urdf_writer import replace_inertial
+from forcegp.robots.urdf_file import read_text, replace_inertial, write_text
 
 GRAVITY = (0.0, 0.0, -9.81)
 

@@ -26,7 +26,7 @@ from forcegp.errors import (
     UnsafeXml,
     UnsupportedJoint,
 )
-from forcegp.robots.spatial import rotation_from_rpy, transform
+from forcegp.robots.inertia import rotation_from_rpy, transform
 
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 MOVABLE = ("revolute", "continuous", "prismatic")

@@ -1,11 +1,16 @@
-"""URDF files: bytes on disk <-> text, in the encoding that the XML declares."""
+"""URDF files: read and written in the encoding that they declare; inertials and friction replaced in the text."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
 
 from forcegp.atomic_files import write_bytes
-from forcegp.errors import UnreadableRobotFile
+from forcegp.errors import UnknownJoint, UnknownLink, UnreadableRobotFile
 
 
 def read_text(path: str | Path) -> str:
@@ -49,3 +54,112 @@ def declared_encoding(data: bytes) -> str:
 def write_text(text: str, path: Path) -> None:
     """Write URDF text in the encoding that it declares. Raises as `atomic_file`."""
     write_bytes(path, text.encode(declared_encoding(text[:200].encode("utf-8"))))
+
+
+def replace_inertial(
+    text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
+) -> str:
+    """URDF text with the ``<inertial>`` element of ``link`` replaced or added, with digits that read back exactly.
+
+    ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, axes of the link frame.
+    """
+    data = text.encode("utf-8")
+    newline = b"\r\n" if b"\r\n" in data else b"\n"
+    spans = _find(data, "link", link, "inertial")
+    if spans is None:
+        raise UnknownLink(f"{source}: no link {link!r} in the URDF text.")
+    (start, head_end), inertial = spans
+    if inertial is not None:
+        first, last = inertial
+        element = _inertial(mass, center_of_mass, inertia, newline + _indent_of(data, first))
+        return (data[:first] + element + data[last:]).decode("utf-8")
+    indent = _indent_of(data, start)
+    element = newline + indent + b"  " + _inertial(mass, center_of_mass, inertia, newline + indent + b"  ")
+    if data[head_end - 2 : head_end] == b"/>":  # <link name="tool"/> has no inside yet
+        opened = data[: head_end - 2].rstrip() + b">"
+        return (opened + element + newline + indent + b"</link>" + data[head_end:]).decode("utf-8")
+    return (data[:head_end] + element + data[head_end:]).decode("utf-8")
+
+
+def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
+    """URDF text with attributes of the ``<dynamics>`` element of ``joint`` replaced or added ('damping', 'friction').
+
+    Attributes that are not named stay, with digits that read back exactly.
+    """
+    data = text.encode("utf-8")
+    spans = _find(data, "joint", joint, "dynamics")
+    if spans is None:
+        raise UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
+    (start, head_end), dynamics = spans
+    if dynamics is None:
+        indent = _indent_of(data, start)
+        newline = b"\r\n" if b"\r\n" in data else b"\n"
+        attributes = " ".join(f'{name}="{value!r}"' for name, value in values.items())
+        element = newline + indent + b"  " + f"<dynamics {attributes}/>".encode()
+        return (data[:head_end] + element + data[head_end:]).decode("utf-8")
+    first, last = dynamics
+    element = data[first:last].decode("utf-8")
+    for name, value in values.items():
+        written = f' {name}="{value!r}"'
+        element, found = re.subn(rf"\s{name}\s*=\s*(\"[^\"]*\"|'[^']*')", written, element, count=1)
+        element = element if found else element.replace("<dynamics", f"<dynamics{written}", 1)
+    return (data[:first] + element.encode() + data[last:]).decode("utf-8")
+
+
+def _find(data: bytes, kind: str, name: str, part: str) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
+    """Byte offsets (first, one past last) of an element's start tag, and of the element ``part`` directly in it."""
+    parser = expat.ParserCreate("utf-8")
+    depth = 0
+    inside = False
+    found: list[int] = []
+    child: list[int] = []
+
+    def after_tag(position: int) -> int:
+        quote = b""
+        while True:
+            byte = data[position : position + 1]
+            if quote:
+                quote = b"" if byte == quote else quote
+            elif byte in (b'"', b"'"):
+                quote = byte
+            elif byte == b">":
+                return position + 1
+            position += 1
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, inside
+        position = parser.CurrentByteIndex
+        depth += 1
+        if depth == 2 and tag == kind and attributes.get("name") == name:
+            inside = True
+            found.extend((position, after_tag(position)))
+        elif inside and depth == 3 and tag == part:
+            child.append(position)
+
+    def end(tag: str) -> None:
+        nonlocal depth, inside
+        if inside and depth == 3 and tag == part:
+            child.append(after_tag(parser.CurrentByteIndex))
+        inside = inside and depth > 2
+        depth -= 1
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(data, True)
+    if not found:
+        return None
+    return (found[0], found[1]), ((child[0], child[1]) if child else None)
+
+
+def _indent_of(data: bytes, position: int) -> bytes:
+    line = data[data.rfind(b"\n", 0, position) + 1 : position]
+    return line if not line.strip() else b""
+
+
+def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, line_start: bytes) -> bytes:
+    xyz = " ".join(repr(float(value)) for value in center_of_mass)
+    entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    moments = " ".join(f'{key}="{float(inertia[index])!r}"' for key, index in entries.items())
+    inner = [f'<origin xyz="{xyz}" rpy="0 0 0"/>', f'<mass value="{float(mass)!r}"/>', f"<inertia {moments}/>"]
+    lines = [b"<inertial>", *(b"  " + element.encode() for element in inner), b"</inertial>"]
+    return line_start.join(lines)

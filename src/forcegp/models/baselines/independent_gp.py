@@ -21,17 +21,22 @@ from forcegp.models.baselines.independent_posterior import (
     joint_part,
     one_joint,
 )
-from forcegp.models.fit_arguments import (
-    check_search_numbers,
-    check_system_and_noise,
-    described_rows,
-    first_start,
-    resolved_noise,
-    training_rows,
-)
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.protocol import Model
-from forcegp.models.search import FitProgress, best_value, blas_threads, default_restarts, perturbed, run_restarts
+from forcegp.models.search import (
+    FitProgress,
+    best_value,
+    blas_threads,
+    check_search_numbers,
+    check_system_and_noise,
+    default_restarts,
+    described_rows,
+    first_start,
+    perturbed,
+    resolved_noise,
+    run_restarts,
+    training_rows,
+)
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import JointForces

@@ -17,16 +17,16 @@ from typing_extensions import override
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import Engine, OptimizationResult
-from forcegp.models.fit_arguments import (
+from forcegp.models.noise import ACCELERATION, Noise
+from forcegp.models.prediction import Prediction, Rows
+from forcegp.models.protocol import Model, Posterior
+from forcegp.models.search import (
     check_search_numbers,
     check_system_and_noise,
     described_rows,
     resolved_noise,
     training_rows,
 )
-from forcegp.models.noise import ACCELERATION, Noise
-from forcegp.models.prediction import Prediction, Rows
-from forcegp.models.protocol import Model, Posterior
 from forcegp.models.training_data import Standardization, TrainingData
 
 

@@ -24,18 +24,18 @@ from forcegp.inference import (
     ProblemSize,
     choose_engine,
 )
-from forcegp.inference.conjugate_gradients import Iteration
 from forcegp.inference.engines import MOST_EXACT_ROWS, MOST_ITERATIVE_ROWS
+from forcegp.inference.iterative import Iteration
 from forcegp.inference.linear_functionals import require_memory_for_functionals
 from forcegp.inference.memory import require_memory
 from forcegp.models.noise import ACCELERATION
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.models.structured.prior_checks import check_distance
 from forcegp.models.structured.refinement import refined
-from forcegp.models.structured.surface_distance import check_distance
 from forcegp.models.training_data import TrainingData
-from forcegp.robots.real_numbers import whole_number
+from forcegp.robots.arguments import whole_number
 
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""

@@ -14,26 +14,26 @@ from typing_extensions import override
 from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
-from forcegp.models.fit_arguments import (
+from forcegp.models.identification.identification import Identification
+from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
+from forcegp.models.search import (
+    ALL_ROWS,
+    MOST_POINTS_FOR_RESTARTS,
+    FitProgress,
     described_rows,
     noise_of_windows,
     resolved_noise,
     training_rows,
     training_windows,
+    with_steps_before,
 )
-from forcegp.models.identification.identification import Identification
-from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
-from forcegp.models.search import ALL_ROWS, MOST_POINTS_FOR_RESTARTS, FitProgress, with_steps_before
-from forcegp.models.structured.definition import StructuredModel
 from forcegp.models.structured.engine_selection import learning_rows, on_all_rows, require_memory_to_learn
-from forcegp.models.structured.load_refinement import fit_with_refined_loads
-from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
-from forcegp.models.structured.objective import LOG_VARIANCE_SPREAD, FitObjective, with_variance_priors
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.physical_start import PhysicalStart
 from forcegp.models.structured.posterior import StructuredPosterior
-from forcegp.models.structured.prior_checks import check_prior
-from forcegp.models.structured.search import Search
-from forcegp.models.structured.surface_distance import check_distance, warn_of_contacts
+from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts
+from forcegp.models.structured.refinement import fit_with_refined_loads
+from forcegp.models.structured.search import LOG_VARIANCE_SPREAD, FitObjective, Search, with_variance_priors
 from forcegp.models.structured.widening import widened
 from forcegp.models.training_data import TrainingData
 from forcegp.parallel import Backend, backend_for

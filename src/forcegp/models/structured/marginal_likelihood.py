@@ -1,35 +1,100 @@
-"""Where physics and Gaussian processes meet: from states and a prior to (m, W), features, start values and NLL."""
+"""Where physics and Gaussian processes meet: from states and a checked prior to (m, W), features, NLL; the model."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
+from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.inference import (
     Engine,
     Exact,
     FunctionalPosterior,
     LatentKernels,
     LatentPosterior,
+    ProblemSize,
     Terms,
     collapsed_bound,
     negative_log_likelihood,
 )
-from forcegp.inference.conjugate_gradients import Iteration
+from forcegp.inference.iterative import Iteration
 from forcegp.inference.linear_functionals import functional_negative_log_likelihood, weighted
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.identification.physical_parameters import COEFFICIENTS, INERTIALS, coefficients_of, inertials_of
 from forcegp.models.noise import ACCELERATION, FORCE, Noise
-from forcegp.models.structured.prior_values import checked_kernels
+from forcegp.models.protocol import Model
+from forcegp.models.search import check_system_and_noise
 from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
-from forcegp.priors import ForcePrior
+from forcegp.priors import ForcePrior, JointForces
+from forcegp.priors.force_prior import Scaling
+
+
+def checked_values(prior: ForcePrior, dynamics: ConstrainedDynamics) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Mixing (N, nv, C) and features (N, d) of every latent at N states. Raises InvalidInput for anything else."""
+    robot, own = dynamics.state.robot, type(prior).__name__
+    names = prior.latent_names(robot)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise InvalidInput(f"{own}.latent_names gives {names!r}; it must give a tuple with a name per latent")
+    rows, count = len(dynamics.state.q), len(names)
+    B = _tensor(f"{own}.mixing", prior.mixing(dynamics), (rows, robot.nv, count), "(rows, nv, latents)")
+    features = _one_per_latent(f"{own}.features", prior.features(dynamics), names)
+    for name, z in zip(names, features, strict=True):
+        _tensor(f"{own}.features of {name!r}", z, (rows, None), "(rows, features); one feature is z[..., None]")
+    ways = get_args(Scaling)
+    for name, given, z in zip(
+        names, _one_per_latent(f"{own}.scalings", prior.scalings(robot), names), features, strict=True
+    ):
+        each = (given,) * z.shape[-1] if isinstance(given, str) else tuple(given)
+        if len(each) != z.shape[-1] or not set(each) <= set(ways):
+            allowed = ", ".join(map(repr, ways))
+            raise InvalidInput(f"{own}.scalings of {name!r} is {given!r}; give one of {allowed}, or one per feature")
+    return B, features
+
+
+def checked_kernels(prior: ForcePrior, kernels: Any, latents: int) -> tuple[Kernel, ...]:
+    """One GPyTorch kernel per latent. Raises InvalidInput for anything else; that they are float64 is checked later."""
+    if not isinstance(kernels, list | tuple) or not all(isinstance(kernel, Kernel) for kernel in kernels):
+        raise InvalidInput(f"{type(prior).__name__}.kernels must give a tuple of GPyTorch kernels, one per latent")
+    if len(kernels) != latents:
+        raise InvalidInput(f"{type(prior).__name__}.kernels gives {len(kernels)} kernels for {latents} latents")
+    return tuple(kernels)
+
+
+def _one_per_latent(what: str, given: Any, names: Any) -> tuple[Any, ...]:
+    if not isinstance(given, list | tuple):
+        raise InvalidInput(f"{what} gives a {type(given).__name__}; it must give a tuple with an entry per latent")
+    if len(given) != len(names):
+        raise InvalidInput(f"{what} gives {len(given)} entries for {len(names)} latents ({', '.join(names)})")
+    return tuple(given)
+
+
+def _differ(wanted: int | None, size: int) -> bool:
+    return wanted not in (None, size)
+
+
+def _tensor(what: str, given: Any, shape: tuple[int | None, ...], wanted: str) -> Tensor:
+    if not isinstance(given, Tensor):
+        raise InvalidInput(f"{what} is a {type(given).__name__}; it must be a float64 tensor {wanted}")
+    if len(given.shape) != len(shape) or any(map(_differ, shape, given.shape)):
+        sizes = ", ".join("any" if size is None else str(size) for size in shape)
+        raise InvalidInput(f"{what} has shape {tuple(given.shape)}; it must be ({sizes}), that is {wanted}")
+    if given.dtype != torch.float64:
+        raise InvalidInput(f"{what} is {given.dtype}; it must be float64: compute it from the state, or call .double()")
+    if given.requires_grad:
+        raise InvalidInput(f"{what} requires gradients, but only kernels are learned: detach the tensors that it holds")
+    lost = ~torch.isfinite(given).flatten(1).all(1)
+    if bool(lost.any()):
+        raise InvalidInput(f"{what} is not finite at training row {int(lost.nonzero()[0])}; mend it there")
+    return given
+
 
 Mean = Literal["analytical", "zero"]
 
@@ -184,3 +249,49 @@ class MarginalLikelihood:
             if self.training.weights is not None:
                 return FunctionalPosterior.condition(kernels, self.training.weights, terms)
             return (engine or Exact()).condition(kernels, terms, start=start, report=report)
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredModel(Model):
+    """The fields of a `StructuredGP`, checked, and the likelihood that they define."""
+
+    system: MechanicalSystem
+    prior: ForcePrior = field(default_factory=JointForces)
+    mean: Mean = "analytical"
+    noise: Noise | None = None
+
+    @usable_arguments("StructuredModel")
+    def __post_init__(self) -> None:
+        check_system_and_noise(self)
+        if not isinstance(self.prior, ForcePrior):
+            raise InvalidInput(f"prior is a {type(self.prior).__name__}; give a ForcePrior, for example JointForces()")
+        if self.mean not in get_args(Mean):
+            raise InvalidInput(f"mean is {self.mean!r}; allowed: {', '.join(map(repr, get_args(Mean)))}")
+        self.prior.check(self.system)
+
+    def likelihood(self, training: TrainingData) -> MarginalLikelihood:
+        """That of these rows or windows."""
+        return MarginalLikelihood(self.system, self.prior, self.mean, training)
+
+    def problem_size(self, rows: int) -> ProblemSize:
+        """Of the posterior of so many rows, without computing anything; contacts count as independent."""
+        nv, latents = self.system.robot.nv, len(self.prior.latent_names(self.system.robot))
+        return ProblemSize(rows, nv, min(latents, nv - len(self.system.contacts)), latents, 0)
+
+    @property
+    def known_noise(self) -> Noise:
+        """The noise of a model that a fit has resolved."""
+        assert self.noise is not None, "a fitted model has its noise"
+        return self.noise
+
+    @property
+    def split_noise(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Noise parameters that are learned, and those that stay."""
+        parameters = self.known_noise.parameters(self.system.robot.nv, self.system.robot.device)
+        return (parameters, {}) if self.known_noise.learn else ({}, parameters)
+
+    @override
+    def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
+        noise = (self.noise or Noise()).parameters(self.system.robot.nv)
+        named = self.likelihood(training).kernels().initial_parameters() | noise
+        return {name: tuple(value.shape) for name, value in named.items()}

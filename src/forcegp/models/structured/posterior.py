@@ -33,7 +33,7 @@ from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Mechani
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
-from forcegp.models.noise import ACCELERATION, FORCE, Noise
+from forcegp.models.noise import ACCELERATION, FORCE, Noise, plus, second_moments, shrunk, without_force_noise
 from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -41,14 +41,12 @@ from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.components import Components, Curve, Latents, components_of, term_slices
-from forcegp.models.structured.definition import StructuredModel
-from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
-from forcegp.models.structured.measured_torque import plus, second_moments, shrunk, without_force_noise
+from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import TrainingData
 from forcegp.priors import JointAccelerations, JointForces, NoForces
-from forcegp.robots.real_numbers import real_tensor
+from forcegp.robots.arguments import real_tensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -15,10 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.inference.compressed_covariance import CompressedCovariance, Sample, compress
 from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
-from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels, Sample, compress
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor

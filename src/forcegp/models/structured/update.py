@@ -19,9 +19,9 @@ from forcegp.inference.memory import require_memory
 from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
-from forcegp.models.structured.surface_distance import check_distance
+from forcegp.models.structured.prior_checks import check_distance
 from forcegp.models.training_data import TrainingData
-from forcegp.robots.real_numbers import whole_number
+from forcegp.robots.arguments import whole_number
 
 Keep = Callable[[ExactPosterior, int], Tensor]
 """(posterior, budget) -> numbers of the rows to keep, ascending."""

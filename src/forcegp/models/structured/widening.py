@@ -32,8 +32,8 @@ from torch import Tensor
 from forcegp.errors import NumericalError
 from forcegp.inference import LatentPosterior
 from forcegp.models.search import MOST_POINTS_FOR_RESTARTS, blas_threads
-from forcegp.models.structured.objective import FitObjective
 from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.models.structured.search import FitObjective
 
 CONTENT, CONFIDENCE = 0.9, 0.995
 """Share of the states that lie inside their 95 % intervals, in this share of the functions that the data leave open."""

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from forcegp.codegen import native_code
-from forcegp.codegen.native_code import COMMANDS, PACKAGES, Purpose, compile_library, require_plain
+from forcegp.codegen.library import COMMANDS, PACKAGES, Purpose, compile_library, require_plain
 from forcegp.errors import CompilerError, InvalidInput
 
 SOURCE = "double twice(double x) { return x + x; }"
@@ -75,7 +74,7 @@ def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
     slow.write_text("#!/bin/sh\nexec sleep 60\n")
     slow.chmod(0o700)
     monkeypatch.setenv("CC", str(slow))
-    monkeypatch.setattr(native_code, "LONGEST", 0.2)
+    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.2)
     with pytest.raises(CompilerError, match=r"compiler failed: .*slow: it did not end within 0\.2 s; name another"):
         compile_library(SOURCE, (), tmp_path / "x.so", "twice", PURPOSE)
 
