@@ -58,7 +58,7 @@ from forcegp.evaluation.plots.style import (
     quiet,
     window,
 )
-from forcegp.priors.expected_friction import ExpectedFriction
+from forcegp.priors.contact_friction import ExpectedFriction
 
 BAND = 1.959963984540054
 

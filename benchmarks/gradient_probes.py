@@ -21,8 +21,8 @@ from torch import Tensor
 
 from benchmarks.solver_problem import Task
 from forcegp.inference import LatentKernels
-from forcegp.inference.deflation import deflate, whiten
 from forcegp.inference.iterative import LowRankPlusDiagonal, conjugate_gradients
+from forcegp.inference.likelihood import deflate, whiten
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 
 ROWS, PROBES, SEEDS, TOLERANCE = 1000, (8, 32), (0, 1, 2), 1e-2

@@ -27,7 +27,7 @@ from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_
 from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
 from forcegp.inference import ENGINES, Inducing, Stochastic
-from forcegp.models.structured.engine_selection import on_all_rows
+from forcegp.models.structured.refinement import on_all_rows
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
 SEED, SECONDS = 903, 420.0

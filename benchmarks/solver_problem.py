@@ -18,7 +18,7 @@ from benchmarks.large_data import COULOMB, RECORDINGS, TEST_SECONDS, TEST_STEP, 
 from forcegp import JointForces, StructuredGP, load_posterior, save_posterior
 from forcegp.data import Dataset, farthest_rows
 from forcegp.inference import LatentKernels, Terms
-from forcegp.inference.deflation import Deflation, deflate, whiten
+from forcegp.inference.likelihood import Deflation, deflate, whiten
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.training_data import TrainingData

@@ -23,7 +23,7 @@ from forcegp.models import (
     load_posterior,
     save_posterior,
 )
-from forcegp.models.noise import Noise
+from forcegp.models.training_data import Noise
 from forcegp.priors.named import named_prior
 from forcegp.robots.arguments import usable_device
 

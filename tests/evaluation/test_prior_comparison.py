@@ -75,9 +75,9 @@ def test_the_same_arguments_give_the_same(comparison, train):
 
 
 def test_many_rows_are_conditioned_on_exactly_with_parameters_from_some(train, monkeypatch):
-    for module in ("inference.engines", "models.structured.engine_selection"):
+    for module in ("inference.engines", "models.structured.refinement"):
         monkeypatch.setattr(f"forcegp.{module}.MOST_EXACT_ROWS", 20)
-    monkeypatch.setattr("forcegp.models.structured.engine_selection.LEARNING_ROWS", 15)
+    monkeypatch.setattr("forcegp.models.structured.refinement.LEARNING_ROWS", 15)
     assert StructuredGP(train.system, JointFriction()).fit(train, points=30, **QUICK).engine.name == "inducing"
     found = compare_priors(train, PRIORS, points=30, **QUICK)
     for posterior in found.posteriors.values():

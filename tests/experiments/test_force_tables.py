@@ -5,7 +5,7 @@ import io
 import pytest
 from tests.experiments.stored_jobs import keep
 
-from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.evaluation.metrics import median_and_range
 from forcegp.experiments.experiment import DataSettings
 from forcegp.experiments.fits import FitSettings
 from forcegp.experiments.force_experiment import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
+from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments.force_experiment import SCENARIOS, ForceExperiment, Trial
 from forcegp.experiments.reproduction import PRESETS, TRIAL_PRESETS, as_csv, experiments_of, page_of, report
 from forcegp.jobs import Job

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from tests.inference.dense import dense_covariance
 from tests.inference.problems import constrained_inverse_mass, normal, problem
 
-from forcegp.inference.deflation import Deflation, deflate, whiten
-from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
+from forcegp.inference.likelihood import DeflatedSystem, Deflation, deflate, solve_deflated, whiten
 
 seeds = st.integers(0, 10_000)
 shapes = st.tuples(st.integers(1, 6), st.integers(1, 5), st.integers(1, 6))

@@ -6,10 +6,9 @@ from tests.inference.problems import Problem, normal, problem
 
 from forcegp.errors import NumericalError
 from forcegp.inference import ExactPosterior, negative_log_likelihood
-from forcegp.inference.deflation import Terms, deflate, whiten
-from forcegp.inference.inducing import InducingPosterior, collapsed_bound, inducing_pivots
+from forcegp.inference.inducing import InducingPosterior, collapsed_bound, inducing_pivots, pivoted_cholesky
 from forcegp.inference.iterative import IterativePosterior, LowRankPlusDiagonal
-from forcegp.inference.weight_space import pivoted_cholesky
+from forcegp.inference.likelihood import Terms, deflate, whiten
 
 SHAPES = {
     "no constraint": {"constraints": 0},

@@ -5,8 +5,8 @@ import torch
 from tests.inference.problems import problem
 
 from forcegp.errors import NumericalError
-from forcegp.inference.deflation import Terms
 from forcegp.inference.inducing import InducingPosterior, collapsed_bound
+from forcegp.inference.likelihood import Terms
 from forcegp.inference.stochastic import _AllLatents, _batch, stochastic_search
 
 

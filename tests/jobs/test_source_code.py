@@ -124,7 +124,7 @@ def test_modules_without_source_count_by_name(toolbox):
 
 def test_the_task_of_a_figure_rests_on_models_and_not_on_other_figures_or_commands():
     found = imported_files("forcegp.experiments.fits")
-    for module in ("models.structured.gp", "inference.likelihood", "robots.algorithms", "mechanics.gauss_principle"):
+    for module in ("models.structured.gp", "inference.likelihood", "robots.kinematics", "mechanics.gauss_principle"):
         assert f"forcegp.{module}" in found, module
     assert "forcegp.simulation.kuka_surface" in imported_files("forcegp.experiments.data")
     assert not [name for name in found if name.startswith(("forcegp.cli", "forcegp.validation", "forcegp.checks"))]

@@ -63,9 +63,9 @@ def test_physical_parameters_are_learned_from_all_rows(data, monkeypatch):
     few = data.rows(slice(0, 24))
     learn = few.system.robot.link("hand").inertial("mass")
     exact = fit(few, learn=learn)
-    for module in ("inference.engines", "models.structured.engine_selection"):
+    for module in ("inference.engines", "models.structured.refinement"):
         monkeypatch.setattr(f"forcegp.{module}.MOST_EXACT_ROWS", 20)
-    monkeypatch.setattr("forcegp.models.structured.engine_selection.LEARNING_ROWS", 12)
+    monkeypatch.setattr("forcegp.models.structured.refinement.LEARNING_ROWS", 12)
     assert fit(few).settings["learning_points"] == 12
     every = fit(few, learn=learn)
     assert every.settings["learning_points"] == 24

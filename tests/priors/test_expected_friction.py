@@ -14,8 +14,7 @@ from tests.robots.robot_models import FRAMES
 from forcegp.errors import FileFormatError, InvalidInput, NumericalWarning, UnknownJoint
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.priors import ContactFriction, JointFriction, named_prior, prior_from_dict, prior_to_dict
-from forcegp.priors.contact_friction import refined_loads
-from forcegp.priors.expected_friction import SMALLEST_SHARE, ExpectedFriction, TabulatedCurve
+from forcegp.priors.contact_friction import SMALLEST_SHARE, ExpectedFriction, TabulatedCurve, refined_loads
 
 MODEL = "chain"
 FRAME = FRAMES[MODEL]

@@ -16,7 +16,7 @@ from forcegp.priors import (
     PeriodicJointForces,
     ToolForces,
 )
-from forcegp.priors.expected_friction import ExpectedFriction, TabulatedCurve
+from forcegp.priors.contact_friction import ExpectedFriction, TabulatedCurve
 
 TIP = ("hand", (0.0, 0.0, 0.2))  # where the arm touches its plane
 

@@ -14,8 +14,8 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import lay_out
-from forcegp.robots.nearest_inertia import MARGIN, nearest_inertia, with_chosen_inertias
 from forcegp.robots.urdf import parse_urdf
+from forcegp.robots.urdf_file import MARGIN, nearest_inertia, with_chosen_inertias
 
 URDF = """<robot name="one"><link name="base"/>
 <!-- rounded to death --><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="{mass}"/>

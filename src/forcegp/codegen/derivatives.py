@@ -18,11 +18,7 @@ FLAT = ("less", "at_most", "equal", "look up", "input", "constant", "call")
 
 
 def gradients(
-    graph: Graph,
-    outputs: Sequence[int],
-    cotangents: Sequence[int],
-    wanted: Sequence[int],
-    held: Sequence[int] = (),
+    graph: Graph, outputs: Sequence[int], cotangents: Sequence[int], wanted: Sequence[int], held: Sequence[int] = ()
 ) -> list[int]:
     """``sum_k cotangents_k d outputs_k / d wanted``.
 
@@ -122,20 +118,14 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
             return [(x, lambda: apply("divide", ONE, y)), (y, lambda: apply("negate", apply("divide", node, y)))]
         case "atan2":
             size = apply("add", square(x), square(y))
-            return [
-                (x, lambda: apply("divide", y, size)),
-                (y, lambda: apply("negate", apply("divide", x, size))),
-            ]
+            return [(x, lambda: apply("divide", y, size)), (y, lambda: apply("negate", apply("divide", x, size)))]
         case "power":
             lower = apply("power", x, apply("subtract", y, ONE))
             log = apply("choose", apply("equal", x, ZERO), ZERO, apply("log", x))
             return [(x, lambda: apply("multiply", y, lower)), (y, lambda: apply("multiply", node, log))]
         case "choose":
             _, y, z = operands
-            return [
-                (y, lambda: apply("choose", x, ONE, ZERO)),
-                (z, lambda: apply("choose", x, ZERO, ONE)),
-            ]
+            return [(y, lambda: apply("choose", x, ONE, ZERO)), (z, lambda: apply("choose", x, ZERO, ONE))]
     raise AssertionError(operation)
 
 

@@ -127,10 +127,7 @@ def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
 
 
 # Lanes and compiler options by the vector unit that torch found.
-VECTOR_UNITS = {
-    "AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")),
-    "AVX2": (4, ("-mavx2", "-mfma")),
-}
+VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")), "AVX2": (4, ("-mavx2", "-mfma"))}
 OPTIONS = ("-std=gnu11", "-O2", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")
 
 

@@ -33,11 +33,10 @@ from forcegp.inference import Exact, OptimizerOptions, ProblemSize
 from forcegp.inference.memory import require_memory
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Noise, StructuredGP, StructuredPosterior
-from forcegp.models.noise import ACCELERATION
 from forcegp.models.search import training_rows
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, Mean
 from forcegp.models.structured.prior_checks import check_prior
-from forcegp.models.training_data import TrainingData
+from forcegp.models.training_data import ACCELERATION, TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import ForcePrior
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
+from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.ablation_jobs import PAPER_STEPS, SCHEDULES
 from forcegp.experiments.experiment import Experiment, Row

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from forcegp.evaluation.metrics import formatted
 from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
-from forcegp.evaluation.summary_statistics import formatted
 from forcegp.experiments import published
 from forcegp.experiments.force_experiment import LABELS, ForceExperiment, Trial, only_test, plain_ticks, score_table
 from forcegp.jobs import JobStore

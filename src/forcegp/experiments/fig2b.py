@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, medians
+from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.figures import learning_curves_figure

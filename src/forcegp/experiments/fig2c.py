@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, median_and_range, number
+from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range, number
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.figures import estimation_figure

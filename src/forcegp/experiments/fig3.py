@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.metrics import interval_coverage
-from forcegp.evaluation.summary_statistics import markdown_table, number
+from forcegp.evaluation.metrics import interval_coverage, markdown_table, number
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.figures import prediction_window_figure

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.summary_statistics import in_columns, markdown_table, median_and_range, number
+from forcegp.evaluation.metrics import in_columns, markdown_table, median_and_range, number
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.figures import rollouts_figure

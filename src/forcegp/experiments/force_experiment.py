@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from typing_extensions import override
 
+from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, median_and_range, medians
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
-from forcegp.evaluation.summary_statistics import formatted, in_columns, markdown_table, median_and_range, medians
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.jobs import Job, JobStore

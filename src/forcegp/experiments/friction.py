@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, medians
+from forcegp.evaluation.metrics import formatted, markdown_table, medians
 from forcegp.experiments.force_experiment import (
     LABELS,
     ForceExperiment,

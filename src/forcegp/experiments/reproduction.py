@@ -16,7 +16,7 @@ from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.evaluation import save_figure
-from forcegp.evaluation.summary_statistics import markdown_table
+from forcegp.evaluation.metrics import markdown_table
 from forcegp.experiments.ablation import Ablation
 from forcegp.experiments.data_efficiency import DataEfficiency, DeepKernel
 from forcegp.experiments.experiment import DataSettings, Experiment, Row

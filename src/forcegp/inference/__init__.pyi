@@ -1,4 +1,5 @@
 from .block_cross_validation import LeaveOut as LeaveOut, leave_blocks_out as leave_blocks_out
+from .dense_kernels import LatentKernels as LatentKernels
 from .engines import (
     ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing, Iterative as
     Iterative, ProblemSize as ProblemSize, Stochastic as Stochastic, choose_engine as choose_engine, engine_from_dict as
@@ -6,8 +7,7 @@ from .engines import (
 )
 from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound
 from .iterative import IterativePosterior as IterativePosterior
-from .kernels import LatentKernels as LatentKernels
-from .likelihood import negative_log_likelihood as negative_log_likelihood
+from .likelihood import Terms as Terms, negative_log_likelihood as negative_log_likelihood
 from .linear_functionals import FunctionalPosterior as FunctionalPosterior
 from .memory import require_memory as require_memory
 from .optimization import (
@@ -15,4 +15,3 @@ from .optimization import (
     minimize_objective as minimize_objective,
 )
 from .posterior import ExactPosterior as ExactPosterior, LatentPosterior as LatentPosterior, exact as exact
-from .deflation import Terms as Terms

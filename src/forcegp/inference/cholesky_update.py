@@ -27,9 +27,8 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.deflation import Deflation, deflate, whiten
-from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, deflated_covariance
+from forcegp.inference.dense_kernels import LatentKernels
+from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, Deflation, deflate, deflated_covariance, whiten
 from forcegp.inference.posterior import ExactPosterior
 
 COPIED_ROWS = 256

@@ -23,10 +23,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message, usable_arguments
-from forcegp.inference.deflation import Terms
+from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior
 from forcegp.inference.iterative import Iteration, IterativePosterior
-from forcegp.inference.kernels import LatentKernels
+from forcegp.inference.likelihood import Terms
 from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 

@@ -2,7 +2,7 @@
 
 In deflated coordinates T alpha = t with T = sum_c (C_c C_c^T) K_c + I. A product with T needs the kernel matrices one
 panel after the other; the preconditioner is the covariance of the same model with a few weights per latent and the rest
-of the prior variance as noise of every point (`weight_space`), inverted by Woodbury's identity. docs/solvers.md
+of the prior variance as noise of every point (`WeightSpace`), inverted by Woodbury's identity. docs/solvers.md
 compares it with others: a pivoted Cholesky factor of T is as good where its rank is chosen well, but gives no
 covariance.
 """
@@ -18,10 +18,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.inference.deflation import Deflation, Terms
-from forcegp.inference.kernels import LatentKernels
+from forcegp.inference.dense_kernels import LatentKernels
+from forcegp.inference.inducing import Pivots, WeightSpace, pivoted_cholesky
+from forcegp.inference.likelihood import Deflation, Terms
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.weight_space import Pivots, WeightSpace, pivoted_cholesky
 
 Linear = Callable[[Tensor], Tensor]
 """A symmetric positive definite operator on columns (n, S)."""

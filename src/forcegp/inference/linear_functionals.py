@@ -25,9 +25,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.deflation import Terms, whiten
-from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.likelihood import scaled_gradients
+from forcegp.inference.dense_kernels import LatentKernels
+from forcegp.inference.likelihood import Terms, scaled_gradients, whiten
 from forcegp.inference.memory import require_memory
 from forcegp.inference.posterior import FactorizedPosterior
 

@@ -20,9 +20,8 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor
-from forcegp.inference.deflation import deflate, whiten
-from forcegp.inference.kernels import LatentKernels
-from forcegp.inference.likelihood import DeflatedSystem, solve_deflated
+from forcegp.inference.dense_kernels import LatentKernels
+from forcegp.inference.likelihood import DeflatedSystem, deflate, solve_deflated, whiten
 
 BLOCK_BYTES = 64 * 2**20
 """Working memory of one block of test points."""

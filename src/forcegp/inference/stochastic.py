@@ -29,9 +29,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import NumericalError
-from forcegp.inference.deflation import Terms, whiten
+from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior
-from forcegp.inference.kernels import LatentKernels
+from forcegp.inference.likelihood import Terms, whiten
 from forcegp.inference.optimization import OptimizationResult
 
 JITTER = 1e-8

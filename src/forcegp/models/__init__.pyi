@@ -7,7 +7,6 @@ from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .identification.identification import Identification as Identification
 from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned
-from .noise import Noise as Noise
 from .prediction import Gaussian as Gaussian, Prediction as Prediction
 from .predictor import Linearization as Linearization, Predictor as Predictor
 from .protocol import Model as Model, Posterior as Posterior
@@ -17,4 +16,4 @@ from .storage import load_posterior as load_posterior, save_posterior as save_po
 from .structured.gp import StructuredGP as StructuredGP
 from .structured.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .structured.posterior import StructuredPosterior as StructuredPosterior
-from .training_data import TrainingData as TrainingData
+from .training_data import Noise as Noise, TrainingData as TrainingData

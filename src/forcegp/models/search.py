@@ -28,7 +28,7 @@ from forcegp.errors import (
 )
 from forcegp.inference import OptimizationResult, OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.noise import Noise
+from forcegp.models.training_data import Noise
 from forcegp.parallel import Backend, Joblib, Serial
 from forcegp.robots.arguments import whole_number
 

@@ -27,10 +27,9 @@ from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models.baselines.independent_gp import IndependentGP
 from forcegp.models.baselines.network_ensemble import NetworkEnsemble
 from forcegp.models.baselines.neural_network import NeuralNetwork
-from forcegp.models.noise import Noise
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.structured.gp import StructuredGP
-from forcegp.models.training_data import TrainingData
+from forcegp.models.training_data import Noise, TrainingData
 from forcegp.priors import prior_from_dict, prior_to_dict
 
 

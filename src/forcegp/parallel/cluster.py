@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.errors import BackendError, InvalidInput, MissingExtra
-from forcegp.parallel.backend import MOST_DEATHS, Backend, Pool, Shared, Workers, check_jobs, replayed
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Joblib, Pool, Serial, Shared, Workers, check_jobs, replayed
 
 ANSWER_SECONDS = 10
 """So long a machine is given to answer."""
@@ -285,3 +285,48 @@ def _portable_work() -> Callable[..., Any]:
         return None, outcome, warned
 
     return inspect.unwrap(work)  # what checks annotations at run time, as the tests do, cannot travel
+
+
+BACKENDS: dict[str, type[Backend]] = {kind.name: kind for kind in (Serial, Joblib, Ray)}
+
+
+def backend_of(name: str, jobs: int | None = None, address: str | None = None) -> Backend:
+    """The backend of this name: serial, joblib or ray.
+
+    jobs: tasks at once; None is as many as this machine has cores, or as the cluster can take. address: of a Ray
+    cluster, HOST:PORT. Raises InvalidInput for another name, and for arguments that mean nothing to it.
+    """
+    if name not in BACKENDS:
+        raise InvalidInput(f"there is no backend {name!r}; choose {', '.join(BACKENDS)}")
+    if jobs is not None:
+        check_jobs(jobs)
+    if address is not None and name != Ray.name:
+        raise InvalidInput(f"the address {address} is that of a cluster, and backend {name} uses none; choose ray")
+    if name == Ray.name:
+        return Ray(address, jobs)
+    if name == Joblib.name:
+        return Joblib(os.cpu_count() or 1 if jobs is None else jobs)
+    if jobs not in (None, 1):
+        raise InvalidInput(f"backend serial does one task at a time, not {jobs}; choose joblib, or leave jobs out")
+    return Serial()
+
+
+def backend_for(given: Backend | str | None, jobs: int | None = None) -> Backend:
+    """What a function means that takes both: a backend, its name, or None for processes as soon as jobs is above 1.
+
+    Raises InvalidInput as `backend_of`, and for a backend with jobs of its own together with others.
+    """
+    if given is None:
+        if jobs is not None:
+            check_jobs(jobs)
+        return Serial() if jobs in (None, 1) else Joblib(jobs)
+    if isinstance(given, str):
+        return backend_of(given, jobs)
+    if not isinstance(given, Backend):
+        raise InvalidInput(
+            f"backend is a {type(given).__name__}; give Serial(), Joblib(jobs), Ray(address), or one of the names "
+            f"{', '.join(BACKENDS)}"
+        )
+    if jobs is not None and jobs != getattr(given, "jobs", 1):
+        raise InvalidInput(f"jobs={jobs} contradicts backend={given}; give one of them")
+    return given

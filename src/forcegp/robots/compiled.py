@@ -12,9 +12,9 @@ from torch import Tensor
 
 from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.algorithms import NOT_POSITIVE_DEFINITE
 from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, check_mapping
 from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request, compiled_program
+from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
 

@@ -1,4 +1,22 @@
-"""One kinematics pass over a batch of states, from which every dynamic and geometric quantity is read."""
+"""One kinematics pass over a batch of states, from which every dynamic and geometric quantity is read.
+
+A twist is the 3x4 matrix ``[[w]x, v]`` (the upper rows of an element of se(3)), with ``w`` the angular velocity and
+``v`` the velocity of the body point that passes the origin. The pseudo-inertia of a body in the world is
+``P_w = T P T^T``. With both,
+
+    M_ij   = < S_i, S_j P_c,j >      for joint i above or equal to joint j, P_c,j summed over what joint j moves
+    tau_i  = < S_i, sum_k A_k P_k >  over the bodies k that joint i moves
+
+where <., .> is the sum of products of entries and ``A_k = T''_k T_k^-1`` the acceleration of body k. These are the
+composite-rigid-body and recursive Newton-Euler algorithms (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6
+and 5) with their recursions over the tree written as products with the (n, n) descendant matrix.
+
+Tensors over joints or bodies have shape (n, rows, columns, batch): joints lead, so that sums over the tree are single
+matrix products; the batch, flattened to one dimension, trails, so that products of thousands of 4x4 matrices are
+vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the batch in front).
+All functions compose differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated
+differentiation apply.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +26,135 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
-from forcegp.robots import algorithms
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.arguments import Inertials, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
-from forcegp.robots.layout import WORLD
+from forcegp.robots.layout import WORLD, Tree
 from forcegp.robots.structure import RobotStructure
+
+Bodies = Float[Tensor, "n 4 4 batch"]
+"""A 4x4 matrix of every body: its pose or its pseudo-inertia."""
+Twists = Float[Tensor, "n 3 4 batch"]
+"""A twist, or an acceleration, of every body."""
+Vectors = Float[Tensor, "n 6 batch"]
+"""A twist of every body as the vector [w; v]."""
+
+NOT_POSITIVE_DEFINITE = (
+    "the mass matrix is not positive definite: either q or the inertial parameters hold NaN or infinity, or "
+    "all mass that a joint moves lies on its axis; check the inputs, or give that joint armature."
+)
+
+
+def product(
+    left: Float[Tensor, "*#joints rows inner #batch"], right: Float[Tensor, "*#joints inner columns #batch"]
+) -> Float[Tensor, "*joints rows columns batch"]:
+    """Matrix product with the batch in the last dimension."""
+    return (left.unsqueeze(-2) * right.unsqueeze(-4)).sum(-3)
+
+
+def over_tree(matrix: Float[Tensor, "n n"], values: Float[Tensor, "n rows columns batch"]) -> Tensor:
+    """``sum_k matrix[i, k] values[k]``."""
+    return (matrix @ values.flatten(1)).view_as(values)
+
+
+def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Bodies:
+    """Pose T of every body frame in the world."""
+    local = torch.addcmul(tree.rest, tree.sine, q.sin()[:, None, None])
+    local = torch.addcmul(local, tree.cosine, q.cos()[:, None, None])
+    if not tree.all_revolute:
+        local = torch.addcmul(local, tree.slide, q[:, None, None])
+    pose = local[tree.levels[0].joints]
+    laid = [pose]
+    for level in tree.levels[1:]:
+        above = pose if level.parents is None else pose[level.parents]
+        pose = product(above, local[level.joints])
+        laid.append(pose)
+    poses = torch.cat(laid)
+    return poses if tree.order is None else poses[tree.order]
+
+
+def joint_twists(tree: Tree, poses: Bodies) -> tuple[Vectors, Twists]:
+    """Twist of each body per unit velocity of its joint, as a vector [w; v] and as the matrix S = [[w]x, v]."""
+    axis, point = poses[:, :3, 2], poses[:, :3, 3]
+    moment = torch.linalg.cross(point, axis, dim=1)
+    if not tree.all_revolute:
+        moment = tree.revolute * moment + (1.0 - tree.revolute) * axis
+        axis = tree.revolute * axis
+    vectors = torch.cat([axis, moment], dim=1)
+    return vectors, (tree.twist_basis @ vectors).unflatten(1, (3, 4))
+
+
+def body_accelerations(
+    tree: Tree, twists: Twists, v: Float[Tensor, "n batch"], a: Float[Tensor, "n batch"] | None = None
+) -> Twists:
+    """Accelerations ``A = T'' T^-1`` of all bodies, without gravity; ``a`` of None is zero.
+
+    With V the body's and V_p its parent body's twist, ``A = A_p + (V_p + V) S v + S a``: differentiating ``T' = V T``
+    twice along a chain, the bracket and the squared terms collapse to that one product.
+    """
+    moving = twists * v[:, None, None]
+    step = product(over_tree(tree.velocity_sum, moving)[:, :, :3], moving)
+    if a is not None:
+        step = torch.addcmul(step, twists, a[:, None, None])
+    return over_tree(tree.ancestors, step)
+
+
+def world_inertias(poses: Bodies, inertias: Float[Tensor, "n 4 4 #batch"]) -> Bodies:
+    """Pseudo-inertias ``T P T^T``."""
+    return product(product(poses, inertias), poses.transpose(1, 2))
+
+
+def mass_matrix(tree: Tree, vectors: Vectors, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch n n"]:
+    """Joint-space inertia matrix, armature included on the diagonal."""
+    momenta = product(twists, over_tree(tree.descendants, inertias))
+    # <[[w]x, v], F> is the product of the vector [w; v] with these six combinations of the entries of F
+    momenta = tree.twist_basis.mT @ momenta.flatten(1, 2)
+    above = product(vectors, momenta.transpose(0, 1))
+    # right where the row's joint moves the column's body; elsewhere the transpose is, or neither on different branches
+    out = torch.where(tree.is_above, above, above.transpose(0, 1))
+    if not tree.is_chain:
+        out = out * tree.related
+    if tree.has_armature:
+        out = out + torch.diag(tree.armature)[..., None]
+    return out.movedim(-1, 0).contiguous()
+
+
+def joint_forces(tree: Tree, twists: Twists, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch n"]:
+    """Joint forces under which the bodies accelerate so against gravity (without armature)."""
+    wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
+    return (twists * wrenches).sum((1, 2)).mT
+
+
+def torque_regressor(
+    tree: Tree, twists: Twists, accelerations: Twists, frames: Bodies, basis: Float[Tensor, "16 parameters"]
+) -> Float[Tensor, "batch n n parameters"]:
+    """Joint force (first n) per unit of each parameter of each body (second n), without armature.
+
+    The pseudo-inertia of body k is ``frames[k] P frames[k]^T`` with P, row by row, equal to ``basis`` times the body's
+    parameters; so ``tau_i = tr((S_i T)^T (A_k - g) T P)``.
+    """
+    columns = []
+    for k in range(len(twists)):
+        frame = frames[k : k + 1]
+        left, right = product(twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
+        gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
+        columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
+    return torch.stack(columns, dim=2)
+
+
+def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch n"]:
+    """Joint forces that hold the robot still."""
+    first_moments = over_tree(tree.descendants, inertias[..., 3:, :])
+    return -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
+
+
+def solve_mass_matrix(mass: Float[Tensor, "*batch n n"], force: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    """``M^-1 force`` by Cholesky; :class:`~forcegp.errors.NumericalError` where M is not positive definite."""
+    try:
+        factor = torch.linalg.cholesky(mass)
+    except torch.linalg.LinAlgError as error:
+        raise NumericalError(NOT_POSITIVE_DEFINITE) from error
+    return torch.cholesky_solve(force[..., None], factor).squeeze(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +165,7 @@ class Kinematics:
     (..., 10); links not named keep the inertia of the URDF. Batch dimensions broadcast. Methods that need velocities
     raise :class:`~forcegp.errors.InvalidInput` if the kinematics was made without.
 
-    The fields are internal: the batch is flattened and trails (see :mod:`forcegp.robots.algorithms`).
+    The fields are internal: the batch is flattened and trails.
     """
 
     robot: RobotStructure
@@ -39,12 +180,12 @@ class Kinematics:
     def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> Kinematics:
         """Kinematics at checked q and v (*batch, nv) of equal shape."""
         batch = q.shape[:-1]
-        poses = algorithms.body_poses(robot.tree, _columns(q, batch))
-        vectors, twists = algorithms.joint_twists(robot.tree, poses)
+        poses = body_poses(robot.tree, _columns(q, batch))
+        vectors, twists = joint_twists(robot.tree, poses)
         if v is None:
             return cls(robot, batch, poses, vectors, twists, None, None)
         v = _columns(v, batch)
-        return cls(robot, batch, poses, vectors, twists, v, algorithms.body_accelerations(robot.tree, twists, v))
+        return cls(robot, batch, poses, vectors, twists, v, body_accelerations(robot.tree, twists, v))
 
     # ------------------------------------------------------------------ dynamics
 
@@ -68,7 +209,7 @@ class Kinematics:
     def gravity_forces(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
         at, inertias = self._with_inertias(inertials)
-        return at._rows(algorithms.gravity_forces(self.robot.tree, at.twists, inertias))
+        return at._rows(gravity_forces(self.robot.tree, at.twists, inertias))
 
     def inverse_dynamics(
         self, a: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
@@ -78,8 +219,8 @@ class Kinematics:
         at, inertias = self._expand(self._broadcast("a", a.shape[:-1]))._with_inertias(inertials)
         _, v = at._moving("inverse_dynamics")
         tree, a = self.robot.tree, _columns(a, at.batch_shape)
-        accelerations = algorithms.body_accelerations(tree, at.twists, v, a)
-        forces = algorithms.joint_forces(tree, at.twists, accelerations, inertias)
+        accelerations = body_accelerations(tree, at.twists, v, a)
+        forces = joint_forces(tree, at.twists, accelerations, inertias)
         return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
     def forward_dynamics(
@@ -89,7 +230,7 @@ class Kinematics:
         tau = self.robot.checked_input("tau", tau)
         at, inertias = self._expand(self._broadcast("tau", tau.shape[:-1]))._with_inertias(inertials)
         net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
-        return at._rows(algorithms.solve_mass_matrix(at._mass_matrix(inertias), net))
+        return at._rows(solve_mass_matrix(at._mass_matrix(inertias), net))
 
     # ------------------------------------------------------------------ linear in the standard parameters of bodies
 
@@ -103,10 +244,10 @@ class Kinematics:
         at = self._expand(self._broadcast("a", a.shape[:-1]))
         _, v = at._moving("torque_regressor")
         tree = self.robot.tree
-        accelerations = algorithms.body_accelerations(tree, at.twists, v, _columns(a, at.batch_shape))
-        frames = algorithms.product(at.poses, self._child_frames()[..., None])
+        accelerations = body_accelerations(tree, at.twists, v, _columns(a, at.batch_shape))
+        frames = product(at.poses, self._child_frames()[..., None])
         basis = standard_basis(self.robot.device)
-        return at._rows(algorithms.torque_regressor(tree, at.twists, accelerations, frames, basis))
+        return at._rows(torque_regressor(tree, at.twists, accelerations, frames, basis))
 
     def dynamics_of_bodies(
         self, parameters: Float[Tensor, "bodies 10"]
@@ -117,7 +258,7 @@ class Kinematics:
         """
         frames = self._child_frames()
         pseudo = frames @ pseudo_inertia_of_standard(parameters) @ frames.mT
-        inertias = algorithms.world_inertias(self.poses, pseudo[..., None])
+        inertias = world_inertias(self.poses, pseudo[..., None])
         return self._rows(self._mass_matrix(inertias)), self._rows(self._bias_forces(inertias))
 
     # ------------------------------------------------------------------ frames
@@ -127,14 +268,14 @@ class Kinematics:
         body, offset = self.robot.frame(frame)
         if body == WORLD:
             return offset.repeat(*self.batch_shape, 1, 1)
-        return self._rows(algorithms.product(self.poses[body], offset[..., None]).movedim(-1, 0))
+        return self._rows(product(self.poses[body], offset[..., None]).movedim(-1, 0))
 
     def frame_jacobian(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         at, body, position = self._world_point(frame, point)
         if body == WORLD:
             return self.twists.new_zeros(*at.batch_shape, 6, self.robot.nv)
-        linear = algorithms.product(at.twists, position)[:, :, 0]
+        linear = product(at.twists, position)[:, :, 0]
         jacobian = torch.cat([linear, at.vectors[:, :3]], dim=1)
         reached = self.robot.tree.descendants[:, body, None, None]
         return at._rows((jacobian * reached).permute(2, 1, 0).contiguous())
@@ -149,7 +290,7 @@ class Kinematics:
         if body == WORLD:
             return self.twists.new_zeros(*at.batch_shape, 6)
         acceleration = accelerations[body]
-        linear = algorithms.product(acceleration, position)[:, 0]
+        linear = product(acceleration, position)[:, 0]
         # A = [dw/dt]x + [w]x [w]x, whose second part is symmetric: the basis reads dw/dt off the antisymmetric half
         angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ acceleration.flatten(0, 1))
         return at._rows(torch.cat([linear, angular]).mT)
@@ -164,11 +305,11 @@ class Kinematics:
         return torch.as_tensor(self.robot.layout.child_frames, device=self.robot.device)
 
     def _mass_matrix(self, inertias: Tensor) -> Tensor:
-        return algorithms.mass_matrix(self.robot.tree, self.vectors, self.twists, inertias)
+        return mass_matrix(self.robot.tree, self.vectors, self.twists, inertias)
 
     def _bias_forces(self, inertias: Tensor) -> Tensor:
         accelerations, _ = self._moving("bias_forces")
-        return algorithms.joint_forces(self.robot.tree, self.twists, accelerations, inertias)
+        return joint_forces(self.robot.tree, self.twists, accelerations, inertias)
 
     def _moving(self, what: str) -> tuple[Tensor, Tensor]:
         if self.accelerations is None or self.v is None:
@@ -178,13 +319,13 @@ class Kinematics:
     def _with_inertias(self, inertials: Inertials | None) -> tuple[Kinematics, Tensor]:
         """These states broadcast against the batch of ``inertials``, and the bodies' pseudo-inertias in the world."""
         if not inertials:
-            return self, algorithms.world_inertias(self.poses, self.robot.tree.inertias)
+            return self, world_inertias(self.poses, self.robot.tree.inertias)
         inertias = self.robot.body_inertias(inertials)  # (nv, 4, 4, *batch)
         batch = inertias.shape[3:]
         if not batch:
-            return self, algorithms.world_inertias(self.poses, inertias[..., None])
+            return self, world_inertias(self.poses, inertias[..., None])
         at = self._expand(self._broadcast("inertials", batch))
-        return at, algorithms.world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
+        return at, world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
 
     def _world_point(self, frame: str, point: Vector | None) -> tuple[Kinematics, int, Tensor]:
         """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
@@ -200,7 +341,7 @@ class Kinematics:
             else:
                 at = self._expand(self._broadcast("point", point.shape[:-1]))
                 local = _expand_trailing(homogeneous.movedim((-2, -1), (0, 1)), 2, at.batch_shape)
-        return at, body, local if body == WORLD else algorithms.product(at.poses[body], local)
+        return at, body, local if body == WORLD else product(at.poses[body], local)
 
     def _broadcast(self, name: str, batch: torch.Size) -> torch.Size:
         return broadcast_batch({"the states": self.batch_shape, name: batch})

@@ -278,7 +278,7 @@ class Tree:
 def compile_tree(
     description: RobotDescription, layout: Layout, *, gravity: np.ndarray, armature: np.ndarray, device: torch.device
 ) -> Tree:
-    """Batched constants for :mod:`forcegp.robots.algorithms`, on ``device``."""
+    """Batched constants for :mod:`forcegp.robots.kinematics`, on ``device``."""
     n = len(layout.joints)
     revolute = np.array([joint.type != "prismatic" for joint in layout.joints])
     rest, sine, cosine, slide = np.zeros((4, n, 4, 4))

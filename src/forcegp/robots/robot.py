@@ -24,10 +24,9 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import check_inertias, compile_tree, lay_out
-from forcegp.robots.nearest_inertia import InertiaChoice, with_chosen_inertias
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import read_text, replace_inertial, write_text
+from forcegp.robots.urdf_file import InertiaChoice, read_text, replace_inertial, with_chosen_inertias, write_text
 
 GRAVITY = (0.0, 0.0, -9.81)
 

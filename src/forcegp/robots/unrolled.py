@@ -1,6 +1,6 @@
 """One given robot as constants, and its rigid-body algorithms at given states, unrolled into scalars.
 
-Where :mod:`forcegp.robots.algorithms` computes with (n, 4, 4, batch) tensors for any tree, here every entry is a scalar
+Where :mod:`forcegp.robots.kinematics` computes with (n, 4, 4, batch) tensors for any tree, here every entry is a scalar
 of its own: a float, or an expression from which code is written (:mod:`forcegp.codegen.graph`). Everything that the
 robot's structure makes zero or one vanishes while the computation is written down. Arrays of NumPy hold the scalars as
 objects, so that their operators write down products and sums entry by entry.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from forcegp.evaluation.summary_statistics import formatted, markdown_table, number
+from forcegp.evaluation.metrics import formatted, markdown_table, number
 from forcegp.validation.paired_tests import SCORES
 
 ALT_TEXTS = {

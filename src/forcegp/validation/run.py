@@ -13,7 +13,7 @@ from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
 from forcegp.data import preparation_report
 from forcegp.errors import FileFormatError, InvalidInput, require_type
-from forcegp.evaluation.summary_statistics import median_and_range
+from forcegp.evaluation.metrics import median_and_range
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.jobs.job import machine
 from forcegp.parallel import Backend, backend_for

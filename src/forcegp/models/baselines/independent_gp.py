@@ -21,7 +21,6 @@ from forcegp.models.baselines.independent_posterior import (
     joint_part,
     one_joint,
 )
-from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.protocol import Model
 from forcegp.models.search import (
     FitProgress,
@@ -37,7 +36,7 @@ from forcegp.models.search import (
     run_restarts,
     training_rows,
 )
-from forcegp.models.training_data import TrainingData
+from forcegp.models.training_data import ACCELERATION, Noise, TrainingData
 from forcegp.parallel import Backend, backend_for
 from forcegp.priors import JointForces
 

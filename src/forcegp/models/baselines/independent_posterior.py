@@ -24,12 +24,11 @@ from forcegp.inference import (
 )
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.mechanics import Baumgarte
-from forcegp.models.noise import ACCELERATION
 from forcegp.models.prediction import Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
-from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
+from forcegp.models.training_data import ACCELERATION, RESIDUAL_FLOOR, Standardization, TrainingData
 from forcegp.priors.force_prior import kernels_of
 
 

@@ -25,10 +25,9 @@ from forcegp.models.baselines.neural_network import (
     held_out_rows,
     initial_weights,
 )
-from forcegp.models.noise import Noise
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
-from forcegp.models.training_data import Standardization, TrainingData
+from forcegp.models.training_data import Noise, Standardization, TrainingData
 
 FEWEST_ROWS = 10
 """Fewer rows cannot be trained on and held out."""

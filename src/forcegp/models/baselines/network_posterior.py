@@ -17,7 +17,6 @@ from typing_extensions import override
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import Engine, OptimizationResult
-from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.prediction import Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.search import (
@@ -27,7 +26,7 @@ from forcegp.models.search import (
     resolved_noise,
     training_rows,
 )
-from forcegp.models.training_data import Standardization, TrainingData
+from forcegp.models.training_data import ACCELERATION, Noise, Standardization, TrainingData
 
 
 class NetworkModel(Model):

@@ -21,10 +21,9 @@ from forcegp.errors import FitError, InvalidInput
 from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.baselines.network_posterior import NetworkModel, NetworkPosterior, inputs
-from forcegp.models.noise import Noise
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
-from forcegp.models.training_data import Standardization, TrainingData
+from forcegp.models.training_data import Noise, Standardization, TrainingData
 
 SMALLEST_VARIANCE = 1e-6
 """Of a standardised output: keeps the logarithm of the predicted variance finite."""

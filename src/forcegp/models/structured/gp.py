@@ -27,12 +27,16 @@ from forcegp.models.search import (
     training_windows,
     with_steps_before,
 )
-from forcegp.models.structured.engine_selection import learning_rows, on_all_rows, require_memory_to_learn
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.physical_start import PhysicalStart
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts
-from forcegp.models.structured.refinement import fit_with_refined_loads
+from forcegp.models.structured.refinement import (
+    fit_with_refined_loads,
+    learning_rows,
+    on_all_rows,
+    require_memory_to_learn,
+)
 from forcegp.models.structured.search import LOG_VARIANCE_SPREAD, FitObjective, Search, with_variance_priors
 from forcegp.models.structured.widening import widened
 from forcegp.models.training_data import TrainingData

@@ -29,10 +29,9 @@ from forcegp.inference.iterative import Iteration
 from forcegp.inference.linear_functionals import functional_negative_log_likelihood, weighted
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.identification.physical_parameters import COEFFICIENTS, INERTIALS, coefficients_of, inertials_of
-from forcegp.models.noise import ACCELERATION, FORCE, Noise
 from forcegp.models.protocol import Model
 from forcegp.models.search import check_system_and_noise
-from forcegp.models.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
+from forcegp.models.training_data import ACCELERATION, FORCE, RESIDUAL_FLOOR, Noise, Standardization, TrainingData
 from forcegp.priors import ForcePrior, JointForces
 from forcegp.priors.force_prior import Scaling
 

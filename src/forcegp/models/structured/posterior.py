@@ -33,7 +33,6 @@ from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Mechani
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
-from forcegp.models.noise import ACCELERATION, FORCE, Noise, plus, second_moments, shrunk, without_force_noise
 from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -44,7 +43,16 @@ from forcegp.models.structured.components import Components, Curve, Latents, com
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
-from forcegp.models.training_data import TrainingData
+from forcegp.models.training_data import (
+    ACCELERATION,
+    FORCE,
+    Noise,
+    TrainingData,
+    plus,
+    second_moments,
+    shrunk,
+    without_force_noise,
+)
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots.arguments import real_tensor
 
@@ -164,12 +172,7 @@ class StructuredPosterior(Posterior):
 
     @override
     def predictor(
-        self,
-        *,
-        covariance: str = "auto",
-        tolerance: float = 0.01,
-        largest_rank: int = 1536,
-        compile: bool = True,
+        self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 1536, compile: bool = True
     ) -> Predictor:
         self._require_commanded_torques()
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}

@@ -16,7 +16,6 @@ from torch import Tensor
 from forcegp.errors import FitError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, best_of, minimize_objective
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters, inertials_of
-from forcegp.models.noise import Noise
 from forcegp.models.search import (
     SMALL,
     FitProgress,
@@ -30,6 +29,7 @@ from forcegp.models.search import (
     run_restarts,
 )
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.training_data import Noise
 from forcegp.parallel import Backend
 from forcegp.robots import pseudo_inertia_from_parameters
 

@@ -16,11 +16,10 @@ from forcegp.errors import DataWarning
 from forcegp.inference import ExactPosterior
 from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
 from forcegp.inference.memory import require_memory
-from forcegp.models.noise import ACCELERATION, Noise
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.prior_checks import check_distance
-from forcegp.models.training_data import TrainingData
+from forcegp.models.training_data import ACCELERATION, Noise, TrainingData
 from forcegp.robots.arguments import whole_number
 
 Keep = Callable[[ExactPosterior, int], Tensor]
