@@ -11,8 +11,6 @@ A symbolic link stays, and what it points to is replaced. What is neither a file
 Its format is that of `sha256sum`. It protects itself: its text must be exactly the one that the files give.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import hashlib

@@ -1,7 +1,5 @@
 """How values show themselves: a few facts as text, and as a table in a notebook."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from html import escape

@@ -1,7 +1,5 @@
 """`identify_analytical`: rigid-body parameters from a recording; and how wrong such systems are about other motions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 

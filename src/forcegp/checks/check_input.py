@@ -101,12 +101,11 @@ class CheckInput:
 
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
-    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the
-    cut-off is that of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or
-    by more than pi otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a
-    log that is otherwise as given). `compared_noise` (nv,) is the standard deviation of the noise of the
-    acceleration in `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any
-    derivative.
+    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the cut-off is that
+    of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or by more than pi
+    otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a log that is
+    otherwise as given). `compared_noise` (nv,) is the standard deviation of the noise of the acceleration in
+    `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset

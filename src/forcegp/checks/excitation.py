@@ -1,7 +1,5 @@
 """Does the motion show what is to be learned, and what does noise hide of it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -89,8 +87,7 @@ def noise_findings(inputs: CheckInput) -> list[Finding]:
             look(
                 subject="noise",
                 seen=f"the acceleration in this dataset is not filtered: its noise is up to "
-                f"{np.max(before[loud] / spread[loud]):.2g} "
-                "times the acceleration itself.",
+                f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
                 remedy=f"forcegp prepare DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
                 joints=names,
             )

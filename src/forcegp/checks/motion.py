@@ -1,7 +1,5 @@
 """Are the rows even in time, and do q, v and a belong to each other."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 from dataclasses import replace

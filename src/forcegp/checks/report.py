@@ -1,7 +1,5 @@
 """`check`: one log against itself and its robot, as a list of findings that a person acts on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,8 +61,7 @@ def robot_findings(robot: Robot) -> list[Finding]:
                 look(
                     subject="URDF",
                     seen=f"link {link.name} has a radius of gyration of {gyration:.3g} m and its centre of mass "
-                    f"{center:.3g} m "
-                    f"from its joint; the whole robot reaches about {reach:.3g} m.",
+                    f"{center:.3g} m from its joint; the whole robot reaches about {reach:.3g} m.",
                     remedy="Check the units of this link (kg, m, kg m²).",
                     numbers={"gyration": gyration, "center": center, "reach": reach},
                 )

@@ -1,7 +1,5 @@
 """Does each channel carry a signal: constant and frozen channels, saturation, limits, resolution."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -195,8 +193,7 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
             yield wrong(
                 subject="saturation",
                 seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
-                f"{at} "
-                f"rows of motion; the longest stretch, {length} rows, begins at row {start} at "
+                f"{at} rows of motion; the longest stretch, {length} rows, begins at row {start} at "
                 f"{log.time[start]:.3f} s.",
                 remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
                 "these stretches out, or move more gently.",

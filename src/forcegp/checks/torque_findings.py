@@ -1,7 +1,5 @@
 """Findings of the comparison of torques with inverse dynamics: factor, unit, delay, what is left."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

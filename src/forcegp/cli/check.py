@@ -26,8 +26,7 @@ COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 class Check(CutoffOptions, RobotOptions):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
-    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is
-    changed.
+    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
 
     For instance:
       forcegp check log.h5 --robot arm.urdf

@@ -157,9 +157,8 @@ def _report_of_regression(
         tables.append(columns("friction and rotors", ["", "identified", "std. error"], rows))
     base = found.base
     summary = (
-        f"{base.rank} base parameters, condition number {base.condition:.3g}; "
-        f"{content['rows']} rows, {content['cpu_seconds']:.1f} s CPU"
-        f"{'' if content['converged'] else ', not converged'}."
+        f"{base.rank} base parameters, condition number {base.condition:.3g}; {content['rows']} rows, "
+        f"{content['cpu_seconds']:.1f} s CPU{'' if content['converged'] else ', not converged'}."
     )
     weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
     lines = [summary, f"Directions that the prior decides, not the data: {weak or 'none'}."]

@@ -141,7 +141,8 @@ class Import(PreparationOptions, RobotOptions):
         if path is None:
             found = {forcegp.recordings.beside(log) for log in self.logs} - {None}
             if len(found) > 1:
-                raise InvalidInput(f"the logs have different mappings beside them ({_list(found)}); give --mapping.")
+                listed = ", ".join(sorted(map(str, found)))
+                raise InvalidInput(f"the logs have different mappings beside them ({listed}); give --mapping.")
             path = next(iter(found), None)
             if path is not None:
                 if self.write_mapping is not None and path.resolve() == self.write_mapping.resolve():
@@ -191,10 +192,6 @@ def _is_mapping(path: Path) -> bool:
     except ForceGPError:
         return False
     return True
-
-
-def _list(paths: set[Path | None]) -> str:
-    return ", ".join(sorted(str(path) for path in paths))
 
 
 def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:

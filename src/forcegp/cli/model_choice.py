@@ -141,7 +141,9 @@ def make_model(
 ) -> forcegp.models.Model:
     """The model of a resolved command."""
     if command.model in NETWORKS:
-        noise = _known_noise(command.noise, dataset)
+        # None where neither SIGMA nor the dataset states it: the network then estimates it
+        unknown = command.noise == "dataset" and dataset.noise_std is None
+        noise = None if unknown else resolved_noise(command.noise, dataset)
         steps = {} if command.iterations is None else {"steps": command.iterations}
         network = forcegp.NeuralNetwork if command.model == "neural-network" else forcegp.NetworkEnsemble
         return network(system, noise, **steps)
@@ -224,8 +226,3 @@ def resolved_noise(given: str, dataset: forcegp.Dataset, force: float | None = N
     except ValueError:
         raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
     return forcegp.Noise(sigma, force)
-
-
-def _known_noise(given: str, dataset: forcegp.Dataset) -> forcegp.Noise | None:
-    """A network's noise: None where neither SIGMA nor the dataset states it: the network then estimates it."""
-    return None if given == "dataset" and dataset.noise_std is None else resolved_noise(given, dataset)

@@ -24,9 +24,8 @@ from forcegp.cli.terminal import Terminal
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, by default
-    a plane and viscous friction (Rath, Geist, Trimpe 2021). Equal seeds give equal way-points; train and
-    test need different ones.
+    kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, by default a plane and
+    viscous friction (Rath, Geist, Trimpe 2021). Equal seeds give equal way-points; train and test need different ones.
 
     For instance:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5

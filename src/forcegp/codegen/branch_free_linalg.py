@@ -1,7 +1,5 @@
 """Small dense linear algebra without branches on values, so that a tape can hold it; derivatives are right as well."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -5,8 +5,6 @@ parts, functions of their own: in one function, twice as much takes a compiler f
 later parts use wait in an array, whose places are used again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

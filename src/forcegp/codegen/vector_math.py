@@ -6,8 +6,6 @@ ch. 5). tanh and asinh from expm1 and log1p, so that nothing cancels near 0. Wha
 range of these, take libm, lane by lane.
 """
 
-from __future__ import annotations
-
 from math import factorial
 
 LANE_BY_LANE = ("tan", "asin", "acos", "atan", "sinh", "cosh", "erf")

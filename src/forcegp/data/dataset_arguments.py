@@ -1,7 +1,5 @@
 """Datasets as arguments: they come first, but for models and posteriors, and have the joints that are asked for."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps

@@ -82,9 +82,8 @@ def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording")
     worst = int(np.argmax(np.abs(steps - median)))
     if median <= 0 or abs(steps[worst] - median) > JITTER * median:
         raise DatasetError(
-            f"{name} is not sampled uniformly: the step after row {worst} is {steps[worst]:.6g} s, "
-            f"the median {median:.6g} s. "
-            "Resample it first (forcegp.data.resample)."
+            f"{name} is not sampled uniformly: the step after row {worst} is {steps[worst]:.6g} s, the median "
+            f"{median:.6g} s. Resample it first (forcegp.data.resample)."
         )
     return float((time[-1] - time[0]) / (len(time) - 1))
 

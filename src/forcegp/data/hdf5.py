@@ -3,8 +3,6 @@
 Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

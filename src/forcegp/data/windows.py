@@ -129,7 +129,8 @@ class WindowObservation(ABC):
         positive = np.maximum(c, SMALLEST_SHARE * c.max(axis=1, keepdims=True))
 
         def at_nodes(values: np.ndarray) -> np.ndarray:
-            means = [np.einsum("km,kmj->kj", _shares(positive[:, part]), values[:, part]) for part in parts]
+            shares = (positive[:, part] / positive[:, part].sum(axis=1, keepdims=True) for part in parts)
+            means = [np.einsum("km,kmj->kj", w, values[:, part]) for w, part in zip(shares, parts, strict=True)]
             return np.stack(means, axis=1).reshape(-1, values.shape[-1])
 
         repeat = {name: np.repeat(values, self.nodes, axis=0) for name, values in (("a", observed), ("noise", noise))}
@@ -307,7 +308,3 @@ def _exact(weights: np.ndarray, s: np.ndarray, moments: np.ndarray) -> np.ndarra
     missing = moments - np.einsum("km,kmj->kj", weights, powers)
     gram = np.einsum("kmi,kmj->kij", powers, powers)
     return weights + np.einsum("kmj,kj->km", powers, np.linalg.solve(gram, missing[..., None])[..., 0])
-
-
-def _shares(weights: np.ndarray) -> np.ndarray:
-    return weights / weights.sum(axis=1, keepdims=True)

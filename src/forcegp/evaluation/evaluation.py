@@ -1,7 +1,5 @@
 """`evaluate`: predict every row of a Dataset with a fitted model and score it; the scores are an `Evaluation`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Generic, TypeVar

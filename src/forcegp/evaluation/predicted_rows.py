@@ -15,7 +15,6 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.evaluation.metrics import negative_log_density
-from forcegp.mechanics import ConstrainedDynamics
 from forcegp.models.prediction import Gaussian, Prediction
 from forcegp.models.protocol import Posterior
 from forcegp.models.search import SMALL_COVARIANCE
@@ -104,6 +103,7 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
     known = _array(dynamics.acceleration_map(known=True).offset)
+    carried = dynamics.Q_K if posterior.carries_known_forces else torch.zeros_like(dynamics.Q_K)
     return PredictedRows(
         mean=mean,
         variance=_array(prediction.variance),
@@ -116,7 +116,7 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
         known_physics=known,
         moving_force=(mass @ (mean - known)[..., None])[..., 0],
         moving_force_variance=np.einsum("nij,njk,nik->ni", mass, covariance, mass),
-        carried_known_force=None if prediction.unknown_force is None else _carried_known_force(posterior, dynamics),
+        carried_known_force=None if prediction.unknown_force is None else _array(carried),
         A=_array(own.A),
         b=_array(own.b),
         mass=mass,
@@ -154,10 +154,6 @@ def _noise_covariance(
     stated, model = stated_noise_level(posterior, dataset), _array(posterior.noise_std)
     rows = np.maximum(model / stated, 1.0) * dataset.noise_std[block]
     return noise + (np.square(rows) - np.square(model))[..., None] * identity
-
-
-def _carried_known_force(posterior: Posterior, dynamics: ConstrainedDynamics) -> Float[np.ndarray, "rows nv"]:
-    return _array(dynamics.Q_K if posterior.carries_known_forces else torch.zeros_like(dynamics.Q_K))
 
 
 def _mean(force: Gaussian | None) -> np.ndarray | None:

@@ -1,7 +1,5 @@
 """What the paper leaves unclear, and what each of it does to the numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The jobs of the ablation: other searches, a filter, test rows among the training rows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

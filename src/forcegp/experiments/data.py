@@ -1,7 +1,5 @@
 """The data of the experiments: trajectories of `kuka-surface`, thinned by farthest-point sampling, kept as jobs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

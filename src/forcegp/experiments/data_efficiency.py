@@ -1,7 +1,5 @@
 """Errors against few training points, outside of where models were trained too, and a deep kernel."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi

@@ -1,7 +1,5 @@
 """Extrapolation: trained in one half of the workspace (and slowly), tested in the other (and faster)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Figure 2b: prediction and constraint error against the number of training points."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Figure 2c: the tool's mass and centre of mass, learned along with everything else."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The jobs of figure 2c: estimate the tool's mass and centre of mass from a wrong start."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,7 +40,7 @@ def trace(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
     history = [{NAMES[name]: value for name, value in point.items()} for point in _identification(posterior).history]
     return {
         "mass_error": [point["mass"] - true["mass"] for point in history],
-        "center_error": [_center_error(point, true) for point in history],
+        "center_error": [math.dist(*([x[f"com.{axis}"] for axis in "xyz"] for x in (at, true))) for at in history],
         "mae": [_mae(posterior.at_iteration(k), test) for k in range(len(history))],
         "start_mass": MASS_OFFSET,
         "start_center": list(CENTER_OFFSET),
@@ -85,10 +83,6 @@ def _values(system: MechanicalSystem | None) -> dict[str, float]:
     assert system is not None
     link = system.robot.link(TOOL_LINK)
     return {"mass": link.mass, **{f"com.{axis}": value for axis, value in zip("xyz", link.center_of_mass, strict=True)}}
-
-
-def _center_error(point: Mapping[str, float], true: Mapping[str, float]) -> float:
-    return float(np.linalg.norm([point[f"com.{axis}"] - true[f"com.{axis}"] for axis in "xyz"]))
 
 
 def _mae(posterior: StructuredPosterior, test: Dataset) -> float:

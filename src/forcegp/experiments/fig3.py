@@ -1,7 +1,5 @@
 """Figure 3: what four models predict for the same three seconds, with their 95 % intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

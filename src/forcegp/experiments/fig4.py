@@ -1,7 +1,5 @@
 """Figure 4: motions that the models predict, from the same initial states, over seconds."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 Fits to more points begin where the fit to fewer ended, because the training sets are nested.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,17 +33,13 @@ START_FRICTION = 0.1
 """Where the estimation of the joints' viscous friction begins [Nms/rad]."""
 
 
-def _nothing(system: MechanicalSystem) -> Mapping[str, Any]:
-    return {}
-
-
 @dataclass(frozen=True)
 class ModelKind:
     """A model's label in the paper's figures, how it is made for a system, and further arguments of its fit."""
 
     label: str
     make: Callable[[MechanicalSystem], Any]
-    fit_arguments: Callable[[MechanicalSystem], Mapping[str, Any]] = field(default=_nothing)
+    fit_arguments: Callable[[MechanicalSystem], Mapping[str, Any]] = field(default=lambda system: {})
 
 
 def _analytical(system: MechanicalSystem) -> StructuredGP:

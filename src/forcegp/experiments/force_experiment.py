@@ -1,7 +1,5 @@
 """What the experiments on force priors share: trials (a model on a scenario), their jobs, and summaries over seeds."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

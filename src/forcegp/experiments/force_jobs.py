@@ -1,7 +1,5 @@
 """Jobs of the experiments on force priors: simulate one trajectory, fit one model, score it on several."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,7 +33,9 @@ def true_curves(posterior: Any) -> dict[str, Law]:
     prior = getattr(posterior.model, "prior", None)
     if prior is None or system is None:
         return {}
-    config = KukaSurfaceConfig(**_tuples(posterior.settings["data"]["metadata"]["config"]))
+    given: Mapping[str, Any] = posterior.settings["data"]["metadata"]["config"]
+    values: Any = {name: tuple(x) if isinstance(x, list | tuple) else x for name, x in given.items()}
+    config = KukaSurfaceConfig(**values)
     out: dict[str, Law] = {}
     names = posterior.latent_names
     for _, term, which in term_slices(prior, system.robot):
@@ -73,10 +73,6 @@ def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
 
 def _per_speed(law: Law) -> Law:
     return lambda speed: law(speed) / speed
-
-
-def _tuples(config: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list | tuple) else value for name, value in config.items()}
 
 
 FILE = "data.h5"

@@ -1,7 +1,5 @@
 """Friction as it is, in every contact: Coulomb, Stribeck, under load, on other surfaces, and with one that opens."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

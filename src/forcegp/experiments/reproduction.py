@@ -1,7 +1,5 @@
 """The presets: experiments with all their settings; run them, and write JSON, CSV, figures and one page of Markdown."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
@@ -232,10 +230,9 @@ def reproduce(
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
     Writes the page (`page_name`) and, in the folder of its name (`page_of`), `<name>.json`, `<name>.csv` and the
-    figures as PNG, into `out` and, if given, into `docs`, too. `command` is the command that the page
-    names as its source.
-    Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and as
-    `JobStore.open` and `run_jobs`.
+    figures as PNG, into `out` and, if given, into `docs`, too. `command` is the command that the page names as its
+    source. Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and
+    as `JobStore.open` and `run_jobs`.
     """
     for experiment in experiments:
         experiment.require_possible()

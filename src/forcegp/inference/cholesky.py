@@ -93,8 +93,7 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
         if not bool(torch.isfinite(matrix.diagonal()).all()):
             raise NumericalError(
                 "the covariance matrix has entries that are not finite; check the data for huge or constant columns "
-                "and the start values "
-                "of the hyper-parameters"
+                "and the start values of the hyper-parameters"
             )
         jitter = relative * float(matrix.diagonal().mean()) if relative and matrix.shape[0] else relative
         if jitter:
@@ -111,9 +110,8 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
                 )
             return CholeskyFactor(lower, jitter)
     raise NumericalError(
-        f"the covariance matrix is not positive definite even with {jitter:.2e} added to its diagonal; raise the "
-        "noise level, remove "
-        "duplicate points, or check that the inputs are finite and of similar scale"
+        f"the covariance matrix is not positive definite even with {jitter:.2e} added to its diagonal; raise the noise "
+        "level, remove duplicate points, or check that the inputs are finite and of similar scale"
     )
 
 

@@ -1,7 +1,5 @@
 """How much memory there is, and the error that names what a computation would need."""
 
-from __future__ import annotations
-
 import ctypes
 import sys
 from pathlib import Path

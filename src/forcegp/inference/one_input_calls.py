@@ -1,7 +1,5 @@
 """Latents of one input as C functions of a program: what `KernelSum` is for the others, at a cost that no N changes."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Minimise an objective over named tensors: L-BFGS, an optional Adam warm-up, rollback and a named cause."""
 
-from __future__ import annotations
-
 import operator
 import time
 import warnings

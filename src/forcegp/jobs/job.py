@@ -3,9 +3,8 @@
 Imports are read from the source, not carried out. Followed are those into forcegp and into the module's own package;
 other libraries are not, their versions stand in `machine`. `from forcegp.data import Dataset` and
 `forcegp.data.Dataset` count the module that defines the name: packages re-export names from their modules, by imports
-or by a stub `__init__.pyi` for lazy ones.
-Comments, docstrings, line breaks and imports for type checkers do not count. Only what a program decides while it
-runs escapes, names of modules put together from pieces for example.
+or by a stub `__init__.pyi` for lazy ones. Comments, docstrings, line breaks and imports for type checkers do not count.
+Only what a program decides while it runs escapes, names of modules put together from pieces for example.
 """
 
 from __future__ import annotations
@@ -117,7 +116,8 @@ class _Source:
     def imports(self, package: str, *, types: bool = False) -> Iterator[Import]:
         """All imports, also those in functions; those for type checkers only if `types`."""
         nodes = list(self._nodes(types=types))
-        modules = {alias.asname or alias.name.partition(".")[0]: alias for alias in _aliases(nodes)}
+        aliases = (alias for node in nodes if isinstance(node, ast.Import) for alias in node.names)
+        modules = {alias.asname or alias.name.partition(".")[0]: alias for alias in aliases}
         used: set[str] = set()
         for node in nodes:
             if isinstance(node, ast.ImportFrom):
@@ -155,10 +155,6 @@ class _Source:
                 waiting += node.orelse
             elif not (isinstance(node, ast.Attribute) and _dotted(node)):
                 waiting += ast.iter_child_nodes(node)
-
-
-def _aliases(nodes: list[ast.AST]) -> Iterator[ast.alias]:
-    return (alias for node in nodes if isinstance(node, ast.Import) for alias in node.names)
 
 
 def _origin(node: ast.ImportFrom, package: str) -> str:

@@ -212,7 +212,8 @@ class ConstrainedDynamics:
 
     def multiplier_map(self, known: bool = True) -> AffineMap:
         """lambda = offset + matrix Q_U, in N for surfaces that are signed distances."""
-        matrix = -self.pseudo_inverse.mT @ self._constrained_projector @ self.inverse_lower
+        projector = self.pseudo_inverse @ (self.A @ self.inverse_lower.mT)  # A~^+ A~
+        matrix = -self.pseudo_inverse.mT @ projector @ self.inverse_lower
         offset = (self.pseudo_inverse.mT @ (self.pseudo_inverse @ self.b[..., None]))[..., 0]
         if known:
             offset = offset + (matrix @ self.Q_K[..., None])[..., 0]
@@ -239,11 +240,6 @@ class ConstrainedDynamics:
     def multiplier(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch m"]:
         """lambda = (A M^-1 A^T)^+ (b - A M^-1 (Q_K + Q_U)); the constraint force is A^T lambda."""
         return self.multiplier_map()(Q_U)
-
-    @property
-    def _constrained_projector(self) -> Float[Tensor, "*batch nv nv"]:
-        """A~^+ A~."""
-        return self.pseudo_inverse @ (self.A @ self.inverse_lower.mT)
 
 
 def factors(M: Float[Tensor, "*batch nv nv"]) -> tuple[Float[Tensor, "*batch nv nv"], Float[Tensor, "*batch nv nv"]]:

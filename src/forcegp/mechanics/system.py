@@ -64,8 +64,7 @@ class MechanicalSystem(Summary):
             if body < 0:
                 raise ContactError(
                     f"frame {contact.frame!r} of {self.robot.name} is fixed in the world, so a contact there "
-                    "constrains nothing; name a frame "
-                    "that moves."
+                    "constrains nothing; name a frame that moves."
                 )
 
     @override
@@ -83,9 +82,8 @@ class MechanicalSystem(Summary):
     ) -> ConstrainedDynamics:
         """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
 
-        Differentiable in all arguments.
-        `inertials` maps link names to log-Cholesky parameters (..., 10). Contact points are kinematic: no inertial
-        parameter moves them.
+        Differentiable in all arguments. `inertials` maps link names to log-Cholesky parameters (..., 10). Contact
+        points are kinematic: no inertial parameter moves them.
         """
         state = State.of(self.robot, q, v, u, inertials)
         M = self.mass_matrix(state.kinematics, inertials)
@@ -127,9 +125,8 @@ class MechanicalSystem(Summary):
         if len(bad):
             row, index = (int(entry) for entry in bad[0])
             raise ContactError(
-                f"contact {index} (frame {self.contacts[index].frame!r}) has no direction at row {row}: the "
-                "gradient of its surface vanishes "
-                "or the point cannot move along it; check the surface, the contact point and q."
+                f"contact {index} (frame {self.contacts[index].frame!r}) has no direction at row {row}: the gradient "
+                "of its surface vanishes or the point cannot move along it; check the surface, the contact point and q."
             )
         dynamics = self.dynamics(q, v, u)
         a = dynamics.acceleration_map().offset

@@ -4,8 +4,6 @@ The program is that of a compiled predictor (`predictor_code`) for one state, wi
 is written (`c_files`) is compiled and compared with `posterior.predict` before the folder appears.
 """
 
-from __future__ import annotations
-
 import ctypes
 import tempfile
 import warnings

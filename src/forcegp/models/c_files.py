@@ -1,7 +1,5 @@
 """The files of a model as C99: its program, the header, and what is written beside them."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import re
 from collections.abc import Iterator, Mapping, Sequence

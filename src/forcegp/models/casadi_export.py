@@ -5,8 +5,6 @@ products of matrices (MX), whose size does not grow with the derivatives. CasADi
 and only here.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What fits of all models share: checks of the data and numbers that they are given, several seeded starts."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence

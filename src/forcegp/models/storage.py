@@ -5,8 +5,6 @@ another system (`with_system`) has `target.urdf`, too, the robot there. The fold
 parameters; loading runs the same conditioning as fitting, so predictions are the same.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence

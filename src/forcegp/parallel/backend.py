@@ -297,7 +297,8 @@ class _Processes(Workers):
             died = [task for future, task in tasks if isinstance(future.exception(), TerminatedWorkerError)]
             if died:
                 self._begin_again(died)
-            whole = [(task.key, _with_warnings(future)) for future, task in tasks if task not in died]
+            alive = [(task.key, future) for future, task in tasks if task not in died]
+            whole = [(key, each if each.exception() is not None else replayed(*each.result())) for key, each in alive]
             if whole:
                 return whole
 
@@ -342,7 +343,3 @@ class _Processes(Workers):
         )
         for task in tasks:
             self._begin(task)
-
-
-def _with_warnings(future: Future[Any]) -> Future[Any]:
-    return future if future.exception() is not None else replayed(*future.result())

@@ -1,7 +1,5 @@
 """`Ray`: the machines of a Ray cluster."""
 
-from __future__ import annotations
-
 import inspect
 import logging
 import os

@@ -1,7 +1,5 @@
 """Kernels of the built-in priors, whose parameters are searched on a log scale: stationary ones, weights, friction."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

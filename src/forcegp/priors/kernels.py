@@ -9,8 +9,6 @@ Terms of a sum have log-normal priors on their variances: beside a linear kernel
 1e27 times the noise. A kernel by itself has none, for nothing competes with it.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Priors by name, as commands and quick scripts give them, and as stored models hold them."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

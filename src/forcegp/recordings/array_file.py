@@ -1,7 +1,5 @@
 """Files that hold arrays by name, and the first of them: NumPy archives (.npz)."""
 
-from __future__ import annotations
-
 import fnmatch
 import math
 import re

@@ -1,7 +1,5 @@
 """CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow in pieces."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

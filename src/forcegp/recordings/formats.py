@@ -1,7 +1,5 @@
 """Which reader reads which file: `open_source`; and several files that make up one recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path

@@ -1,7 +1,5 @@
 """HDF5 files of any layout, MATLAB files of version 7.3 (which are HDF5), and those of versions 5 to 7 by scipy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import cached_property

@@ -1,7 +1,5 @@
 """`import_recordings`: from log files to one dataset file, whatever their format and size."""
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence

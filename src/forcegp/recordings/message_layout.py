@@ -4,8 +4,6 @@ ROS 2 messages are CDR (OMG XTypes 1.3, 7.4: a header of four bytes, then values
 after that header); ROS 1 messages are the same without header, alignment and zero bytes at the end of texts.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Parquet files, and folders of them as LeRobot writes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -49,7 +47,7 @@ class ParquetFile(Source):
             for field in file.schema_arrow:
                 if _is_number(field.type):
                     self._scalars[field.name] = field.name
-                elif _is_list(field.type) and _is_number(field.type.value_type):
+                elif any(is_list(field.type) for is_list in LISTS) and _is_number(field.type.value_type):
                     lists.append(field.name)
             for name in lists:
                 first = next(file.iter_batches(1, columns=[name])).column(0)[0]
@@ -120,10 +118,7 @@ def _is_number(kind: pyarrow.DataType) -> bool:
     return types.is_floating(kind) or types.is_integer(kind)
 
 
-def _is_list(kind: pyarrow.DataType) -> bool:
-    return types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
-
-
+LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
 INFO = Path("meta") / "info.json"
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 LARGEST_INFO = 16 * 2**20  # bytes

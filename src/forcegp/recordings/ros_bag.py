@@ -5,8 +5,6 @@ read chunk by chunk instead, which takes a fraction of the time; every other bag
 `mcap_chunks` uses what `rosbags` does not promise to keep.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

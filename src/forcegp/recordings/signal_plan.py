@@ -1,7 +1,5 @@
 """A mapping applied to a table: which combination of its columns each joint's signals are."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

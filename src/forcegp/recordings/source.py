@@ -1,7 +1,5 @@
 """`Source`: a log file as a table of named columns of numbers, read in pieces; how much a compressed one may hold."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import re

@@ -10,8 +10,6 @@ inverse dynamics ID (implicit differentiation; Carpentier & Mansard, "Analytical
 algorithms", RSS 2018). The factor and the accelerations are "kept" by the program of the value, if it is asked to.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -13,9 +13,8 @@ and 5) with their recursions over the tree written as products with the (n, n) d
 
 Tensors over joints or bodies have shape (n, rows, columns, batch): joints lead, so that sums over the tree are single
 matrix products; the batch, flattened to one dimension, trails, so that products of thousands of 4x4 matrices are
-vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the batch in front).
-All functions compose differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated
-differentiation apply.
+vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the batch in front). All functions compose
+differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated differentiation apply.
 """
 
 from __future__ import annotations

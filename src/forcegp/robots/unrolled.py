@@ -16,8 +16,6 @@ the wrench of the composite body under A of one unit of joint j (Featherstone, "
 ch. 5 and 6), carried to the joints above. Being linear in P, both are polynomials of degree one in the inertias.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Format: http://wiki.ros.org/urdf/XML. Defaults are those of the format (origin: 
 written back).
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from dataclasses import dataclass

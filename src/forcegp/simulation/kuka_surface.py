@@ -1,7 +1,5 @@
 """The `kuka-surface` scenario: an iiwa slides its tool on a surface with friction (after Rath, Geist, Trimpe 2021)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version

@@ -6,8 +6,6 @@ A name is an entry of `CANDIDATES`, a way to identify the system (`identified-to
     CANDIDATES["mine"] = Candidate("what it is", "black box", fit_mine)
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One comparison: what is compared on what."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """Figures of a comparison: errors per joint, calibration, and errors of predicted motions against their length."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

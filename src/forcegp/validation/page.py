@@ -1,7 +1,5 @@
 """The page of a comparison: every number on it comes from the document of results."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any

@@ -61,7 +61,7 @@ class PairedTest:
     @property
     def outcome(self) -> str:
         """`better`, `worse` or `undecided`."""
-        equal = _equal(self.score)
+        equal = 0.0 if self.score == "nlpd" else 1.0  # where both are equal
         if self.interval is None or self.interval[0] <= equal <= self.interval[1]:
             return "undecided"
         return "better" if self.interval[1] < equal else "worse"
@@ -86,11 +86,6 @@ class PairedTest:
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
         return {**asdict(self), "verdict": self.outcome, "sentence": self.sentence}
-
-
-def _equal(score: str) -> float:
-    """The value where both are equal."""
-    return 0.0 if score == "nlpd" else 1.0
 
 
 def _formatted(score: str, value: float) -> str:

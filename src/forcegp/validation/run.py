@@ -1,7 +1,5 @@
 """`validate`: compute what is missing of a comparison, and write its page, figures and numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Plots of a log: what a check found, and the spectra before and after preparation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

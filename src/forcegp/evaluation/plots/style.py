@@ -1,7 +1,5 @@
 """What all figures share: colours that everyone can distinguish, quiet axes, names, units, and whole PNG files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`IndependentGP`: one Gaussian process per joint acceleration, without physics; the paper's baseline "GP"."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar

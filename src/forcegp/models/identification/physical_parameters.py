@@ -215,9 +215,8 @@ class PhysicalParameters:
     def tensors(self, z: Float[Tensor, "k"]) -> dict[str, Tensor]:
         """The parameters that `MarginalLikelihood` understands, differentiable in z.
 
-        Coefficients of one force that are learned in several groups are joined.
-        Raises NumericalError for values beyond `FARTHEST`, so that a search turns back: data that do not inform a
-        parameter let it run away.
+        Coefficients of one force that are learned in several groups are joined. Raises NumericalError for values beyond
+        `FARTHEST`, so that a search turns back: data that do not inform a parameter let it run away.
         """
         farthest = float((self.transform @ z).detach().abs().amax()) if len(z) else 0.0
         if not farthest <= FARTHEST:

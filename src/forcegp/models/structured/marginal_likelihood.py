@@ -75,14 +75,10 @@ def _one_per_latent(what: str, given: Any, names: Any) -> tuple[Any, ...]:
     return tuple(given)
 
 
-def _differ(wanted: int | None, size: int) -> bool:
-    return wanted not in (None, size)
-
-
 def _tensor(what: str, given: Any, shape: tuple[int | None, ...], wanted: str) -> Tensor:
     if not isinstance(given, Tensor):
         raise InvalidInput(f"{what} is a {type(given).__name__}; it must be a float64 tensor {wanted}")
-    if len(given.shape) != len(shape) or any(map(_differ, shape, given.shape)):
+    if len(given.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, given.shape, strict=True)):
         sizes = ", ".join("any" if size is None else str(size) for size in shape)
         raise InvalidInput(f"{what} has shape {tuple(given.shape)}; it must be ({sizes}), that is {wanted}")
     if given.dtype != torch.float64:
@@ -193,8 +189,7 @@ class MarginalLikelihood:
         if variances.numel() and not largest > 0.0:
             raise InvalidInput(
                 "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was "
-                "measured and not computed from "
-                "the model itself"
+                "measured and not computed from the model itself"
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         dimensions = tuple(z.shape[-1] for z in features)

@@ -215,7 +215,8 @@ class StructuredPosterior(Posterior):
             given = prior.features(self.likelihood.dynamics(self.parameters))[index]
             visited = torch.stack([given.amin(0), given.amax(0)]) if given.shape[-1] else given[:2]
             z = _curve_features(latent, features, visited, points)
-            shift, scale = (part[index] for part in (self.likelihood.standardization.shift, self._scales))
+            standardization = self.likelihood.standardization
+            shift, scale = (part[index] for part in (standardization.shift, standardization.scale))
             mean, variance = self.latent.one(index, (z - shift) / scale)
         labels = prior.feature_names(robot)
         plain = tuple(f"feature {k}" for k in range(z.shape[-1]))
@@ -233,10 +234,6 @@ class StructuredPosterior(Posterior):
     def latent_names(self) -> tuple[str, ...]:
         """The processes that the prior is made of."""
         return self.model.prior.latent_names(self.model.system.robot)
-
-    @property
-    def _scales(self) -> tuple[Tensor, ...]:
-        return self.likelihood.standardization.scale
 
     @override
     def with_system(self, system: MechanicalSystem) -> StructuredPosterior:

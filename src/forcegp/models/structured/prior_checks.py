@@ -1,7 +1,5 @@
 """What data cannot teach a prior, and whether they bear out the contacts: checked before anything is fitted."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 

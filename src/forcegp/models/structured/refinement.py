@@ -8,8 +8,6 @@ Fitted again under an expected friction, every round is an exact fit of a legiti
 benchmarks.force_pictures contact-friction` draws the curve with and without.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping
@@ -96,7 +94,9 @@ def on_all_rows(
     `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
     """
     reference = fitted.training
-    training = reference if len(rows) == len(reference.q) else _training(rows, reference)
+    training = reference
+    if len(rows) != len(reference.q):
+        training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
     likelihood = replace(fitted.likelihood, training=training)
     fitted.model.system.check_states(training.q, training.v, training.u)
     if training is not reference:
@@ -118,10 +118,6 @@ def on_all_rows(
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
         return refined(posterior, hyperprior, report)
-
-
-def _training(rows: Dataset, reference: TrainingData) -> TrainingData:
-    return replace(TrainingData.of(rows, reference.q.device), reference=reference)
 
 
 def _leaves_too_much_out(latent: LatentPosterior, engine: Engine) -> bool:

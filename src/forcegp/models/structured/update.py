@@ -1,7 +1,5 @@
 """A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
