@@ -23,7 +23,8 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
+from operator import or_
 from pathlib import Path
 
 import numpy as np
@@ -286,13 +287,24 @@ class RowFunction:
             pointers = _pointers(count, (*inputs, *filled))
             return self._evaluate(bounds[thread], bounds[thread + 1], self._tables, *pointers)
 
-        found = 0
-        with ThreadPoolExecutor(threads) as pool:  # ctypes lets other threads run meanwhile
-            for bits in pool.map(part, range(threads)):
-                found |= bits
+        found = reduce(or_, in_threads(part, threads))
         for k, values in sums.items():
             outputs[k].copy_(values.sum(0))
         return found
+
+
+def in_threads(part: Callable[[int], int], count: int) -> list[int]:
+    """part(0), part(1), ... at once, the first in this thread; ctypes lets other threads run meanwhile."""
+    if count == 1:
+        return [part(0)]
+    others = [_pool(count - 1, os.getpid()).submit(part, k) for k in range(1, count)]
+    return [part(0), *(other.result() for other in others)]
+
+
+@cache
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads that stay, for to start them takes as long as many states; those of a parent process are not there."""
+    return ThreadPoolExecutor(threads)
 
 
 def _pointers(count: int, rows: Iterable[Tensor]) -> list[int]:

@@ -169,16 +169,28 @@ class Predictor(Summary):
         an implicit step is not found.
         """
         states, single = self._states(q, v, u)
-        state = stepped(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
+        state = self._stepped(torch.cat(states, dim=-1), dt, integrator)
         q, v = (state[0] if single else state).split(self.nv, dim=-1)
         return q, v
+
+    def _stepped(self, x: Tensor, dt: float, integrator: str) -> Tensor:
+        """[q, v] after a step from the rows x = [q, v, u]; implicit ones by the compiled loop where that finds it."""
+        if integrator == "implicit-midpoint" and self.code is not None and not x.requires_grad and len(x):
+            q, v, u = x.chunk(3, dim=-1)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NumericalWarning)  # of a step that is not found, which is an error here
+                motion = self.rollouts(q, v, u[:, None], dt, integrator=integrator)
+            if bool(motion.v.isfinite().all()):
+                return torch.cat([motion.q[:, 1], motion.v[:, 1]], dim=-1)
+        return stepped(self.mean, self.posterior.system, x, dt, integrator)
 
     def linearize_step(
         self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
     ) -> StepLinearization:
         """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph."""
         states, single = self._states(q, v, u)
-        linear = linearized_step(self.mean, self.posterior.system, torch.cat(states, dim=-1), dt, integrator)
+        system, rows = self.posterior.system, torch.cat(states, dim=-1)
+        linear = linearized_step(self._stepped, self.linearize, system, rows, dt, integrator)
         return StepLinearization(*(part[0] for part in linear)) if single else linear
 
     def rollouts(
