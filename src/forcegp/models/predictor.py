@@ -299,6 +299,7 @@ class Predictor(Summary):
     def compiled(self, kind: str) -> RowFunction | None:
         """The program "mean", "linearize" or "covariance", made now if it is not there; None where torch computes."""
         if self.code is not None and kind not in self._functions:
+            require_plain((), "a compiled predictor", INSTEAD_OF_TRANSFORMS)  # no code can be made or loaded under them
             self._functions[kind] = self._made(lambda code: code.function(kind))
         return self._functions.get(kind)
 
