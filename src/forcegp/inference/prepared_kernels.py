@@ -13,8 +13,9 @@ whitened data with f(z) and L L^T = T theirs. With orthonormal columns B (n, R),
 
 is the covariance given only the R numbers (L^-T B)^T t of the data t: that of a Gaussian process which has seen less.
 So it is never below the exact one (the difference V^T (I - B B^T) V is positive semidefinite) and needs R instead of n
-numbers per latent and centre. B holds the leading left singular vectors of V at sample states, each weighted by what
-it does to the standard deviations there.
+numbers per latent and centre. B holds leading left singular vectors of V at sample states, each weighted by what it
+does to the standard deviations there. They are found a block at a time, where most is missing, until they are enough:
+up to a tenth more than the best ones, in a third of the time that a singular value decomposition takes.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPoste
 
 ROUNDING = 1e-7
 """Standard deviations below this fraction of the prior's are rounding: nothing there can be uncertain."""
-FEWEST, SMALL, ITERATIONS = 256, 1000, 2
-"""Singular vectors that are tried first, rows of a matrix of which all are computed at once, and power iterations."""
+DIRECTIONS = 128
+"""Of so many directions the leading ones are computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,41 +80,34 @@ def compress(
     It is `largest` where more would be needed. B is chosen at the states of `sample`.
     """
     with torch.no_grad():
-        D, _ = _directions(latent, sample)
-        at, total = _directions(latent, check)
-        most, count = min(largest, *D.shape), FEWEST
-        while True:
-            B = _leading(D, min(count, most))
-            excess = (total - (B.mT @ at).square_().cumsum_(0)).clamp_min_(0.0)  # in units of the exact variance
-            enough = torch.nonzero((1.0 + excess.amax(1)).sqrt() - 1.0 <= tolerance)
-            if len(enough) or count >= most:
-                break
-            count *= 2
-        rank = int(enough[0]) + 1 if len(enough) else most
-        S = latent.system.factor.solve_upper(B[:, :rank].contiguous())
+        (D, left), (at, total) = _directions(latent, sample), _directions(latent, check)
+        B, excess = D.new_zeros(0, D.shape[1]), total  # in units of the exact variance
+        most, allowed = min(largest, *D.shape), (1.0 + tolerance) ** 2 - 1.0
+        while len(B) < most and float(excess.amax()) > allowed:
+            # the leading half of the directions of which most is missing: what is small among them is better chosen
+            # among all in the next round
+            X = D[left.topk(min(DIRECTIONS, len(left))).indices]
+            for _ in range(2):  # once leaves rounding
+                X = X - (X @ B.mT) @ B
+            U = torch.linalg.svd(X, full_matrices=False)[2][: min(DIRECTIONS // 2, most - len(B))]
+            U = torch.linalg.qr((U - (U @ B.mT) @ B).mT)[0].mT
+            left -= (U @ D.mT).square_().sum(0)
+            excess = excess - (U @ at.mT).square_().sum(0)
+            B = torch.cat([B, U])
+        # in the order of what they explain at all states, fewer of the same are enough
+        B = torch.linalg.svd(torch.linalg.qr(D @ B.mT, mode="r")[1])[2] @ B
+        excess = (total - (B @ at.mT).square_().cumsum_(0)).clamp_min_(0.0)
+        enough = torch.nonzero(excess.amax(1) <= allowed)
+        B = B[: int(enough[0]) + 1] if len(enough) else B
+        S = latent.system.factor.solve_upper(B.mT.contiguous())
         C = latent.system.deflation.C
-        factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], rank))
+        factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], -1))
         chosen = tuple(factors[list(group)].contiguous() for group in groups)
-    return CompressedCovariance(chosen, (1.0 + excess[rank - 1]).sqrt() - 1.0)
+    return CompressedCovariance(chosen, (1.0 + excess[len(B) - 1]).sqrt() - 1.0)
 
 
-def _leading(D: Float[Tensor, "n m"], count: int) -> Float[Tensor, "n count"]:
-    """Leading left singular vectors of D; where D is large, nearly, by subspace iteration.
-
-    Halko, Martinsson & Tropp, "Finding structure with randomness" (2011), algorithms 4.4 and 5.3.
-    """
-    if len(D) > max(SMALL, 2 * count):
-        X = torch.randn(D.shape[1], count, dtype=D.dtype, generator=torch.Generator().manual_seed(0)).to(D.device)
-        for _ in range(ITERATIONS):
-            X = D.mT @ torch.linalg.qr(D @ X)[0]
-        X = torch.linalg.qr(D @ X)[0]
-        return X @ _leading(X.mT @ D, count)
-    # not of D D^T: squared, what matters where nearly all is known would hide the rest
-    return torch.linalg.svd(torch.linalg.qr(D.mT, mode="r")[1].mT)[0][:, :count]
-
-
-def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "n _"], Float[Tensor, " _"]]:
-    """V W^T over the exact standard deviations, one column per state and entry of y, and the squared columns' sums."""
+def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "_ n"], Float[Tensor, " _"]]:
+    """W V^T over the exact standard deviations, one row per state and entry of y, and the rows' squared norms."""
     C = latent.system.deflation.C
     count, rank, latents = C.shape
     points, height = len(sample.W), max(1, BLOCK_BYTES // max(1, 8 * count * rank * latents))
@@ -123,16 +117,22 @@ def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "
         cross = torch.stack(
             [k.cross(z, at) for k, z, at in zip(latent.kernels.dense, features, latent.features, strict=True)]
         )
-        V = torch.einsum("cnj,jac->jacn", cross, C).reshape(count * rank, -1)
-        V = latent.system.factor.solve_lower(V).reshape(count * rank, latents, -1)
-        y = torch.einsum("acn,nkc->ank", V, W)
+        # W = Y Z with as few rows Z as it has rank: contacts and few latents leave fewer columns to solve for
+        Y, scales, Z = torch.linalg.svd(W, full_matrices=False)
+        needed = max(1, int((scales > ROUNDING**2 * scales.amax()).sum(1).max()))
+        Z = (scales[..., None] * Z)[:, :needed]
+        weighted = cross.permute(2, 0, 1)[..., None] * Z.permute(2, 0, 1)  # (N, C, n, needed)
+        K = torch.bmm(C, weighted.flatten(2)).flatten(0, 1)
+        V = latent.system.factor.solve_lower(K).reshape(len(K), -1, needed)
+        y = torch.bmm(Y[..., :needed], V.permute(1, 2, 0))
         prior = torch.stack([k.diagonal(z) for k, z in zip(latent.kernels.dense, features, strict=True)], dim=-1)
-        variance = torch.einsum("nkc,nc->nk", W.square(), prior)
-        left = (variance - y.square().sum(0)).sqrt()
+        variance, known = torch.einsum("nkc,nc->nk", W.square(), prior), torch.linalg.vector_norm(y, dim=-1)
+        left = (variance - known.square()).sqrt()
         counts = left > ROUNDING * variance.sqrt()  # False where NaN
-        found.append((y / torch.where(counts, left, 1.0))[:, counts])
-    D = torch.cat(found, dim=1)
-    return D, D.square().sum(0)
+        y /= left[..., None]
+        found.append((y.flatten(0, 1) if counts.all() else y[counts], (known / left)[counts]))
+    D, known = zip(*found, strict=True)
+    return torch.cat(D), torch.cat(known).square()
 
 
 @dataclass(frozen=True, eq=False)
