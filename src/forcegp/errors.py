@@ -1,7 +1,5 @@
 """One tree of errors. Every message says what was given, what is allowed and what to do."""
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 from collections.abc import Iterable, Iterator, Mapping

@@ -15,8 +15,6 @@ A body is often several links. With the factors of its old and new pseudo-inerti
 possible, and links that were equal stay equal. Motions show nothing but their sum.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import ClassVar
 

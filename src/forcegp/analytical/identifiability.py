@@ -20,8 +20,6 @@ calculation of the base inertial parameters of robots", J. Robotic Systems 1991)
 independent columns, each divided by its norm, measures how well a motion excites them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,7 +95,7 @@ class BaseParameters:
     condition: float
 
     @classmethod
-    def of(cls, regressor: Float[np.ndarray, "rows p"], names: tuple[str, ...]) -> BaseParameters:
+    def of(cls, regressor: Float[np.ndarray, "rows p"], names: tuple[str, ...]) -> "BaseParameters":
         """From the stacked rows of a regressor. Raises InvalidInput where it is zero or not finite."""
         if not np.isfinite(regressor).all():
             raise InvalidInput("the regressor is not finite; check q, v and a for NaN and infinity.")

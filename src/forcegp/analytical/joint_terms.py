@@ -4,8 +4,6 @@ A term adds ``f(parameters; v) + B(parameters) a`` to the torque that a motion n
 system (which has the opposite sign). A new friction law is one entry in `LAWS`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

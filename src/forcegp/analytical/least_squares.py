@@ -13,8 +13,6 @@ so joints of small inertia count less where the noise is one of forces. The two 
 largest likelihood (the model of `forcegp.models.Noise`). One level per joint would let rows of large M^-1 decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -40,7 +38,7 @@ class NoiseLevels:
     force: Float[np.ndarray, " nv"]
 
     @classmethod
-    def of(cls, residual: Float[np.ndarray, "rows nv"], M: Float[np.ndarray, "rows nv nv"]) -> NoiseLevels:
+    def of(cls, residual: Float[np.ndarray, "rows nv"], M: Float[np.ndarray, "rows nv nv"]) -> "NoiseLevels":
         """Those of largest likelihood, by L-BFGS on their logarithms, each at least `LEAST` of the whole."""
         chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
         r, inverse = (torch.as_tensor(x) for x in (residual[chosen], np.linalg.inv(M[chosen])))

@@ -16,8 +16,6 @@ Friction g(x; v) |u| under load makes u the solution of u = z + g |u|, with z al
 The measured |u| in its place would explain the measured torque by itself: g tends to 1, whatever the robot is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """`AnalyticalIdentification`: what was estimated, how sure it is, and what it predicts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """The log as every check sees it, and what a check found."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -147,7 +145,7 @@ class CheckInput:
         return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
 
     @classmethod
-    def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> CheckInput:
+    def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> "CheckInput":
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
@@ -182,7 +180,7 @@ class CheckInput:
         )
 
     @classmethod
-    def quick(cls, dataset: Dataset, system: MechanicalSystem | None) -> CheckInput:
+    def quick(cls, dataset: Dataset, system: MechanicalSystem | None) -> "CheckInput":
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
         system = dataset.system if system is None else system
         if dataset.time_ordered and not move_on(dataset):

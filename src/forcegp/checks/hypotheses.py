@@ -4,8 +4,6 @@ Each hypothesis corrects one error. The hypothesis under which inverse dynamics 
 leaves far less unexplained than the log as it is; then the next is sought, on top of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any

@@ -6,8 +6,6 @@ every value, and the value is found that leaves least of all torques unexplained
 `forcegp.checks.torques`, but with the torques of the URDF taken as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 

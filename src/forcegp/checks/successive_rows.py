@@ -1,7 +1,5 @@
 """What successive rows show, without a filter: drop-outs, running means, and the noise of the acceleration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

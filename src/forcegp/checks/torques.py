@@ -5,8 +5,6 @@ s, I, d, c >= 0, by non-negative least squares (Lawson & Hanson 1974): friction 
 negative factor was logged with a wrong sign.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,17 +34,17 @@ class Correction:
     torque_factor: Float[np.ndarray, " nv"]
 
     @classmethod
-    def none(cls, nv: int) -> Correction:
+    def none(cls, nv: int) -> "Correction":
         """Everything stays."""
         return cls(
             motion_from=np.arange(nv), motion_factor=np.ones(nv), torque_from=np.arange(nv), torque_factor=np.ones(nv)
         )
 
-    def motion(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> Correction:
+    def motion(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> "Correction":
         """Then motions in another order, by further factors."""
         return replace(self, motion_from=self.motion_from[order], motion_factor=self.motion_factor[order] * factor)
 
-    def torque(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> Correction:
+    def torque(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> "Correction":
         """Then torques in another order, by further factors."""
         return replace(self, torque_from=self.torque_from[order], torque_factor=self.torque_factor[order] * factor)
 

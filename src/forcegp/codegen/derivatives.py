@@ -4,8 +4,6 @@
 most of them are structurally zero (Griewank & Walther, "Evaluating Derivatives", 2008, ch. 3).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

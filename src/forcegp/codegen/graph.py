@@ -7,8 +7,6 @@ with zero, sums of known numbers) is never recorded, and negations move to where
 numbers.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
@@ -74,7 +72,7 @@ class Graph:
         self._record(("constant", 1.0))
         self.inputs = [self._record(("input", position)) for position in range(inputs)]
 
-    def more_inputs(self, count: int) -> list[Expression]:
+    def more_inputs(self, count: int) -> "list[Expression]":
         """Scalars that are given when the program runs, after those before."""
         added = [self._record(("input", len(self.inputs) + k)) for k in range(count)]
         self.inputs += added
@@ -105,7 +103,7 @@ class Graph:
         """One output of a call."""
         return self._record(("output", call, position))
 
-    def copier(self, other: Graph, known: dict[int, int]) -> Copier:
+    def copier(self, other: "Graph", known: dict[int, int]) -> "Copier":
         """What copies nodes of another graph to this one."""
         return Copier(self, other, known)
 
@@ -244,45 +242,45 @@ class Expression:
     def __init__(self, graph: Graph, node: int) -> None:
         self.graph, self.node = graph, node
 
-    def _apply(self, operation: str, *operands: Expression | float) -> Expression | float:
+    def _apply(self, operation: str, *operands: "Expression | float") -> "Expression | float":
         node = self.graph.apply(operation, *(node_of(self.graph, x) for x in operands))
         value = self.graph.value(node)
         return Expression(self.graph, node) if value is None else value
 
-    def __add__(self, other: Expression | float) -> Expression | float:
+    def __add__(self, other: "Expression | float") -> "Expression | float":
         return self._apply("add", self, other)
 
     __radd__ = __add__
 
-    def __sub__(self, other: Expression | float) -> Expression | float:
+    def __sub__(self, other: "Expression | float") -> "Expression | float":
         return self._apply("subtract", self, other)
 
-    def __rsub__(self, other: float) -> Expression | float:
+    def __rsub__(self, other: float) -> "Expression | float":
         return self._apply("subtract", other, self)
 
-    def __mul__(self, other: Expression | float) -> Expression | float:
+    def __mul__(self, other: "Expression | float") -> "Expression | float":
         return self._apply("multiply", self, other)
 
     __rmul__ = __mul__
 
-    def __truediv__(self, other: Expression | float) -> Expression | float:
+    def __truediv__(self, other: "Expression | float") -> "Expression | float":
         return self._apply("divide", self, other)
 
-    def __rtruediv__(self, other: float) -> Expression | float:
+    def __rtruediv__(self, other: float) -> "Expression | float":
         return self._apply("divide", other, self)
 
-    def __neg__(self) -> Expression | float:
+    def __neg__(self) -> "Expression | float":
         return self._apply("negate", self)
 
-    def exp(self) -> Expression | float:
+    def exp(self) -> "Expression | float":
         """Exponential."""
         return self._apply("exp", self)
 
-    def sin(self) -> Expression | float:
+    def sin(self) -> "Expression | float":
         """Sine."""
         return self._apply("sin", self)
 
-    def cos(self) -> Expression | float:
+    def cos(self) -> "Expression | float":
         """Cosine."""
         return self._apply("cos", self)
 

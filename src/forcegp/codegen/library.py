@@ -8,8 +8,6 @@ C of our own and not `torch.compile`: of the same scalars inductor made code in 
 which runs six times faster (`python -m benchmarks.compiled_dynamics inductor`), and this cache loads in 2 ms.
 """
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import os
@@ -140,7 +138,7 @@ class VectorUnit:
     options: tuple[str, ...]
 
     @classmethod
-    def of_this_processor(cls) -> VectorUnit:
+    def of_this_processor(cls) -> "VectorUnit":
         """What torch found."""
         return cls(*VECTOR_UNITS.get(torch.backends.cpu.get_cpu_capability(), (2, ())))
 

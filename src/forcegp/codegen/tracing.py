@@ -8,8 +8,6 @@ A second implementation of each force is not needed: surfaces, known forces and 
 they stand. At one state the cost of rigid-body dynamics is that of calling torch operations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -73,7 +71,7 @@ def trace(
 class _InsideTorch(StraightLineAlgebra):
     """Refuses what takes recorded numbers out of torch, where they would be constants without a word."""
 
-    def __init__(self, recorded: _Recording) -> None:
+    def __init__(self, recorded: "_Recording") -> None:
         super().__init__()
         self.recorded = recorded
 
@@ -91,7 +89,7 @@ class _Recording(TorchDispatchMode):
         super().__init__()
         self.graph, self._known = graph, {}
 
-    def note(self, tensor: Tensor, numbers: _Numbers) -> None:
+    def note(self, tensor: Tensor, numbers: "_Numbers") -> None:
         """The nodes of a tensor, which is kept alive so that no other gets its id."""
         self._known[id(tensor)] = tensor, numbers
 

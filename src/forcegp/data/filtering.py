@@ -1,7 +1,5 @@
 """Low-pass filtering, differentiation and resampling of logs; every function returns new arrays or a new Dataset."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """From a raw log to rows that can be learned from, and what that costs: filter, align, differentiate, thin out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -85,7 +83,7 @@ class Preparation:
         """Whether the rows stay as they are."""
         return self == Preparation(order=self.order, differentiate=self.differentiate)
 
-    def resolved(self, dataset: Dataset) -> Preparation:
+    def resolved(self, dataset: Dataset) -> "Preparation":
         """The same with numbers in place of "auto". Raises as `motion_spectrum` and `estimate_delay`."""
         return _resolve(self, dataset)[0]
 
@@ -94,7 +92,7 @@ class Preparation:
         chosen = self.resolved(dataset)
         return _filtered(chosen, dataset).rows(_kept(chosen, dataset))
 
-    def apply(self, dataset: Dataset) -> Prepared:
+    def apply(self, dataset: Dataset) -> "Prepared":
         """The prepared Dataset and its price.
 
         `truth` and `noise_std` are dropped as `low_pass` and `differentiated` drop them. Raises DatasetError for rows

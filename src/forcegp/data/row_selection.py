@@ -4,8 +4,6 @@ Neighbouring rows of one motion are nearly equal: a random split of rows tests m
 therefore by episode, and `require_disjoint` refuses a pair that overlaps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -9,8 +9,6 @@ knee. Just above it lies the noise floor. The cut-off is where the power is twic
 are equal: the best linear filter has the gain 1/2 there (Wiener 1949), and so has `zero_phase_low_pass` at its cut-off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

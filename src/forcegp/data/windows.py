@@ -11,8 +11,6 @@ unknown forces, that holds exactly; no filter comes before. White noise of the s
 the norm of the weights as its standard deviation in units of the signal's.
 """
 
-from __future__ import annotations
-
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

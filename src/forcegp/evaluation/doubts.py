@@ -1,7 +1,5 @@
 """Sentences that belong beside the scores of a model: what a reader would have to find out otherwise."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Iterator, Mapping

@@ -4,8 +4,6 @@ A Dataset holds the truth of a force by its name, `Q_U.<name>` and `force.<name>
 truth none is compared, since only their sum is true then.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -58,7 +56,7 @@ class ForceScore:
         mean: Float[np.ndarray, "rows k"],
         variance: Float[np.ndarray, "rows k"],
         truth: Float[np.ndarray, "rows k"],
-    ) -> ForceScore:
+    ) -> "ForceScore":
         """Scores of a prediction."""
         error = mean - truth
         size = float(np.sqrt(np.square(truth).mean()))

@@ -1,7 +1,5 @@
 """Scores of predictions as functions of arrays, rows first, one column per joint or contact; medians over seeds."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Predictions for every row of a Dataset as numpy arrays, made in blocks so that memory stays bounded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, fields

@@ -11,8 +11,6 @@ d = sum D_b / sum n_b per row, the standard error of d over B blocks is
 (the linearised standard error of a ratio; Cochran 1977, "Sampling techniques", chapter 6).
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence

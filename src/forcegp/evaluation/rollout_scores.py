@@ -1,7 +1,5 @@
 """`RolloutErrors`: how far rollouts are from what was recorded, over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

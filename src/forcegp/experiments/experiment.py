@@ -1,7 +1,5 @@
 """What every experiment is: a typed configuration with its jobs, its summary, its figures and its text."""
 
-from __future__ import annotations
-
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -41,12 +39,12 @@ class Experiment(ABC):
     data: DataSettings
     points: Any
 
-    def with_points(self, points: Sequence[int]) -> Experiment:
+    def with_points(self, points: Sequence[int]) -> "Experiment":
         """The same with other numbers of training points; an experiment at one number takes the largest."""
         given = tuple(sorted(set(points)))
         return dataclasses.replace(self, points=given[-1] if isinstance(self.points, int) else given)
 
-    def with_seeds(self, seeds: Sequence[int]) -> Experiment:
+    def with_seeds(self, seeds: Sequence[int]) -> "Experiment":
         """The same on other trajectories."""
         given = tuple(dict.fromkeys(seeds))
         changed = {"seed": given[0], "seeds": given, "seeds_many_points": given}

@@ -1,7 +1,5 @@
 """The jobs of the extrapolation: split rows by where and how fast the tool is, fit, and score on both sides."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

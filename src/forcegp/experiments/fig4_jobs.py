@@ -1,7 +1,5 @@
 """The jobs of figure 4: roll models out from rows of a test trajectory and compare with what was recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -12,8 +12,6 @@ and y_i less its prediction is L_i (U_i e_i + remainder_i), of covariance L_i (I
 Sigma_ii the block of (T^-1_II)^-1 that belongs to row i. Hyper-parameters stay those of all rows.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,7 +54,7 @@ class LeaveOut:
         return float(self.log_density.sum())
 
     @classmethod
-    def of_independent_outputs(cls, parts: Sequence[LeaveOut]) -> LeaveOut:
+    def of_independent_outputs(cls, parts: "Sequence[LeaveOut]") -> "LeaveOut":
         """The same rows and blocks, from models of one output each that share nothing."""
         first = parts[0]
         return cls(

@@ -5,8 +5,6 @@ two copies of 288 MB, and scipy's `dpotri` was measured 1.8 times faster than `t
 use torch.linalg.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass

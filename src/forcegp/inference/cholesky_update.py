@@ -17,8 +17,6 @@ wrongly of it (`leave_out`). Rows that the others predict already are worth noth
 is a step of Cholesky's algorithm on P, so that rows can be left out one after the other without another inversion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -11,8 +11,6 @@ Functions of the distance, linear and constant kernels, and those with an embedd
 (`kernel_matrices`) are evaluated here; every other kernel is called as it is, and once more in the backward pass.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -332,11 +330,11 @@ class LatentKernels(torch.nn.Module):
         """The unconstrained parameters by name, detached copies."""
         return {name: value.detach().clone() for name, value in self.named_parameters()}
 
-    def at(self, parameters: Mapping[str, Tensor]) -> LatentKernels:
+    def at(self, parameters: Mapping[str, Tensor]) -> "LatentKernels":
         """A copy that holds `parameters`, without gradients; this one is not changed."""
         return deepcopy(self).moved_to(parameters)
 
-    def moved_to(self, parameters: Mapping[str, Tensor]) -> LatentKernels:
+    def moved_to(self, parameters: Mapping[str, Tensor]) -> "LatentKernels":
         """These kernels themselves, which from now on hold `parameters`, without gradients: copies take long."""
         for name, value in self.named_parameters():
             value.requires_grad_(False)

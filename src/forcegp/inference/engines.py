@@ -10,8 +10,6 @@
 with N rows, r the rank of the mixing vectors, C latents and P points of all latents together.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -57,7 +55,7 @@ class ProblemSize:
     features: int
 
     @classmethod
-    def of(cls, terms: Terms) -> ProblemSize:
+    def of(cls, terms: Terms) -> "ProblemSize":
         """From the data; the rank is that of some of the rows."""
         W, features = terms.W, terms.features
         rows, outputs, latents = W.shape

@@ -23,8 +23,6 @@ processes"); D_i = I + sum_c C_ic C_ic^T (k_c(z_i, z_i) - |phi_c(z_i)|^2) gives 
 noise of their own, the fully independent training conditional of Snelson & Ghahramani (2006).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -124,7 +122,7 @@ class WeightSpace:
         C: Float[Tensor, "N r C"],
         t: Float[Tensor, "N r"],
         noise_precision: Float[Tensor, "N r r"] | None = None,
-    ) -> WeightSpace:
+    ) -> "WeightSpace":
         """Condition on all rows; None for the noise precision D^-1 is white noise.
 
         Time O(N P^2), memory O(P^2) and a block of rows. Raises NumericalError where the kernel matrix of the points
@@ -241,7 +239,7 @@ class InducingPosterior(LatentPosterior):
     space: WeightSpace
 
     @classmethod
-    def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> InducingPosterior:
+    def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> "InducingPosterior":
         """Condition on the data through at most `points` inducing points for each latent.
 
         Fewer where each latent leaves out less than its share of `tolerance`, see `left_out`.

@@ -7,8 +7,6 @@ compares it with others: a pivoted Cholesky factor of T is as good where its ran
 covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -174,7 +172,7 @@ class LowRankPlusDiagonal:
         C: Float[Tensor, "N r C"],
         t: Float[Tensor, "N r"],
         points: int,
-    ) -> LowRankPlusDiagonal:
+    ) -> "LowRankPlusDiagonal":
         """With `points` weights for each latent, at greedy pivots."""
         relevance = C.square().sum(1)
         pivots = tuple(
@@ -238,7 +236,7 @@ class IterativePosterior(LatentPosterior):
         solve_covariance: bool = False,
         start: Float[Tensor, "n 1"] | None = None,
         report: Iteration | None = None,
-    ) -> IterativePosterior:
+    ) -> "IterativePosterior":
         """Condition on the data.
 
         `points` of each latent for the preconditioner, `memory` bytes for kernel matrices that are kept, `start` an

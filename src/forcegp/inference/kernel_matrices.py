@@ -10,8 +10,6 @@ backward pass. A kernel class of anybody may have one of
 all differentiable in z and in the kernel's parameters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

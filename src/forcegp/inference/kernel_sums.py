@@ -11,8 +11,6 @@ that is one product per feature, and one exponential. Several states stand in th
 there is only one, several centres.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -83,7 +81,7 @@ class KernelSum:
         function: PairFunction,
         diagonal: Callable[[Tensor], Tensor],
         level: tuple[float, ...],
-    ) -> KernelSum:
+    ) -> "KernelSum":
         """Traced from the kernels less a constant `level` of each.
 
         Raises InvalidInput, naming the operation, for those that no graph holds.

@@ -7,8 +7,6 @@ is normal; those of a Matern and of the rational quadratic are normal with a ran
 & Williams 2006, sections 4.2.1 and 5.4.3). Terms without any k_i are drawn exactly.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -56,7 +54,7 @@ class KernelTerm:
     features: tuple[PointMap, ...] = ()
     factors: tuple[SpectralFactor, ...] = ()
 
-    def times(self, other: KernelTerm) -> KernelTerm:
+    def times(self, other: "KernelTerm") -> "KernelTerm":
         """The term of a product of two kernels."""
         return KernelTerm(self.scale * other.scale, self.features + other.features, self.factors + other.factors)
 
@@ -139,7 +137,7 @@ class DrawnTerm:
     @classmethod
     def draw(
         cls, term: KernelTerm, centers: Float[Tensor, "N d"], samples: int, count: int, generator: torch.Generator
-    ) -> DrawnTerm:
+    ) -> "DrawnTerm":
         """`count` frequencies for each function."""
         columns = term.columns(centers[:1]).shape[-1]
         embedded = [factor.embedding(centers) for factor in term.factors]

@@ -18,8 +18,6 @@ in one buffer of (rN)^2 doubles that becomes its own factor and its own inverse;
 rows, lower triangle only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

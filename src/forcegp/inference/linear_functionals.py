@@ -12,8 +12,6 @@ of size DN for D outputs and N functionals. There is no deflation: the direction
 functional. With n = 1 all of this is what `likelihood` and `posterior` compute.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +40,7 @@ class Functionals:
     log_noise: Float[Tensor, ""]
 
     @classmethod
-    def of(cls, weights: Float[Tensor, "N n"], terms: Terms) -> Functionals:
+    def of(cls, weights: Float[Tensor, "N n"], terms: Terms) -> "Functionals":
         """From the terms of the N n states, functional by functional; differentiable in all of them.
 
         Every state has its own residual, y_w - m_i for example, and its own noise covariance. Those of a functional are
@@ -139,7 +137,7 @@ class FunctionalPosterior(FactorizedPosterior):
     remedy: ClassVar[str] = "fit to accelerations, with StructuredGP.fit, for which single rows are what is observed"
 
     @classmethod
-    def condition(cls, kernels: LatentKernels, weights: Float[Tensor, "N n"], terms: Terms) -> FunctionalPosterior:
+    def condition(cls, kernels: LatentKernels, weights: Float[Tensor, "N n"], terms: Terms) -> "FunctionalPosterior":
         """Condition on the functionals of these terms (`Functionals.of`)."""
         with torch.no_grad():
             functionals = Functionals.of(weights, terms)

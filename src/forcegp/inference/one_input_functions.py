@@ -6,8 +6,6 @@ envelopes e(s) e(s') times a Matern of a monotone curve of s; products phi(s) ph
 friction kernel and Materns have an exact form, which two passes over the sorted centres prepare; others get a table.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -82,7 +80,7 @@ class OneInputFunctions:
         products = [math.prod((y[i] for i in factors), start=torch.ones_like(s)) for factors in self.envelopes]
         return torch.stack([p[:, None] * g for p, g in zip(products, levels, strict=True)]).sum(0)
 
-    def only(self, r: int) -> OneInputFunctions:
+    def only(self, r: int) -> "OneInputFunctions":
         """One of the functions."""
         return replace(self, polynomials=self.polynomials[:, r : r + 1], constants=self.constants[r : r + 1])
 

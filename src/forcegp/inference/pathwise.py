@@ -13,8 +13,6 @@ batched operation (`FunctionSamples`); sums and products of other kernels are dr
 Matern 1/2 of one input has too high frequencies for cosines and is drawn on a grid (`kernel_terms.DrawnTerm`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -49,7 +47,7 @@ class StackedKernels:
     training: Float[Tensor, "C N d"]
 
     @classmethod
-    def of(cls, latent: LatentPosterior) -> StackedKernels | None:
+    def of(cls, latent: LatentPosterior) -> "StackedKernels | None":
         """None if some kernel is not a scaled squared exponential, or if there are no latents."""
         parameters = [squared_exponential_parameters(kernel) for kernel in latent.kernels]
         if not parameters or any(found is None for found in parameters):
@@ -82,7 +80,7 @@ class StackedFunctions:
     weights: Float[Tensor, "C N"]
 
     @classmethod
-    def mean_of(cls, latent: LatentPosterior) -> StackedFunctions:
+    def mean_of(cls, latent: LatentPosterior) -> "StackedFunctions":
         """Prepared once for a posterior; kernels that cannot be stacked are evaluated one by one."""
         with torch.no_grad():
             return cls(latent, StackedKernels.of(latent), stacked(latent.weights))
@@ -111,7 +109,7 @@ class FunctionSamples:
     @classmethod
     def draw(
         cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
-    ) -> FunctionSamples:
+    ) -> "FunctionSamples":
         """Draw functions, `widening` times as far from the mean; the same seed gives the same ones.
 
         Raises InvalidInput if a kernel is not a scaled squared exponential; `draw_functions` takes others, too.
@@ -166,7 +164,7 @@ class ComposedSamples:
     @classmethod
     def draw(
         cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
-    ) -> ComposedSamples:
+    ) -> "ComposedSamples":
         """As `FunctionSamples.draw`; `frequencies` are those of one function of one term.
 
         Raises InvalidInput for a kernel of which neither features nor a spectrum are known.

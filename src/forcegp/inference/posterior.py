@@ -4,8 +4,6 @@ Whatever computes it, its mean is a sum of kernel functions about some centres: 
 exact posterior has the training points as centres; others may have fewer.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -150,7 +148,7 @@ class ExactPosterior(FactorizedPosterior):
         W: Float[Tensor, "N D C"],
         residual: Float[Tensor, "N D"],
         noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
-    ) -> ExactPosterior:
+    ) -> "ExactPosterior":
         """Condition on residual = y - m; the arguments are those of `negative_log_likelihood`."""
         with torch.no_grad():
             W_white, y_white, _ = whiten(W, residual, noise)

@@ -12,8 +12,6 @@ gradients in practice"). At fixed hyper-parameters nothing of this is needed: `I
 one pass over the rows, which is where the search begins and what follows it.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

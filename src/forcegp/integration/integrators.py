@@ -4,8 +4,6 @@ An integrator asks for accelerations a(q, v) wherever they come from; actuator f
 over the step. All states are batched, (n, nv).
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable

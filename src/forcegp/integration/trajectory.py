@@ -4,8 +4,6 @@ A motion that diverges is a result, not an error that would take the others alon
 and figures compare them.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

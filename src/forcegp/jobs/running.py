@@ -1,7 +1,5 @@
 """`JobStore`, a folder of finished jobs, and `run_jobs`, which computes those that it lacks, each after its inputs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile
@@ -43,7 +41,7 @@ class JobStore:
     @classmethod
     def open(
         cls, folder: Path, kind: str, configuration: Mapping[str, Any], *, overwrite: bool | None = None
-    ) -> JobStore:
+    ) -> "JobStore":
         """The folder, made if it does not exist, for jobs of this kind under one configuration of JSON values.
 
         With `overwrite` everything is computed anew; None for commands that do not offer it. Warns where the folder

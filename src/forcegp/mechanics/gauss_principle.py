@@ -8,8 +8,6 @@ read from the one small pseudo-inverse A~^+, which also covers redundant constra
 H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -79,7 +77,7 @@ class Contact:
         return self.surface.value(self.position(kinematics))
 
     def constraint(
-        self, state: State, baumgarte: Baumgarte | None
+        self, state: "State", baumgarte: Baumgarte | None
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
@@ -118,7 +116,7 @@ class State:
     @classmethod
     def of(
         cls, robot: Robot, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
-    ) -> State:
+    ) -> "State":
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
         q, v, u = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v), ("u", u)))
         try:
@@ -176,7 +174,7 @@ class ConstrainedDynamics:
         normals: Float[Tensor, "*batch m 3"],
         Q_K: Float[Tensor, "*batch nv"],
         contacts: tuple[Contact, ...] = (),
-    ) -> ConstrainedDynamics:
+    ) -> "ConstrainedDynamics":
         """Gauss' principle for M (..., nv, nv) and A a = b.
 
         Raises NumericalError when M is not positive definite or A is not finite.

@@ -3,8 +3,6 @@
 A new known force is one subclass with a `force`, and an entry in `KNOWN_FORCES` so that files can carry it.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -46,7 +44,7 @@ class KnownForce(ABC):
         """What this adds to the mass matrix, in kg m^2 or kg."""
         return None
 
-    def bound_to(self, robot: Robot) -> KnownForce:
+    def bound_to(self, robot: Robot) -> "KnownForce":
         """The same with per-joint numbers as tensors (nv,) in the order of robot.joint_names, checked."""
         if not self.per_joint:
             return self
@@ -92,7 +90,7 @@ class ViscousJointFriction(KnownForce):
     learned: ClassVar[str | None] = "coefficients"
 
     @classmethod
-    def from_robot(cls, robot: Robot) -> ViscousJointFriction:
+    def from_robot(cls, robot: Robot) -> "ViscousJointFriction":
         """The <dynamics damping> of the URDF."""
         return cls([joint.damping for joint in robot.joints])
 
@@ -112,7 +110,7 @@ class CoulombJointFriction(KnownForce):
     learned: ClassVar[str | None] = "coefficients"
 
     @classmethod
-    def from_robot(cls, robot: Robot, velocity_scale: PerJoint = 0.01) -> CoulombJointFriction:
+    def from_robot(cls, robot: Robot, velocity_scale: PerJoint = 0.01) -> "CoulombJointFriction":
         """The <dynamics friction> of the URDF."""
         return cls([joint.friction for joint in robot.joints], velocity_scale)
 

@@ -6,8 +6,6 @@ surface is one subclass of `Surface` that defines `value`; the derivatives follo
 be stored with a dataset or a model it also needs an entry in `SURFACES` and plain numbers as its fields.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """`MechanicalSystem`: a robot, its contacts and the known forces, as one immutable value that files can carry."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -140,18 +138,18 @@ class MechanicalSystem(Summary):
                 "the least-squares sense; remove one of them or check their surfaces."
             )
 
-    def to(self, device: torch.device | str) -> MechanicalSystem:
+    def to(self, device: torch.device | str) -> "MechanicalSystem":
         """The same system with its robot and the numbers of its known forces on `device`, for instance "cuda".
 
         Raises InvalidInput for a device that is not there.
         """
         return replace(self, robot=self.robot.to(device))  # known forces are bound to the robot's device again
 
-    def with_robot(self, robot: Robot) -> MechanicalSystem:
+    def with_robot(self, robot: Robot) -> "MechanicalSystem":
         """The same contacts and forces on another robot with the same joints."""
         return replace(self, robot=robot)
 
-    def with_contacts(self, contacts: Sequence[Contact]) -> MechanicalSystem:
+    def with_contacts(self, contacts: Sequence[Contact]) -> "MechanicalSystem":
         """The same robot and forces under other contacts."""
         return replace(self, contacts=contacts)  # type: ignore[arg-type]  # the constructor makes a tuple, or refuses
 
@@ -172,7 +170,7 @@ class MechanicalSystem(Summary):
             )
         return found[0]
 
-    def with_coefficients(self, coefficients: Mapping[str, Tensor]) -> MechanicalSystem:
+    def with_coefficients(self, coefficients: Mapping[str, Tensor]) -> "MechanicalSystem":
         """The same system where the known forces of these names have other coefficients (nv,), which keep their graph.
 
         Raises InvalidInput for names that `force_index` refuses.
@@ -207,7 +205,7 @@ class MechanicalSystem(Summary):
         return json.dumps(self.to_dict())
 
     @classmethod
-    def from_dict(cls, stored: Mapping[str, Any], contacts: Sequence[Contact] | None = None) -> MechanicalSystem:
+    def from_dict(cls, stored: Mapping[str, Any], contacts: Sequence[Contact] | None = None) -> "MechanicalSystem":
         """The system that `to_dict` stored; `contacts` replaces the stored ones.
 
         Raises FileFormatError for anything else.
@@ -241,7 +239,7 @@ class MechanicalSystem(Summary):
         return cls(robot, tuple(contacts), forces, baumgarte)
 
     @classmethod
-    def from_json(cls, text: str) -> MechanicalSystem:
+    def from_json(cls, text: str) -> "MechanicalSystem":
         """The system that `to_json` stored."""
         try:
             stored = json.loads(text)

@@ -5,8 +5,6 @@ Jacobian, shortened where it overshoots. A motion that the loop cannot carry to 
 Newton's method fails, or because it leaves the range of a table, is left to `integration`, which decides what it is.
 """
 
-from __future__ import annotations
-
 import ctypes
 import warnings
 from collections.abc import Callable, Sequence
@@ -170,7 +168,7 @@ def loop_source(method: str, function: str, nv: int) -> str:
 
 
 def fused(
-    loops: Sequence[FusedLoop],
+    loops: "Sequence[FusedLoop]",
     method: Integrator,
     acceleration: Callable[[Tensor, Tensor, Tensor], Tensor],
     q: Float[Tensor, "n nv"],

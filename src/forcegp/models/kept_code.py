@@ -6,8 +6,6 @@ prior, the data and the hyper-parameters. Models whose parts cannot be described
 code, have none. The oldest records go where all together grow too large.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import hashlib

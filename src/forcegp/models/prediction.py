@@ -1,7 +1,5 @@
 """Predictions as frozen values."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
@@ -93,7 +91,7 @@ class Prediction(Gaussian):
     @classmethod
     def of_accelerations(
         cls, mean: Float[Tensor, "*b nv"], variance: Float[Tensor, "*b nv"] | None, noise: Float[Tensor, "*b nv"]
-    ) -> Prediction:
+    ) -> "Prediction":
         """Of a model of independent joints without forces; `noise` is the variance of a measurement about it."""
         covariance = None if variance is None else torch.diag_embed(variance)
         return cls(mean, covariance, None, None, None, torch.diag_embed(noise))

@@ -4,8 +4,6 @@ Rigid-body terms, constraints, prior, features and processes become one C progra
 uses few combinations of the data (`inference.prepared_kernels`). `structured.predictor_preparation` makes one.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Sequence

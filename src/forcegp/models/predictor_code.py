@@ -5,8 +5,6 @@ The Python code that `predict` runs is traced once (`codegen.tracing`); processe
 first asked for.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -84,7 +82,7 @@ class PredictorCode:
         sums: tuple[LatentCall, ...],
         compressed: CompressedCovariance | None,
         widening: float,
-    ) -> PredictorCode:
+    ) -> "PredictorCode":
         """Trace the physics at an example (1, nv) of a state.
 
         Raises InvalidInput for a system on another device and for operations that a graph cannot hold.

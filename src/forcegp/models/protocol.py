@@ -1,7 +1,5 @@
 """What every model and every posterior offers: `model.fit(dataset, ...) -> posterior`, `posterior.predict(q, v, u)`."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -268,7 +266,7 @@ class Posterior(Summary, ABC):
         """What conditioning on these rows again can begin from, stored with the model; None where it is cheap."""
         return None
 
-    def update(self, rows: Dataset, budget: int | None = None) -> Posterior:
+    def update(self, rows: Dataset, budget: int | None = None) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
         Parameters, noise level and standardization stay those of the fit, so the result is exactly that of

@@ -1,7 +1,5 @@
 """Where a robot goes according to a fitted model: `Rollout`, and one step x+ = f(x, u) with its derivatives."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -80,7 +78,7 @@ class Rollout:
     diverged_at: Int[Tensor, "*batch"]
     integrator: str
     baumgarte: Baumgarte | None
-    samples: Rollout | None = None
+    samples: "Rollout | None" = None
 
     def std(self, quantity: Quantity = "q") -> Tensor:
         """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.

@@ -1,7 +1,5 @@
 """What a model is conditioned on: rows or windows with standardised features, and the noise of their measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -40,7 +38,7 @@ class TrainingData:
     u: Float[Tensor, "N nv"]
     a: Float[Tensor, "N nv"]
     noise_std: Float[Tensor, "N nv"] | None = None
-    reference: TrainingData | None = None
+    reference: "TrainingData | None" = None
     weights: Float[Tensor, "windows nodes"] | None = None
 
     def __len__(self) -> int:
@@ -48,7 +46,7 @@ class TrainingData:
         return len(self.q if self.weights is None else self.weights)
 
     @classmethod
-    def of(cls, given: Dataset | Windows, device: torch.device) -> TrainingData:
+    def of(cls, given: Dataset | Windows, device: torch.device) -> "TrainingData":
         """Copies of all rows of a Dataset, or of all windows."""
         rows = given.nodes if isinstance(given, Windows) else given
         weights = torch.tensor(given.weights, device=device) if isinstance(given, Windows) else None
@@ -57,7 +55,7 @@ class TrainingData:
         states = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
         return cls(*states, noise_std=noise_std, weights=weights)
 
-    def to(self, device: torch.device) -> TrainingData:
+    def to(self, device: torch.device) -> "TrainingData":
         """The same rows on another device."""
         states = (getattr(self, name).to(device) for name in ("q", "v", "u", "a"))
         noise_std = None if self.noise_std is None else self.noise_std.to(device)
@@ -90,7 +88,7 @@ class Standardization:
     @classmethod
     def of(
         cls, features: Sequence[Float[Tensor, "N _"]], scalings: Sequence[tuple[Scaling, ...] | Scaling] | None = None
-    ) -> Standardization:
+    ) -> "Standardization":
         """As `scalings` say for each latent or each of its features; None shifts and scales all of them."""
         scalings = ("standardize",) * len(features) if scalings is None else scalings
         shifts, scales = [], []
@@ -218,7 +216,7 @@ class Noise:
         }
 
     @classmethod
-    def from_dict(cls, stored: Mapping[str, Any]) -> Noise:
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Noise":
         """The noise that `to_dict` stored."""
         force = stored["force"]
         return cls(

@@ -3,8 +3,6 @@
 `Serial` works in this process, `Joblib` in processes on this machine, kept between calls.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import threading
@@ -62,7 +60,7 @@ class Pool(ABC):
     def stop(self) -> None:
         """End what is at work and return when no task runs any longer."""
 
-    def __enter__(self) -> Pool:
+    def __enter__(self) -> "Pool":
         return self
 
     def __exit__(

@@ -1,7 +1,5 @@
 """`ContactFriction`: what resists the sliding of a contact, and the normal force that this friction changes itself."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -82,7 +80,7 @@ class ExpectedFriction:
     joints: tuple[tuple[str, TabulatedCurve], ...] = ()
 
     @classmethod
-    def of(cls, given: object) -> ExpectedFriction | None:
+    def of(cls, given: object) -> "ExpectedFriction | None":
         """None, a coefficient that holds at all speeds, an `ExpectedFriction`, or what files hold of one.
 
         Raises InvalidInput for anything else, and for a coefficient that is negative or not finite.

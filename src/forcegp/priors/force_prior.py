@@ -1,7 +1,5 @@
 """What every prior on the unknown force defines: Q_U(x) = B(x) f(z(x)) with independent Gaussian processes f_c."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -85,17 +83,17 @@ class ForcePrior(ABC):
         """What the prior is called where its forces are listed, for example "joint-friction"."""
         return re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()
 
-    def summands(self) -> tuple[ForcePrior, ...]:
+    def summands(self) -> "tuple[ForcePrior, ...]":
         """The priors that add up to this one."""
         return (self,)
 
-    def __add__(self, other: ForcePrior) -> SumPrior:
+    def __add__(self, other: "ForcePrior") -> "SumPrior":
         """Q_U is the sum of what both describe. Raises InvalidInput for what is no prior, as `SumPrior`."""
         if not isinstance(other, ForcePrior):
             return SumPrior((self, other))
         return SumPrior((*self.summands(), *other.summands()))
 
-    def __radd__(self, other: object) -> ForcePrior:
+    def __radd__(self, other: object) -> "ForcePrior":
         """`sum([a, b])` begins with 0. Raises InvalidInput for anything else that is no prior, as `SumPrior`."""
         return self if isinstance(other, int) and other == 0 else SumPrior((other, self))  # type: ignore[arg-type]  # refused there
 

@@ -1,7 +1,5 @@
 """Priors at the joints: on all of (q, v, u), of forces or accelerations, one function per joint, and no force."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`Payload`: the weight of something that the robot carries and the model does not contain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """`ToolForces`: an unknown Cartesian force, and if wanted torque, at one point of the robot."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ class ToolPoint:
     orientation: Float[Tensor, "*batch 3 3"]
 
     @classmethod
-    def of(cls, dynamics: ConstrainedDynamics, frame: str, point: Sequence[float]) -> ToolPoint:
+    def of(cls, dynamics: ConstrainedDynamics, frame: str, point: Sequence[float]) -> "ToolPoint":
         """At every state of the dynamics. Raises UnknownFrame."""
         kinematics = dynamics.state.kinematics
         pose = kinematics.frame_pose(frame)
@@ -39,7 +37,7 @@ class ToolPoint:
         return cls(position, kinematics.frame_jacobian(frame, tuple(point)), pose[..., :3, :3])
 
     @classmethod
-    def of_contact(cls, dynamics: ConstrainedDynamics, contact: int) -> ToolPoint:
+    def of_contact(cls, dynamics: ConstrainedDynamics, contact: int) -> "ToolPoint":
         """The point that touches."""
         touching = dynamics.contacts[contact]
         return cls.of(dynamics, touching.frame, touching.point)

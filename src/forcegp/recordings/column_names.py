@@ -8,8 +8,6 @@ Known columns are recognised letter by letter, the longest first, so most names 
 backticks settle the rest.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence

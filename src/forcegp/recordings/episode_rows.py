@@ -1,7 +1,5 @@
 """The stamps of a recording, the stretches between its gaps, and their rows as a Dataset has them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -227,7 +225,7 @@ class EpisodeRows:
     class _LogRows:
         """The rows of the log that are used, by number."""
 
-        def __init__(self, owner: EpisodeRows, spool: Spool) -> None:
+        def __init__(self, owner: "EpisodeRows", spool: Spool) -> None:
             self.spool = spool
             self.first = owner.stretch.recording.first
             self.numbers = owner._numbers

@@ -1,7 +1,5 @@
 """`ColumnMapping`: which columns are what, in which units; its YAML files, and the short forms of the command line."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping
@@ -149,7 +147,7 @@ class ColumnMapping:
             if what == "scale" and number == 0.0:
                 raise InvalidInput(f"scale of {signal} is 0, which would erase it.")
 
-    def changed_by(self, other: ColumnMapping) -> ColumnMapping:
+    def changed_by(self, other: "ColumnMapping") -> "ColumnMapping":
         """The mapping with everything that the other one states; time and step take each other's place."""
         stated = {
             item.name: getattr(other, item.name)

@@ -4,8 +4,6 @@ Real numbers of any precision are taken and computed with in float64, which chan
 other numbers than were meant is refused: text, dates, booleans, complex numbers, masked entries.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """`CompiledRobot`: the dynamics of one robot as machine code made for it, with first derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,13 +48,13 @@ class CompiledRobot:
         self._unrolled = UnrolledRobot(robot)
         self._programs: dict[Request, RowFunction] = {}
 
-    def __reduce__(self) -> tuple[type[CompiledRobot], tuple[RobotStructure, Path]]:
+    def __reduce__(self) -> "tuple[type[CompiledRobot], tuple[RobotStructure, Path]]":
         return CompiledRobot, (self.robot, self.folder)
 
     def __repr__(self) -> str:
         return f"CompiledRobot({self.robot!r}, folder={str(self.folder)!r})"
 
-    def prepare(self, *functions: str, inertials: bool = False, derivatives: bool = False) -> CompiledRobot:
+    def prepare(self, *functions: str, inertials: bool = False, derivatives: bool = False) -> "CompiledRobot":
         """Compile functions now: those named, or all; returns the same object.
 
         ``inertials``: for calls with ``inertials=``, which take the inertias as inputs; else for those without.

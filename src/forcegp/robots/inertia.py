@@ -9,8 +9,6 @@ with mass ``m`` (kg), centre of mass ``c`` (m) and inertia ``I`` about the centr
 with these parameters exists if and only if P is positive semi-definite, which includes the triangle inequality of I.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -17,8 +17,6 @@ vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the bat
 differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated differentiation apply.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -176,7 +174,7 @@ class Kinematics:
     accelerations: Tensor | None  # (nv, 3, 4, batch), at zero joint acceleration and without gravity
 
     @classmethod
-    def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> Kinematics:
+    def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> "Kinematics":
         """Kinematics at checked q and v (*batch, nv) of equal shape."""
         batch = q.shape[:-1]
         poses = body_poses(robot.tree, _columns(q, batch))
@@ -315,7 +313,7 @@ class Kinematics:
             raise InvalidInput(f"{what} needs velocities; make the kinematics with robot.kinematics(q, v).")
         return self.accelerations, self.v
 
-    def _with_inertias(self, inertials: Inertials | None) -> tuple[Kinematics, Tensor]:
+    def _with_inertias(self, inertials: Inertials | None) -> "tuple[Kinematics, Tensor]":
         """These states broadcast against the batch of ``inertials``, and the bodies' pseudo-inertias in the world."""
         if not inertials:
             return self, world_inertias(self.poses, self.robot.tree.inertias)
@@ -326,7 +324,7 @@ class Kinematics:
         at = self._expand(self._broadcast("inertials", batch))
         return at, world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
 
-    def _world_point(self, frame: str, point: Vector | None) -> tuple[Kinematics, int, Tensor]:
+    def _world_point(self, frame: str, point: Vector | None) -> "tuple[Kinematics, int, Tensor]":
         """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
         body, offset = self.robot.frame(frame)
         at = self
@@ -345,7 +343,7 @@ class Kinematics:
     def _broadcast(self, name: str, batch: torch.Size) -> torch.Size:
         return broadcast_batch({"the states": self.batch_shape, name: batch})
 
-    def _expand(self, batch: torch.Size) -> Kinematics:
+    def _expand(self, batch: torch.Size) -> "Kinematics":
         if batch == self.batch_shape:
             return self
 

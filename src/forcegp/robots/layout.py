@@ -6,8 +6,6 @@ and every link fixed to it. Body i's frame is the child link's frame turned so t
 makes every joint a rotation about or a translation along z.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -221,7 +219,7 @@ class Level:
     joints: Tensor | slice
     parents: Tensor | None  # positions in the previous level; None where that is the whole level, in order
 
-    def to(self, device: torch.device) -> Level:
+    def to(self, device: torch.device) -> "Level":
         """The same level with its indices on another device."""
         joints = self.joints if isinstance(self.joints, slice) else self.joints.to(device)
         return Level(joints, None if self.parents is None else self.parents.to(device))
@@ -255,13 +253,13 @@ class Tree:
     armature: Tensor  # (n,)
     has_armature: bool
 
-    def to(self, device: torch.device | str) -> Tree:
+    def to(self, device: torch.device | str) -> "Tree":
         """The same constants on another device. Raises InvalidInput for one that is not there."""
         device = usable_device(device)
         moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **moved, levels=tuple(level.to(device) for level in self.levels))
 
-    def equals(self, other: Tree) -> bool:
+    def equals(self, other: "Tree") -> bool:
         """Whether both move alike: equal joints, poses, inertias, gravity and armature, whatever their URDFs look like.
 
         Numbers may differ by rounding (1e-9, relative), as after writing a URDF and reading it again.

@@ -1,7 +1,5 @@
 """`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,7 +55,7 @@ class Robot(RobotStructure):
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
-    ) -> Robot:
+    ) -> "Robot":
         """Read a URDF file.
 
         Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
@@ -82,7 +80,7 @@ class Robot(RobotStructure):
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
-    ) -> Robot:
+    ) -> "Robot":
         """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
         description = parse_urdf(text, source=source)
         locked = locked_positions(locked or {})
@@ -101,7 +99,7 @@ class Robot(RobotStructure):
         frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
         return cls(description, layout, tree, text, tuple(locked.items()), frames)
 
-    def with_inertials(self, inertials: Inertials) -> Robot:
+    def with_inertials(self, inertials: Inertials) -> "Robot":
         """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
         text = self.urdf_text
         for name, parameters in inertials.items():
@@ -115,13 +113,13 @@ class Robot(RobotStructure):
             text = replace_inertial(text, name, float(mass), center, inertia, source=self.source)
         return self._rebuilt(text, self.armature)
 
-    def with_armature(self, armature: Vector | Mapping[str, float | int]) -> Robot:
+    def with_armature(self, armature: Vector | Mapping[str, float | int]) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
         if isinstance(armature, Mapping):
             armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True)) | dict(armature)
         return self._rebuilt(self.urdf_text, armature)
 
-    def to(self, device: torch.device | str) -> Robot:
+    def to(self, device: torch.device | str) -> "Robot":
         """The same robot with its constants on ``device``, for instance "cuda"."""
         tree = self.tree.to(device)
         frames = {name: (body, offset.to(tree.rest.device)) for name, (body, offset) in self._frames.items()}
@@ -131,7 +129,7 @@ class Robot(RobotStructure):
         """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""
         return CompiledRobot(self, folder)
 
-    def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> Robot:
+    def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> "Robot":
         robot = Robot.from_urdf_text(
             text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked
         )

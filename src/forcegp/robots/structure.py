@@ -1,7 +1,5 @@
 """What a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -38,7 +36,7 @@ class Joint:
     friction: float  # Nm or N
 
     @classmethod
-    def of(cls, joint: JointDescription) -> Joint:
+    def of(cls, joint: JointDescription) -> "Joint":
         """A movable joint as a description has it, without its place in the tree."""
         return cls(**{field.name: getattr(joint, field.name) for field in fields(cls)})
 
@@ -78,7 +76,7 @@ class Link:
     inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
 
     @classmethod
-    def of(cls, name: str, joint: str | None, inertial: InertialDescription | None) -> Link:
+    def of(cls, name: str, joint: str | None, inertial: InertialDescription | None) -> "Link":
         """A link with its inertia; without one it is a massless frame."""
         if inertial is None:
             return cls(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)

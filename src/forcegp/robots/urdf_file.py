@@ -7,8 +7,6 @@ axes and ``|dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2`` for changes s of the eigenva
 three variables.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A fixed-base arm in PyBullet without a window: its state, its dynamics as PyBullet computes them, and steps."""
 
-from __future__ import annotations
-
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -75,7 +73,7 @@ class BulletArm:
         bullet.setJointMotorControlArray(self.body, self.joints, bullet.VELOCITY_CONTROL, forces=[0.0] * nv, **client)
         self._zeros = [0.0] * nv
 
-    def __enter__(self) -> BulletArm:
+    def __enter__(self) -> "BulletArm":
         return self
 
     def __exit__(

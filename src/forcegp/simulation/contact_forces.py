@@ -1,7 +1,5 @@
 """The tool's contact: friction laws, an ideal bilateral constraint, or PyBullet's own unilateral contact."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -119,7 +117,7 @@ class ArmState:
     bias_acceleration: Float[np.ndarray, "6"]
 
     @staticmethod
-    def of(arm: BulletArm) -> ArmState:
+    def of(arm: BulletArm) -> "ArmState":
         """The present one."""
         q, v = arm.state()
         return ArmState(q, v, arm.mass_matrix(q), arm.bias_forces(q, v), *arm.tool(v))

@@ -1,7 +1,5 @@
 """One episode of the `kuka-surface` scenario: controller, friction and contact in the loop, recorded row by row."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

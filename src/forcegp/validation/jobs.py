@@ -1,7 +1,5 @@
 """The jobs of a comparison: identify a system, or fit and score a model, on one split with one seed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -5,8 +5,6 @@ that one model is better if the 95 % interval of the mean of d excludes 0: mean 
 (Student's paired test). Runs differ by their training rows; that recordings differ as well, only several splits show.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """Scores of one model on held-out rows, and of the motions that it predicts from held-out states."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any

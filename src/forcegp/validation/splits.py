@@ -6,8 +6,6 @@ than `guard` seconds to such a stretch (block cross-validation with a margin; Ra
 model-selection for dependent data: hv-block cross-validation").
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Plot: the friction curves that a model learned, one panel each, over velocity, and the truth where it is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

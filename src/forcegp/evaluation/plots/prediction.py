@@ -1,7 +1,5 @@
 """Plots: predicted accelerations and normal forces against the truth, and the course of the search."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

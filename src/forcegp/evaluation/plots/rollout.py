@@ -1,7 +1,5 @@
 """Plot: predicted and recorded motion joint by joint, how the error grows, and how far the tool is off the surface."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plots: the path of the tool with the error along it, and one picture of a model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`IndependentPosterior`: one Gaussian process per joint acceleration, conditioned on data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

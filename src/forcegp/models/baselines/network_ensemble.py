@@ -1,7 +1,5 @@
 """`NetworkEnsemble`: several residual networks that predict a mean and a variance, and differ where data are few."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass

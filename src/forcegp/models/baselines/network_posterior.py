@@ -1,7 +1,5 @@
 """What networks share: checks of their arguments, standardised inputs, and a posterior with a diagonal covariance."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -48,7 +46,7 @@ class NetworkModel(Model):
             )
 
     @abstractmethod
-    def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
+    def moments(self, posterior: "NetworkPosterior", x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
         """Mean, its variance, and the variance of data about it, at standardised inputs."""
 
     @override
@@ -60,7 +58,7 @@ class NetworkModel(Model):
         settings: Mapping[str, Any],
         engine: Engine | None = None,
         solution: Tensor | None = None,
-    ) -> NetworkPosterior:
+    ) -> "NetworkPosterior":
         return NetworkPosterior(self, training, dict(parameters), result, dict(settings))
 
     def resolved_noise(self, rows: Dataset) -> Noise | None:
@@ -77,7 +75,7 @@ class NetworkModel(Model):
 
     def trained(
         self, rows: Dataset, dataset: Dataset, training: TrainingData, seed: int, result: OptimizationResult
-    ) -> NetworkPosterior:
+    ) -> "NetworkPosterior":
         """The posterior of a training, whose settings hold every field that is a plain number."""
         noise = self.resolved_noise(rows)
         settings = described_rows(rows, dataset) | {"seed": seed, "noise": None if noise is None else noise.to_dict()}

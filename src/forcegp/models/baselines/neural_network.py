@@ -1,7 +1,5 @@
 """`NeuralNetwork`: one small network from (q, v, u) to the acceleration; the paper's baseline for many points."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

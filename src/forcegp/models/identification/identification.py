@@ -13,8 +13,6 @@ Curvatures of H_kk below `FLAT` are raised to it, which is a prior of standard d
 they would count as known, and standard errors would be too small.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -75,7 +73,7 @@ class Curvature:
     tolerated: float
 
     @classmethod
-    def unknown(cls, like: Float[Tensor, "k"]) -> Curvature:
+    def unknown(cls, like: Float[Tensor, "k"]) -> "Curvature":
         """No information about parameters of this shape, and no optimum."""
         return cls(like.new_zeros(len(like), len(like)), float("inf"), 0.0, 0.0, 0.0)
 
@@ -201,7 +199,7 @@ class Identification(Summary):
     @classmethod
     def of(
         cls, physical: PhysicalParameters, objective: Objective, result: OptimizationResult, covariance_rows: int
-    ) -> Identification:
+    ) -> "Identification":
         """From the result of a search that kept its iterates; `covariance_rows` is the size of what it factorised."""
         history = tuple(physical.named(point[PHYSICAL]) for point in result.iterates)
         return cls(physical, objective, result.parameters, history, covariance_rows)

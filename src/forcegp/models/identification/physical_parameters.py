@@ -12,8 +12,6 @@ alpha = alpha0 + s/2, d_i = log V_ii + alpha0 - alpha and s_ij = V_ij e^(alpha0 
 exist. The search moves z with s = T z; T makes its steps comparable (`models.physical_scaling`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -166,7 +164,7 @@ class PhysicalParameters:
     transform: Float[Tensor, "k k"]
 
     @classmethod
-    def of(cls, system: MechanicalSystem, learn: Learned | Iterable[Learned]) -> PhysicalParameters:
+    def of(cls, system: MechanicalSystem, learn: Learned | Iterable[Learned]) -> "PhysicalParameters":
         """The parameters that `learn` names, from the values that the system has, scaled but not yet whitened.
 
         Raises InvalidInput, UnknownLink or UnknownJoint for what the system does not have, or has twice, and
@@ -185,7 +183,7 @@ class PhysicalParameters:
         identity = torch.eye(len(names), dtype=torch.float64, device=system.robot.device)
         return cls(system, groups, identity)
 
-    def with_transform(self, transform: Float[Tensor, "k k"]) -> PhysicalParameters:
+    def with_transform(self, transform: Float[Tensor, "k k"]) -> "PhysicalParameters":
         """The same with s = transform z."""
         return replace(self, transform=transform)
 

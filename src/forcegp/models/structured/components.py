@@ -1,7 +1,5 @@
 """Forces of a fitted model, each by itself, and those of the actuators that make a wanted acceleration."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -80,7 +78,7 @@ class Latents:
         covariance = None if self.covariance is None else symmetric(matrix @ self.covariance @ matrix.mT)
         return Gaussian(mean if offset is None else offset + mean, covariance)
 
-    def part(self, which: slice) -> Latents:
+    def part(self, which: slice) -> "Latents":
         """Some of the processes alone."""
         covariance = None if self.covariance is None else self.covariance[..., which, which]
         return Latents(self.mean[..., which], covariance)

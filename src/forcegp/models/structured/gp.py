@@ -1,7 +1,5 @@
 """`StructuredGP`: Gaussian processes on the unknown forces inside known constrained rigid-body dynamics."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -338,7 +336,7 @@ class StructuredGP(StructuredModel):
         )
         return replace(posterior, identification=identification)
 
-    def _checked(self, rows: Dataset | Windows) -> tuple[StructuredGP, MarginalLikelihood]:
+    def _checked(self, rows: Dataset | Windows) -> "tuple[StructuredGP, MarginalLikelihood]":
         """The model with its noise resolved, and its likelihood of these rows, which have passed every check."""
         fitted = replace(self, noise=resolved_noise(self.noise, rows))
         likelihood = fitted.likelihood(TrainingData.of(rows, self.system.robot.device))

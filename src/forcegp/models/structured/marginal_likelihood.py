@@ -1,7 +1,5 @@
 """Where physics and Gaussian processes meet: from states and a checked prior to (m, W), features, NLL; the model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -141,7 +139,7 @@ class MarginalLikelihood:
         return Standardization.of(self.prior.features(self._nominal_dynamics), scalings)
 
     @cached_property
-    def _reference(self) -> MarginalLikelihood | None:
+    def _reference(self) -> "MarginalLikelihood | None":
         """The same model on the rows that standardise features, where they are others than the training rows."""
         rows = self.training.reference
         return None if rows is None else replace(self, training=rows)

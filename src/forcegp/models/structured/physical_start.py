@@ -22,8 +22,6 @@ S_i = R_i + W_i diag(k_c(x_i, x_i)) W_i^T:
 the search moves z, s = L^-T z. None of this changes what the objective is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -65,7 +63,7 @@ class PhysicalStart:
         likelihood: MarginalLikelihood,
         noise: Mapping[str, Tensor],
         prior_strength: float = 0.0,
-    ) -> PhysicalStart:
+    ) -> "PhysicalStart":
         """From the values that the system of `likelihood` has.
 
         `noise` holds the noise parameters at their start.

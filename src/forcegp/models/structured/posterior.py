@@ -1,7 +1,5 @@
 """`StructuredPosterior`: a fitted structured model as a value that predicts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -236,7 +234,7 @@ class StructuredPosterior(Posterior):
         return self.model.prior.latent_names(self.model.system.robot)
 
     @override
-    def with_system(self, system: MechanicalSystem) -> StructuredPosterior:
+    def with_system(self, system: MechanicalSystem) -> "StructuredPosterior":
         """The same forces in another system (robot, contacts, known forces, stabilisation) with the same joints.
 
         Raises InvalidInput for other joints, and, without an analytical mean, for another robot: the processes hold
@@ -262,11 +260,11 @@ class StructuredPosterior(Posterior):
         return replace(self, target=system)
 
     @override
-    def to(self, device: torch.device | str) -> StructuredPosterior:
+    def to(self, device: torch.device | str) -> "StructuredPosterior":
         return replace(super().to(device), identification=self.identification)
 
     @override
-    def update(self, rows: Dataset, budget: int | None = None, *, keep: Keep = rows_to_keep) -> StructuredPosterior:
+    def update(self, rows: Dataset, budget: int | None = None, *, keep: Keep = rows_to_keep) -> "StructuredPosterior":
         """As `Posterior.update`; `keep` chooses the rows that stay."""
         if self.target is not None:
             raise InvalidInput(
@@ -339,7 +337,7 @@ class StructuredPosterior(Posterior):
         model, standardization = self.model, self.likelihood.standardization
         return PredictorPhysics(system, model.prior, model.mean == "analytical", inertials, standardization)
 
-    def at_iteration(self, iteration: int) -> StructuredPosterior:
+    def at_iteration(self, iteration: int) -> "StructuredPosterior":
         """The posterior as it was after that iteration of the search (0: the start), its system included.
 
         Raises InvalidInput unless the fit kept its iterates: with `learn`, or `OptimizerOptions(keep_iterates=True)`.

@@ -1,7 +1,5 @@
 """A structured posterior made ready for control rates: tape of its terms, kernels, compressed covariance."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

@@ -1,7 +1,5 @@
 """The search of a structured model: what a fit lowers, and several starts, of which the best is kept."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace

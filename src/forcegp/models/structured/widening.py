@@ -19,8 +19,6 @@ makes up for both:
 What was measured is in docs/forces.md. Means do not change.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping
