@@ -5,6 +5,8 @@ this residual is fitted by friction of the joints and the tool (a linear basis s
 same under other contacts: with the point moved, without any, or with one that the motion shows.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import Any
 

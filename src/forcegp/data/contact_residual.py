@@ -1,5 +1,7 @@
 """What friction leaves of the accelerations under given contacts, by linear least squares."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

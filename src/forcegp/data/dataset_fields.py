@@ -1,5 +1,7 @@
 """What a Dataset is made of: checked read-only columns, units, frozen metadata; and its columns as a pandas frame."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -23,7 +25,7 @@ class FrozenDict(dict[str, Any]):
 
     def __reduce__(
         self,
-    ) -> "tuple[type[FrozenDict], tuple[dict[str, Any]]]":  # the default would fill through __setitem__
+    ) -> tuple[type[FrozenDict], tuple[dict[str, Any]]]:  # the default would fill through __setitem__
         return FrozenDict, (dict(self),)
 
     def copy(self) -> dict[str, Any]:

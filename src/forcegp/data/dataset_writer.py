@@ -4,6 +4,8 @@ Columns are written by more than one thread: HDF5's deflate takes more time than
 differentiating together, and runs on one.
 """
 
+from __future__ import annotations
+
 import os
 import zlib
 from collections import deque
@@ -61,7 +63,7 @@ class DatasetWriter:
         self._stack = ExitStack()
         self._file: NewFile
 
-    def __enter__(self) -> "DatasetWriter":
+    def __enter__(self) -> DatasetWriter:
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_file(self.path))
             self._file = stack.enter_context(NewFile(temporary))

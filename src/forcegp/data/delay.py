@@ -1,5 +1,7 @@
 """How much later than the motion a torque was logged: the shift of u at which inverse dynamics fits it best."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

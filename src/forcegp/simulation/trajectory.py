@@ -1,5 +1,7 @@
 """What the tool slides on, its way-points, the smooth path through them, and the controller that follows it."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 
@@ -162,7 +164,7 @@ class PathOverTable:
         seconds: float,
         rng: np.random.Generator,
         lifts: np.random.Generator,
-    ) -> "PathOverTable":
+    ) -> PathOverTable:
         """`random_path` over the table, from the true place `start` [m]."""
         origin = np.array(start, dtype=np.float64)
         origin[2] -= table.height(origin[None, :2])[0][0]
