@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from forcegp import Baumgarte, KukaSurfaceConfig, StructuredGP, simulate_kuka_surface
-from forcegp.evaluation import recorded_motions, rollout_errors
+from forcegp.data import recorded_motions
+from forcegp.evaluation import rollout_errors
 
 HELD = Baumgarte(10.0, 1.0)
 RUNS = (("symplectic-euler", HELD, 0), ("symplectic-euler", None, 0), ("rk4", HELD, 0), ("projected", None, 0))

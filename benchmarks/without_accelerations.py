@@ -39,8 +39,8 @@ from forcegp.data import (
     resample,
     units_for,
 )
+from forcegp.data.motion_records import RecordedMotions, recorded_motions
 from forcegp.errors import DataWarning, NumericalWarning
-from forcegp.evaluation.rollout_scores import RecordedMotions, recorded_motions
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, RotorInertia
 from forcegp.models import Noise, StructuredGP, StructuredPosterior
 from forcegp.models.structured.marginal_likelihood import Mean

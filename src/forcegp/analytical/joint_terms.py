@@ -67,8 +67,10 @@ class Law:
     def torque(self, values: Arrays, state: State) -> tuple[np.ndarray, np.ndarray]:
         """What it adds to the torque (rows, nv), and the derivative in each field (fields, rows, nv)."""
         numbers = [torch.tensor(values[f.name]).expand(state.v.shape).clone().requires_grad_() for f in self.fields]
-        torque = -self.force(dict(zip((f.name for f in self.fields), numbers, strict=True))).force(state)
-        return torque.detach().numpy(), torch.stack(torch.autograd.grad(torque.sum(), numbers)).numpy()
+        with torch.enable_grad():
+            torque = -self.force(dict(zip((f.name for f in self.fields), numbers, strict=True))).force(state)
+            derivatives = torch.autograd.grad(torque.sum(), numbers)
+        return torque.detach().numpy(), torch.stack(derivatives).numpy()
 
 
 VELOCITY_SCALE = Field("velocity_scale", "1/s", (0, 1, 0.1), 0.03, 20.0, logarithm=True)

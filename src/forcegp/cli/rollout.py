@@ -76,7 +76,7 @@ class Rollout(Command):
         posterior = carried_over(terminal, posterior, dataset, self.system)
         for sentence in forcegp.evaluation.system_warnings(posterior, dataset):
             terminal.warn(sentence)
-        recorded = forcegp.evaluation.recorded_motions(dataset, rows, self.seconds)
+        recorded = forcegp.data.recorded_motions(dataset, rows, self.seconds)
         begun = time.process_time()
         with terminal.progress(f"rolling out: {len(recorded.rows)} motions of {recorded.time[-1]:.3g} s") as report:
             rollout = posterior.rollout(
@@ -114,7 +114,7 @@ class Rollout(Command):
     def _summary(
         self,
         rollout: forcegp.models.Rollout,
-        recorded: forcegp.evaluation.RecordedMotions,
+        recorded: forcegp.data.RecordedMotions,
         errors: forcegp.evaluation.RolloutErrors,
         dataset: forcegp.Dataset,
         cpu_seconds: float,
@@ -146,7 +146,7 @@ class Rollout(Command):
         self,
         folder: Path,
         rollout: forcegp.models.Rollout,
-        recorded: forcegp.evaluation.RecordedMotions,
+        recorded: forcegp.data.RecordedMotions,
         errors: forcegp.evaluation.RolloutErrors,
         dataset: forcegp.Dataset,
         summary: Mapping[str, Any],

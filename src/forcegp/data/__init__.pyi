@@ -15,6 +15,7 @@ from .filtering import (
 )
 from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
 from .hdf5 import is_dataset as is_dataset
+from .motion_records import RecordedMotions as RecordedMotions, recorded_motions as recorded_motions
 from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
 from .spectrum import (
     MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,

@@ -21,6 +21,5 @@ from .prior_comparison import (
     PriorComparison as PriorComparison, PriorScore as PriorScore, compare_priors as compare_priors,
 )
 from .rollout_scores import (
-    RecordedMotions as RecordedMotions, recorded_motions as recorded_motions, RolloutErrors as RolloutErrors,
-    rollout_errors as rollout_errors,
+    RolloutErrors as RolloutErrors, rollout_errors as rollout_errors,
 )

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.evaluation.rollout_scores import recorded_motions
+from forcegp.data.motion_records import recorded_motions
 from forcegp.experiments.data import test_trajectory
 from forcegp.experiments.fits import MODEL
 from forcegp.integration import Feedback, SymplecticEuler, integrate

@@ -21,8 +21,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, unknown_name_message, usable_arguments
+from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.inducing import InducingPosterior
+from forcegp.inference.inducing import InducingPosterior, WeightSpace
 from forcegp.inference.iterative import Iteration, IterativePosterior
 from forcegp.inference.likelihood import Terms
 from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
@@ -253,7 +254,45 @@ class Stochastic(Engine):
         return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=0.0)
 
 
-ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing, Stochastic)}
+@dataclass(frozen=True)
+class InducingWeights(Engine):
+    """Weights of inducing points that were found elsewhere, as from motions: `points` of each latent.
+
+    Rows cannot be conditioned on by it: places, means and precision are stored with the model.
+    """
+
+    name: ClassVar[str] = "inducing-weights"
+    remedy: ClassVar[str] = "refine a model with fewer inducing points"
+    points: tuple[int, ...] = ()
+
+    @override
+    def required_bytes(self, size: ProblemSize) -> int:
+        return 16 * sum(self.points) ** 2
+
+    @override
+    def condition(
+        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
+    ) -> LatentPosterior:
+        sizes = [count * z.shape[-1] for count, z in zip(self.points, terms.features, strict=True)]
+        count = sum(self.points)
+        if start is None or start.numel() != sum(sizes) + count + count**2:
+            raise InvalidInput(
+                "a model refined on motions is conditioned on them, not on rows; fit again, and refine again."
+            )
+        *places, mean, lower = start.split([*sizes, count, count**2])
+        shaped = [z.view(-1, like.shape[-1]) for z, like in zip(places, terms.features, strict=True)]
+        return InducingPosterior(kernels, WeightSpace.at(kernels, shaped, CholeskyFactor(lower.view(count, -1)), mean))
+
+    @override
+    def solution(self, posterior: LatentPosterior) -> Tensor | None:
+        assert isinstance(posterior, InducingPosterior)
+        space = posterior.space
+        return torch.cat([*(z.flatten() for z in space.points), space.mean, space.precision.lower.tril().flatten()])
+
+
+ENGINES: dict[str, type[Engine]] = {
+    kind.name: kind for kind in (Exact, Iterative, Inducing, Stochastic, InducingWeights)
+}
 
 
 @dataclass(frozen=True)

@@ -128,11 +128,7 @@ class WeightSpace:
         Time O(N P^2), memory O(P^2) and a block of rows. Raises NumericalError where the kernel matrix of the points
         cannot be factorised.
         """
-        points = tuple(z.detach() for z in points)
-        lowers = tuple(
-            factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
-        )
-        prior = cls(kernels, points, lowers, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0), 0.0)
+        prior = cls.at(kernels, points, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0))
         white, slices = C if noise_precision is None else noise_precision @ C, prior.slices
         pairs = (C[..., :, None] * white[..., None, :]).sum(1)  # C_i^T D_i^-1 C_i
         target = (white * t[..., None]).sum(1)  # C_i^T D_i^-1 t_i
@@ -152,7 +148,21 @@ class WeightSpace:
                     B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
         precision = factorize(B.clone)
         mean = precision.solve(right[:, None])[:, 0] if prior.count else right
-        return cls(kernels, points, lowers, precision, mean, float(left_out) / max(1, len(C)))
+        return cls(kernels, prior.points, prior.lowers, precision, mean, float(left_out) / max(1, len(C)))
+
+    @classmethod
+    def at(
+        cls, kernels: LatentKernels, points: Sequence[Float[Tensor, "_ _"]], precision: CholeskyFactor, mean: Tensor
+    ) -> "WeightSpace":
+        """With weights that were found elsewhere, of which nothing is said of what they leave out.
+
+        Raises NumericalError where the kernel matrix of the points cannot be factorised.
+        """
+        points = tuple(z.detach() for z in points)
+        lowers = tuple(
+            factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
+        )
+        return cls(kernels, points, lowers, precision, mean, 0.0)
 
     @property
     def count(self) -> int:

@@ -286,6 +286,33 @@ class Posterior(Summary, ABC):
             "a StructuredGP with engine='exact'."
         )
 
+    def refined_on_motions(
+        self: AnyPosterior,
+        dataset: Dataset,
+        seconds: float = 1.0,
+        *,
+        inertias: bool = True,
+        report: Callable[[int, float], None] | None = None,
+    ) -> AnyPosterior:
+        """Known forces, inertias and latent functions fitted to the recorded positions, beginning from this posterior.
+
+        Parameters
+        ----------
+        dataset: a recording in equal steps of time, also in several episodes. Of each row q and u count, and v where a
+            window begins.
+        seconds: length of the windows that motions are computed over: some tenths of a second to some seconds.
+        inertias: also those of the bodies, near the ones that the system has.
+        report: called as report(step, rms of q in rad or m).
+
+        The result predicts for the refined system, `posterior.system`: friction and rotors that it lists are refined.
+        Its `settings["motions"]` hold what was found, with standard errors, and what the motions did not tell.
+        Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
+        NumericalError where no motion is found near the recorded one.
+        """
+        raise InvalidInput(
+            f"a {self.description} has no forces that motions could refine; fit a StructuredGP or an analytical model."
+        )
+
     def with_system(self: AnyPosterior, system: MechanicalSystem) -> AnyPosterior:
         """The same knowledge in another system (robot, contacts, known forces) with the same joints.
 

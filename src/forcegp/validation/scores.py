@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 
 from forcegp.checks.check_input import plain
 from forcegp.data import Dataset, time_blocks
+from forcegp.data.motion_records import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
-from forcegp.evaluation.rollout_scores import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
 

@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
+from forcegp.data.motion_records import RecordedMotions
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.rollout_scores import INTERVAL, RecordedMotions, RolloutErrors
+from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors
 from forcegp.models.rollout import Rollout
 
 COLUMNS = 4

@@ -39,6 +39,7 @@ from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.components import Components, Curve, Latents, components_of, term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
+from forcegp.models.structured.motion_fit import refine_on_motions
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
 from forcegp.models.training_data import (
@@ -278,6 +279,17 @@ class StructuredPosterior(Posterior):
         settings = {"points": len(latent.system.deflation.C), "budget": budget}
         settings["rows_added"] = self.settings.get("rows_added", 0) + len(rows)
         return replace(self, likelihood=likelihood, latent=latent).with_settings(**settings)
+
+    @override
+    def refined_on_motions(
+        self,
+        dataset: Dataset,
+        seconds: float = 1.0,
+        *,
+        inertias: bool = True,
+        report: Callable[[int, float], None] | None = None,
+    ) -> "StructuredPosterior":
+        return refine_on_motions(self, dataset, seconds, inertias, report)
 
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:

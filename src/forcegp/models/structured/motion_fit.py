@@ -1,0 +1,359 @@
+"""What moves is what is fitted: known forces, inertias and latent functions refined on recorded positions.
+
+Accelerations of a log are filtered and differentiated; their errors resemble each other over the filter's memory and
+integrate into motions. Here the recording is cut into windows k of some tenths of a second to some seconds, and
+
+    1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |w|^2 + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2_S
+
+is minimised over the windows' initial states x_k, joint friction and inertias, and the weights w of the latent functions
+f_c = phi_c . w_c, which are standard normal a priori (`inference.inducing.WeightSpace`): the Gaussian process is the
+regulariser. sigma_j is what motions leave unexplained, tau_j how many rows of a window one independent residual is
+worth (`analytical.least_squares.correlation_time`): without it a window at 1 kHz would count as a thousand facts.
+
+Gauss-Newton with Levenberg's damping; initial states are eliminated window by window (Schur complement); motions and
+their derivatives come from the implicit midpoint rule (`integration.midpoint_sensitivities`), with
+
+    da/dp = -H (Y dpi/dp + d(tau)/dp),    da/dw_c = H b_c phi_c(z_c)^T
+
+of the torque regressor Y, joint terms tau and mixing b_c. The covariance of w is the inverse of the Gauss-Newton
+curvature, with all other unknowns marginalised (Laplace).
+"""
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
+from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.analytical.identification import joint_terms
+from forcegp.analytical.joint_terms import INERTIAS, LAWS
+from forcegp.analytical.least_squares import correlation_time
+from forcegp.data import Dataset
+from forcegp.data.motion_records import RecordedMotions, all_motions
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_type
+from forcegp.inference import InducingPosterior, InducingWeights
+from forcegp.inference.cholesky import factorize
+from forcegp.inference.inducing import WeightSpace, pivoted_cholesky
+from forcegp.integration.integrators import rows_jacobian
+from forcegp.integration.midpoint_sensitivities import Linear, WindowMotions, window_motions
+from forcegp.mechanics import MechanicalSystem
+
+Report = Callable[[int, float], None]
+Structured = Any
+"""A `StructuredPosterior`, whose module imports this one."""
+STEP = 0.005
+"""Longest step in s: shorter where the recording has shorter ones, of which several make a step."""
+POINTS = {1: 24, 2: 48}
+"""Inducing points of a latent with so many features; `MORE` of others."""
+MORE = 96
+SPEED = 0.05
+"""Standard deviation of a window's initial velocity, relative to that of all velocities: it comes from a filter."""
+ITERATIONS, ROUNDS = 40, 4
+"""Most steps for given noise, and times that the noise is estimated anew."""
+CONTENT = 0.01
+"""Nats by which a step must lower the objective for the search to go on."""
+SETTLED = 0.02
+"""Relative change of the noise that ends the rounds."""
+HELD = 0.5
+"""A parameter whose standard deviation is above this fraction of its prior's is one that the motions do not tell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Coordinates x of joint terms, bodies and latent weights, one after the other, and what they make of a posterior."""
+
+    start: Structured
+    space: WeightSpace
+    terms: Any
+    bodies: ConsistentBodies | None
+
+    @classmethod
+    def of(cls, posterior: Structured, dataset: Dataset, inertias: bool) -> "Unknowns":
+        """The laws of friction and rotors that the system lists, bodies where asked for, inducing points of the prior."""
+        robot, _ = thickened(posterior.system.robot)
+        system = posterior.system.with_robot(robot) if inertias else posterior.system
+        listed = [type(force) for force in system.known_forces]
+        laws = [name for name, law in LAWS.items() if law.kind in listed]
+        rotors = next((name for name, kind in INERTIAS.items() if kind in listed), None)
+        terms = joint_terms(system, laws, rotors, dataset.q, dataset.v, dataset.u, dataset.a)
+        bodies = ConsistentBodies(body_pseudo_inertias(robot).cpu().numpy()) if inertias else None
+        return cls(replace(posterior, target=system), _space(posterior), terms, bodies)
+
+    @cached_property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of terms, bodies and weights."""
+        return self.terms.size, 0 if self.bodies is None else self.bodies.size, self.space.count
+
+    def split(self, x: Tensor) -> tuple[np.ndarray, np.ndarray, Tensor]:
+        """Coordinates of terms, bodies and weights."""
+        terms, bodies, weights = x.split(self.sizes)
+        return terms.numpy(), bodies.numpy(), weights
+
+    @property
+    def first(self) -> Float[Tensor, " P"]:
+        """What the posterior that was given has."""
+        return torch.cat([torch.as_tensor(self.terms.start(unlisted=0.0)), torch.zeros(self.sizes[1]), self.space.mean])
+
+    def prior(self, x: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, "P P"]]:
+        """Standardised distance from the prior, and its Jacobian."""
+        in_terms, in_bodies, weights = self.split(x)
+        center, spread = self.terms.prior()
+        values, blocks = [torch.as_tensor((in_terms - center) / spread)], [torch.diag(torch.as_tensor(1.0 / spread))]
+        if self.bodies is not None:
+            distance, jacobian = self.bodies.distance(in_bodies)
+            values, blocks = [*values, torch.as_tensor(distance)], [*blocks, torch.as_tensor(jacobian)]
+        return torch.cat([*values, weights]), torch.block_diag(*blocks, torch.eye(len(weights), dtype=x.dtype))
+
+    def system(self, x: Tensor) -> MechanicalSystem:
+        """The system with these terms and bodies."""
+        in_terms, in_bodies, _ = self.split(x)
+        system = self.start.system
+        kept = [force for force in system.known_forces if type(force) not in self.terms.kinds]
+        robot = system.robot
+        if self.bodies is not None:
+            robot = with_bodies(robot, self.bodies.pseudo_inertias(in_bodies))
+        return replace(system, robot=robot, known_forces=(*kept, *self.terms.known_forces(in_terms)))
+
+    def posterior(self, x: Tensor, space: WeightSpace | None = None) -> Structured:
+        """The posterior with that system and these weights."""
+        space = replace(self.space, mean=self.split(x)[2]) if space is None else space
+        latent = InducingPosterior(self.start.kernels, space) if self.space.count else self.start.latent
+        return replace(self.start, target=self.system(x), latent=latent)
+
+    def accelerations(self, x: Tensor) -> Callable[[Tensor, Tensor, Tensor, bool], Linear]:
+        """The mean acceleration and its derivatives, in x as well."""
+        posterior, (in_terms, in_bodies, _) = self.posterior(x), self.split(x)
+        mean, nv = posterior.accelerations(None).mean(), posterior.system.robot.nv
+        prior, standardize = posterior.model.prior, posterior.likelihood.standardization
+
+        def at(q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
+            a, slopes = rows_jacobian(lambda state: mean(*state.split(nv, dim=-1), u), torch.cat([q, v], dim=-1))
+            a_q, a_v = slopes.split(nv, dim=-1)
+            if not parameters:
+                return Linear(a, a_q, a_v)
+            with torch.no_grad():
+                dynamics = posterior.dynamics(q, v, u)
+                _, added = self.terms.torque(in_terms, v.numpy(), a.numpy(), u.abs().numpy())
+                columns = [-torch.as_tensor(added)]
+                if self.bodies is not None:
+                    Y = dynamics.state.kinematics.torque_regressor(a)
+                    of_bodies = torch.einsum("nibp,bpk->nibk", Y, torch.as_tensor(self.bodies.derivatives(in_bodies)))
+                    columns.append(-of_bodies.flatten(2))
+                if self.space.count:
+                    phi = self.space.columns(standardize(prior.features(dynamics)))
+                    mixing = prior.mixing(dynamics)
+                    columns += [mixing[..., c : c + 1] * f.mT[:, None] for c, f in enumerate(phi)]
+                return Linear(a, a_q, a_v, dynamics.H @ torch.cat(columns, dim=-1))
+
+        return at
+
+
+def _space(posterior: Structured) -> WeightSpace:
+    """Weights of the latents that the posterior has, or of as many inducing points as its features need."""
+    if isinstance(posterior.latent, InducingPosterior):
+        return posterior.latent.space
+    with torch.no_grad():
+        terms = posterior.likelihood.terms(posterior.parameters)
+        deflation, kernels = terms.deflated(), posterior.kernels
+        points = []
+        for c, z in enumerate(terms.features):
+            relevance = deflation.C[..., c].square().sum(1)
+            most = POINTS.get(z.shape[-1], MORE)
+            points.append(z[pivoted_cholesky(kernels.dense[c], z, relevance, most).indices])
+        return WeightSpace.of(kernels, terms.features, points, deflation.C, deflation.t)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Unknowns x, initial states (K, 2 nv), the motions from there, and the objective."""
+
+    x: Tensor
+    states: Tensor
+    motions: WindowMotions
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class MotionFit:
+    """The recorded windows, the unknowns and the noise that residuals have: what is minimised, and how."""
+
+    recorded: RecordedMotions
+    stride: int
+    unknowns: Unknowns
+
+    @property
+    def h(self) -> float:
+        """The step in s."""
+        return self.stride * self.recorded.dt
+
+    @cached_property
+    def q(self) -> Float[Tensor, "K T+1 nv"]:
+        """Recorded positions at the ends of the steps."""
+        return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
+
+    @cached_property
+    def u(self) -> Float[Tensor, "K T nv"]:
+        """Actuator forces, their mean over each step."""
+        return torch.as_tensor(self.recorded.u.copy()).unflatten(1, (-1, self.stride)).mean(2)
+
+    @cached_property
+    def start(self) -> Float[Tensor, "K 2*nv"]:
+        """Recorded initial states."""
+        return torch.as_tensor(np.concatenate([self.recorded.q[:, 0], self.recorded.v[:, 0]], axis=-1))
+
+    def spread(self, sigma: Tensor) -> Float[Tensor, " 2*nv"]:
+        """Standard deviations of initial states about the recorded ones."""
+        speed = torch.as_tensor(self.recorded.v.copy()).square().mean((0, 1)).sqrt()
+        return torch.cat([sigma, (SPEED * speed).clamp_min(1e-9)])
+
+    def at(self, x: Tensor, states: Tensor, noise: Tensor, sigma: Tensor, near: WindowMotions | None) -> _Point:
+        """The point, its motions sought from those of another; infinitely bad where there are none."""
+        q, nv = self.q, self.q.shape[-1]
+        guess = ((q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / self.h)
+        if near is not None:
+            guess = near.middle_q, near.middle_v
+        accelerations = self.unknowns.accelerations(x)
+        start = states.split(nv, dim=-1)
+        motions = window_motions(accelerations, *start, self.u, self.h, guess, derivatives=True)
+        residual = (motions.q - q) / noise
+        away = (states - self.start) / self.spread(sigma)
+        from_prior, _ = self.unknowns.prior(x)
+        cost = 0.5 * float(residual.square().sum() + away.square().sum() + from_prior.square().sum())
+        good = bool(motions.found.all()) and math.isfinite(cost)
+        return _Point(x, states, motions, cost if good else math.inf)
+
+    def curvature(self, here: _Point, noise: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gauss-Newton's matrix and right side for x, and (G, g) with the change of states g - G dx, (K, 2 nv, ...)."""
+        motions = here.motions
+        assert motions.in_start is not None and motions.in_parameters is not None
+        A = (motions.in_start / noise[:, None]).flatten(1, 2)
+        B = (motions.in_parameters / noise[:, None]).flatten(1, 2)
+        r = ((self.q - motions.q) / noise).flatten(1)[..., None]
+        weight = self.spread(sigma) ** -2
+        of_states = A.mT @ A + torch.diag(weight)
+        pull = A.mT @ r - (weight * (here.states - self.start))[..., None]
+        solved = torch.linalg.solve(of_states, torch.cat([A.mT @ B, pull], dim=-1))
+        G, g = solved[..., :-1], solved[..., -1]
+        values, jacobian = self.unknowns.prior(here.x)
+        N = (B.mT @ B - (A.mT @ B).mT @ G).sum(0) + jacobian.mT @ jacobian
+        right = (B.mT @ r - (A.mT @ B).mT @ g[..., None]).sum(0)[:, 0] - jacobian.mT @ values
+        return N, right, G, g
+
+    def minimized(self, here: _Point, noise: Tensor, sigma: Tensor, report: Callable[[float], None]) -> _Point:
+        """Levenberg-Marquardt for given noise."""
+        damping = 1e-3
+        here = self.at(here.x, here.states, noise, sigma, here.motions)
+        for _ in range(ITERATIONS):
+            N, right, G, g = self.curvature(here, noise, sigma)
+            while True:
+                dx = torch.linalg.solve(N + damping * torch.diag(N.diagonal()), right)
+                there = self.at(here.x + dx, here.states + g - G @ dx, noise, sigma, here.motions)
+                if there.cost < here.cost or damping > 1e8:
+                    break
+                damping *= 5.0
+            gain = here.cost - there.cost
+            if not gain > 0.0:
+                return here
+            here, damping = there, max(0.2 * damping, 1e-9)
+            report(float((self.q - here.motions.q).square().mean().sqrt()))
+            if gain < CONTENT:
+                break
+        return here
+
+    def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
+        """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
+        residual = motions.q - self.q
+        sigma = residual.square().mean((0, 1)).sqrt().clamp_min(1e-12)
+        window = np.repeat(np.arange(len(residual)), residual.shape[1])
+        time = torch.as_tensor(correlation_time((residual / sigma).flatten(0, 1).numpy(), window))
+        return sigma, sigma * time.clamp_min(1.0).sqrt()
+
+
+def refine_on_motions(
+    posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None = None
+) -> Structured:
+    """What `Structured.refined_on_motions` documents."""
+    require_type("dataset", dataset, Dataset)
+    if isinstance(seconds, bool) or not (isinstance(seconds, int | float) and 0.0 < seconds < math.inf):
+        raise InvalidInput(f"seconds is {seconds!r}; give the length of the windows as a positive number, such as 1.0.")
+    if posterior.model.mean != "analytical":
+        raise InvalidInput(
+            "the model has no analytical mean, so its processes hold gravity and inertia, which motions of some seconds "
+            "do not tell; fit with mean='analytical'."
+        )
+    if posterior.identification is not None:
+        raise InvalidInput(
+            "the model learned physical parameters with its accelerations; write its system, fit a model with that one "
+            "(forcegp fit --identified RUN), and refine this."
+        )
+    recorded, stride = all_motions(dataset, seconds, STEP)
+    fit = MotionFit(recorded, stride, Unknowns.of(posterior, dataset, inertias))
+    x, states = fit.unknowns.first, fit.start
+    one = torch.ones(states.shape[-1] // 2, dtype=x.dtype)
+    here = fit.at(x, states, one, one, None)
+    if not math.isfinite(here.cost):
+        raise NumericalError(
+            f"the model that is refined finds no motion near the recorded one within {seconds:g} s; give fewer seconds, "
+            "or a model that fits its accelerations better."
+        )
+    before = sigma, noise = fit.noise(here.motions)
+    done, settled = 0, False
+
+    def say(rms: float) -> None:
+        nonlocal done
+        done += 1
+        if report is not None:
+            report(done, rms)
+
+    for _ in range(ROUNDS):
+        here = fit.minimized(here, noise, sigma, say)
+        last, (sigma, noise) = noise, fit.noise(here.motions)
+        settled = bool(((noise - last).abs() <= SETTLED * last).all())
+        if settled:
+            break
+    if not settled:
+        warnings.warn(
+            f"the noise of motions has not settled after {ROUNDS} rounds; give other seconds, or look at the errors",
+            NumericalWarning,
+            stacklevel=3,
+        )
+    return _refined(fit, here, noise, sigma, before[0], seconds)
+
+
+def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, before: Tensor, seconds: float) -> Structured:
+    """The posterior there, with the covariance of the weights."""
+    N, *_ = fit.curvature(here, noise, sigma)
+    unknowns = fit.unknowns
+    others = sum(unknowns.sizes[:2])
+    space = replace(unknowns.space, mean=here.x[others:])
+    if space.count:
+        marginal = N[others:, others:]
+        if others:
+            marginal = marginal - N[others:, :others] @ torch.linalg.solve(N[:others, :others], N[:others, others:])
+        space = replace(space, precision=factorize((0.5 * (marginal + marginal.mT)).clone))
+    deviation = torch.linalg.inv(N).diagonal()[: unknowns.sizes[0]].clamp_min(0.0).sqrt()
+    _, spread = unknowns.terms.prior()
+    slopes = torch.as_tensor(unknowns.terms.slopes(here.x[: unknowns.sizes[0]].numpy())).flatten()
+    values = unknowns.terms.values(here.x[: unknowns.sizes[0]].numpy()).ravel()
+    names = unknowns.terms.names
+    found = unknowns.posterior(here.x, space)
+    engine = found.engine if not space.count else InducingWeights(tuple(len(z) for z in space.points))
+    told = {
+        "seconds": seconds,
+        "windows": len(fit.recorded.q),
+        "step": fit.h,
+        "rms_before": before.tolist(),
+        "rms_after": sigma.tolist(),
+        "parameters": dict(zip(names, values.tolist(), strict=True)),
+        "standard_errors": dict(zip(names, (slopes * deviation).tolist(), strict=True)),
+        "not_told": [n for n, s, p in zip(names, deviation.tolist(), spread, strict=True) if s > HELD * p],
+    }
+    return replace(found, engine=engine).with_settings(motions=told, engine=engine.to_dict(), widening=1.0)
