@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-MOST_PASSES = 40
-FULL_PASSES = 10
-"""Passes after which guesses move half of the way only, where friction makes them jump to and fro."""
+from forcegp.integration.integrators import find_roots
+
+MOST_PASSES = 20
 TOLERANCE = 1e-9
 """Change of a middle velocity, relative to the largest, at which the motions are found."""
 
@@ -38,8 +38,15 @@ class Linear:
     a_p: Float[Tensor, "n nv P"] | None = None
 
 
-LinearAccelerations = Callable[[Tensor, Tensor, Tensor, bool], Linear]
-"""(q, v, u), each (n, nv), and whether derivatives in the parameters are asked for."""
+@dataclass(frozen=True, eq=False)
+class Accelerations:
+    """The accelerations of states (q, v, u), each (n, nv), which torch can differentiate, and their `Linear`.
+
+    `linear` is asked with and without derivatives in the parameters.
+    """
+
+    mean: Callable[[Tensor, Tensor, Tensor], Tensor]
+    linear: Callable[[Tensor, Tensor, Tensor, bool], Linear]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +66,7 @@ class WindowMotions:
 
 
 def window_motions(
-    accelerations: LinearAccelerations,
+    accelerations: Accelerations,
     q0: Float[Tensor, "K nv"],
     v0: Float[Tensor, "K nv"],
     u: Float[Tensor, "K T nv"],
@@ -70,31 +77,57 @@ def window_motions(
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles; without derivatives where those are not asked for.
 
-    Windows that are not found after `MOST_PASSES` are reported as such, with what the last pass gave.
+    Windows that `MOST_PASSES` do not find are stepped through one by one; where that fails, too, `found` is False.
     """
-    middle_q, middle_v = guess
+    middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
-    for done in range(MOST_PASSES):
-        at = _at(accelerations, middle_q, middle_v, u, False)
-        q, v, _ = _pass(at, q0, v0, middle_q, middle_v, h)
+    left = torch.arange(len(q0), device=q0.device)
+    for _ in range(MOST_PASSES):  # of those that are not found: a turn of dry friction is met one pass after the other
+        at = _at(accelerations, middle_q[left], middle_v[left], u[left], False)
+        q, v, _ = _pass(at, q0[left], v0[left], middle_q[left], middle_v[left], h)
         there_q, there_v = (q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / h
-        change = (there_v - middle_v).abs().flatten(1).amax(1)
-        found = change <= TOLERANCE * (1.0 + there_v.abs().flatten(1).amax(1))
-        share = 1.0 if done < FULL_PASSES else 0.5
-        middle_q, middle_v = middle_q + share * (there_q - middle_q), middle_v + share * (there_v - middle_v)
-        if bool((found | ~change.isfinite()).all()):
+        change = (there_v - middle_v[left]).abs().flatten(1).amax(1)
+        middle_q[left], middle_v[left] = there_q, there_v
+        found[left] = change <= TOLERANCE * (1.0 + there_v.abs().flatten(1).amax(1))
+        left = left[~found[left] & change.isfinite()]
+        if not len(left):
             break
+    for row in left.tolist():
+        there = _step_by_step(accelerations, q0[row], v0[row], u[row], h)
+        found[row] = there is not None
+        if there is not None:
+            middle_q[row], middle_v[row] = there
+    at = _at(accelerations, middle_q, middle_v, u, derivatives)
+    q, v, slopes = _pass(at, q0, v0, middle_q, middle_v, h)
     if not derivatives:
         return WindowMotions(q, v, middle_q, middle_v, found)
-    at = _at(accelerations, middle_q, middle_v, u, True)
-    q, v, slopes = _pass(at, q0, v0, middle_q, middle_v, h)
     start = 2 * q0.shape[-1]
     return WindowMotions(q, v, middle_q, middle_v, found, slopes[..., :start], slopes[..., start:])
 
 
-def _at(accelerations: LinearAccelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
+def _step_by_step(
+    accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float
+) -> tuple[Float[Tensor, "T nv"], Float[Tensor, "T nv"]] | None:
+    """The middles of one motion, by Newton's method with shorter steps; None where it has no end."""
+    middles = []
+    for force in u[:, None]:
+        at, found = find_roots(_residual(accelerations, q[None], v[None], force, h), v[None])
+        if not bool(found.all()):
+            return None
+        middle = at[0]
+        middles.append((q + 0.5 * h * middle, middle))
+        q, v = q + h * middle, 2.0 * middle - v
+    positions, velocities = zip(*middles, strict=True)
+    return torch.stack(positions), torch.stack(velocities)
+
+
+def _residual(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float) -> Callable[[Tensor], Tensor]:
+    return lambda at: at - v - 0.5 * h * accelerations.mean(q + 0.5 * h * at, at, u)
+
+
+def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
     """With dimensions (K, T, ...)."""
-    found = accelerations(*(x.flatten(0, 1) for x in (q, v, u)), parameters)
+    found = accelerations.linear(*(x.flatten(0, 1) for x in (q, v, u)), parameters)
     shaped = (None if x is None else x.unflatten(0, q.shape[:2]) for x in (found.a, found.a_q, found.a_v, found.a_p))
     return Linear(*shaped)  # type: ignore[arg-type]  # a_p alone can be None
 

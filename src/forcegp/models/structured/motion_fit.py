@@ -43,7 +43,7 @@ from forcegp.inference import InducingPosterior, InducingWeights
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.inducing import WeightSpace, pivoted_cholesky
 from forcegp.integration.integrators import rows_jacobian
-from forcegp.integration.midpoint_sensitivities import Linear, WindowMotions, window_motions
+from forcegp.integration.midpoint_sensitivities import Accelerations, Linear, WindowMotions, window_motions
 from forcegp.mechanics import MechanicalSystem
 
 Report = Callable[[int, float], None]
@@ -54,12 +54,15 @@ STEP = 0.005
 POINTS = {1: 24, 2: 48}
 """Inducing points of a latent with so many features; `MORE` of others."""
 MORE = 96
-SPEED = 0.05
+import os
+SPEED = float(os.environ.get("SP","0.05"))
 """Standard deviation of a window's initial velocity, relative to that of all velocities: it comes from a filter."""
-ITERATIONS, ROUNDS = 40, 4
+ITERATIONS, ROUNDS = 12, 8
 """Most steps for given noise, and times that the noise is estimated anew."""
-CONTENT = 0.01
-"""Nats by which a step must lower the objective for the search to go on."""
+CONTENT = 0.1
+"""Nats by which a step must be expected to lower the objective for the search to go on."""
+MOST_DAMPING = 1e6
+"""Beyond it steps are too small to matter."""
 SETTLED = 0.02
 """Relative change of the noise that ends the rounds."""
 HELD = 0.5
@@ -102,6 +105,14 @@ class Unknowns:
         """What the posterior that was given has."""
         return torch.cat([torch.as_tensor(self.terms.start(unlisted=0.0)), torch.zeros(self.sizes[1]), self.space.mean])
 
+    @cached_property
+    def limits(self) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
+        """Least and largest values, and the most that one step should change."""
+        free = np.full(sum(self.sizes[1:]), np.inf)
+        low, high = self.terms.bounds
+        longest = np.concatenate([self.terms.longest_steps, np.full(self.sizes[1], 1.0), free[self.sizes[1] :]])
+        return tuple(torch.as_tensor(x) for x in (np.append(low, -free), np.append(high, free), longest))  # type: ignore[return-value]
+
     def prior(self, x: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, "P P"]]:
         """Standardised distance from the prior, and its Jacobian."""
         in_terms, in_bodies, weights = self.split(x)
@@ -128,7 +139,7 @@ class Unknowns:
         latent = InducingPosterior(self.start.kernels, space) if self.space.count else self.start.latent
         return replace(self.start, target=self.system(x), latent=latent)
 
-    def accelerations(self, x: Tensor) -> Callable[[Tensor, Tensor, Tensor, bool], Linear]:
+    def accelerations(self, x: Tensor) -> Accelerations:
         """The mean acceleration and its derivatives, in x as well."""
         posterior, (in_terms, in_bodies, _) = self.posterior(x), self.split(x)
         mean, nv = posterior.accelerations(None).mean(), posterior.system.robot.nv
@@ -153,7 +164,7 @@ class Unknowns:
                     columns += [mixing[..., c : c + 1] * f.mT[:, None] for c, f in enumerate(phi)]
                 return Linear(a, a_q, a_v, dynamics.H @ torch.cat(columns, dim=-1))
 
-        return at
+        return Accelerations(mean, at)
 
 
 def _space(posterior: Structured) -> WeightSpace:
@@ -230,43 +241,71 @@ class MotionFit:
         good = bool(motions.found.all()) and math.isfinite(cost)
         return _Point(x, states, motions, cost if good else math.inf)
 
-    def curvature(self, here: _Point, noise: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gauss-Newton's matrix and right side for x, and (G, g) with the change of states g - G dx, (K, 2 nv, ...)."""
+    def whitened(self, here: _Point, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Residuals of the windows (K, n) and their Jacobians in states (K, n, 2 nv) and unknowns (K, n, P)."""
         motions = here.motions
-        assert motions.in_start is not None and motions.in_parameters is not None
-        A = (motions.in_start / noise[:, None]).flatten(1, 2)
-        B = (motions.in_parameters / noise[:, None]).flatten(1, 2)
-        r = ((self.q - motions.q) / noise).flatten(1)[..., None]
+        parts = (motions.q - self.q)[..., None], motions.in_start, motions.in_parameters
+        r, A, B = ((part / noise[:, None]).flatten(1, 2) for part in parts if part is not None)
+        return r[..., 0], A, B
+
+    def curvature(
+        self, here: _Point, noise: Tensor, sigma: Tensor, damping: float = 0.0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gauss-Newton's matrix and right side for x, and (G, g) with the change of states g - G dx, (K, 2 nv, ...).
+
+        Diagonals are 1 + `damping` times as large, those of states as well: near a reversal of dry friction a motion
+        hangs on its start.
+        """
+        r, A, B = self.whitened(here, noise)
         weight = self.spread(sigma) ** -2
-        of_states = A.mT @ A + torch.diag(weight)
-        pull = A.mT @ r - (weight * (here.states - self.start))[..., None]
-        solved = torch.linalg.solve(of_states, torch.cat([A.mT @ B, pull], dim=-1))
+        of_states, mixed = A.mT @ A + torch.diag(weight), A.mT @ B
+        of_states.diagonal(dim1=1, dim2=2).mul_(1.0 + damping)
+        pull = (A.mT @ r[..., None]) + (weight * (here.states - self.start))[..., None]
+        solved = torch.linalg.solve(of_states, torch.cat([mixed, -pull], dim=-1))
         G, g = solved[..., :-1], solved[..., -1]
         values, jacobian = self.unknowns.prior(here.x)
-        N = (B.mT @ B - (A.mT @ B).mT @ G).sum(0) + jacobian.mT @ jacobian
-        right = (B.mT @ r - (A.mT @ B).mT @ g[..., None]).sum(0)[:, 0] - jacobian.mT @ values
-        return N, right, G, g
+        N = (B.mT @ B).sum(0) + jacobian.mT @ jacobian
+        N.diagonal().mul_(1.0 + damping)
+        right = -(B.mT @ r[..., None] + mixed.mT @ g[..., None]).sum(0)[:, 0] - jacobian.mT @ values
+        return N - (mixed.mT @ G).sum(0), right, G, g
 
-    def minimized(self, here: _Point, noise: Tensor, sigma: Tensor, report: Callable[[float], None]) -> _Point:
-        """Levenberg-Marquardt for given noise."""
-        damping = 1e-3
+    def expected(self, here: _Point, noise: Tensor, sigma: Tensor, dx: Tensor, change: Tensor) -> float:
+        """The objective that linearised motions have after a step."""
+        r, A, B = self.whitened(here, noise)
+        r = r + (A @ change[..., None])[..., 0] + B @ dx
+        away = (here.states + change - self.start) / self.spread(sigma)
+        values, jacobian = self.unknowns.prior(here.x)
+        return 0.5 * float(r.square().sum() + away.square().sum() + (values + jacobian @ dx).square().sum())
+
+    def step(self, x: Tensor, N: Tensor, right: Tensor) -> Float[Tensor, " P"]:
+        """The change that solves N dx = right within the limits: what pushes against one stays there."""
+        low, high, longest = self.unknowns.limits
+        free = ~(((x <= low) & (right < 0.0)) | ((x >= high) & (right > 0.0)))
+        dx = torch.zeros_like(x)
+        dx[free] = torch.linalg.solve(N[free][:, free], right[free])
+        dx /= max(1.0, float((dx.abs() / longest).max())) if len(dx) else 1.0
+        return (x + dx).clamp(low, high) - x
+
+    def minimized(
+        self, here: _Point, noise: Tensor, sigma: Tensor, damping: float, report: Callable[[float], None]
+    ) -> tuple[_Point, float]:
+        """Levenberg-Marquardt for given noise, from that damping; the last damping as well."""
         here = self.at(here.x, here.states, noise, sigma, here.motions)
         for _ in range(ITERATIONS):
-            N, right, G, g = self.curvature(here, noise, sigma)
-            while True:
-                dx = torch.linalg.solve(N + damping * torch.diag(N.diagonal()), right)
-                there = self.at(here.x + dx, here.states + g - G @ dx, noise, sigma, here.motions)
-                if there.cost < here.cost or damping > 1e8:
-                    break
-                damping *= 5.0
-            gain = here.cost - there.cost
-            if not gain > 0.0:
-                return here
-            here, damping = there, max(0.2 * damping, 1e-9)
-            report(float((self.q - here.motions.q).square().mean().sqrt()))
-            if gain < CONTENT:
+            N, right, G, g = self.curvature(here, noise, sigma, damping)
+            dx = self.step(here.x, N, right)
+            change = g - G @ dx
+            foreseen = here.cost - self.expected(here, noise, sigma, dx, change)
+            if not foreseen > CONTENT or damping > MOST_DAMPING:
                 break
-        return here
+            there = self.at(here.x + dx, here.states + change, noise, sigma, here.motions)
+            gain = (here.cost - there.cost) / foreseen
+            # Marquardt's rule: trust the linear model more where it was right, less where it was wrong
+            damping = max(0.2 * damping, 1e-9) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
+            if gain > 0.0:
+                here = there
+                report(float((self.q - here.motions.q).square().mean().sqrt()))
+        return here, damping
 
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
         """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
@@ -305,7 +344,7 @@ def refine_on_motions(
             "or a model that fits its accelerations better."
         )
     before = sigma, noise = fit.noise(here.motions)
-    done, settled = 0, False
+    done, settled, damping = 0, False, 1e-3
 
     def say(rms: float) -> None:
         nonlocal done
@@ -314,7 +353,7 @@ def refine_on_motions(
             report(done, rms)
 
     for _ in range(ROUNDS):
-        here = fit.minimized(here, noise, sigma, say)
+        here, damping = fit.minimized(here, noise, sigma, damping, say)
         last, (sigma, noise) = noise, fit.noise(here.motions)
         settled = bool(((noise - last).abs() <= SETTLED * last).all())
         if settled:
