@@ -41,6 +41,7 @@ PACKAGES = {
         "robots",
         "mechanics",
         "data",
+        "analytical",
         "priors",
         "inference",
         "integration",

@@ -75,7 +75,7 @@ def window_motions(
     *,
     derivatives: bool,
 ) -> WindowMotions:
-    """The motions from (q0, v0) under u, from a guess of the middles; without derivatives where those are not asked for.
+    """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
     Windows that `MOST_PASSES` do not find are stepped through one by one; where that fails, too, `found` is False.
     """
@@ -128,8 +128,8 @@ def _residual(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: 
 def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
     """With dimensions (K, T, ...)."""
     found = accelerations.linear(*(x.flatten(0, 1) for x in (q, v, u)), parameters)
-    shaped = (None if x is None else x.unflatten(0, q.shape[:2]) for x in (found.a, found.a_q, found.a_v, found.a_p))
-    return Linear(*shaped)  # type: ignore[arg-type]  # a_p alone can be None
+    a, a_q, a_v = (x.unflatten(0, q.shape[:2]) for x in (found.a, found.a_q, found.a_v))
+    return Linear(a, a_q, a_v, None if found.a_p is None else found.a_p.unflatten(0, q.shape[:2]))
 
 
 def _pass(

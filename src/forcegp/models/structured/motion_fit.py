@@ -3,12 +3,12 @@
 Accelerations of a log are filtered and differentiated; their errors resemble each other over the filter's memory and
 integrate into motions. Here the recording is cut into windows k of some tenths of a second to some seconds, and
 
-    1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |w|^2 + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2_S
+    1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |w|^2 + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2
 
-is minimised over the windows' initial states x_k, joint friction and inertias, and the weights w of the latent functions
-f_c = phi_c . w_c, which are standard normal a priori (`inference.inducing.WeightSpace`): the Gaussian process is the
-regulariser. sigma_j is what motions leave unexplained, tau_j how many rows of a window one independent residual is
-worth (`analytical.least_squares.correlation_time`): without it a window at 1 kHz would count as a thousand facts.
+is minimised over the windows' initial states x_k, joint friction and inertias p, and the weights w of the latent
+functions f_c = phi_c . w_c, which are standard normal a priori (`inference.inducing.WeightSpace`): the Gaussian process
+is the regulariser. sigma_j is what motions leave unexplained, tau_j how many rows of a window one independent residual
+is worth (`analytical.least_squares.correlation_time`): without it a window at 1 kHz would count as a thousand facts.
 
 Gauss-Newton with Levenberg's damping; initial states are eliminated window by window (Schur complement); motions and
 their derivatives come from the implicit midpoint rule (`integration.midpoint_sensitivities`), with
@@ -20,7 +20,6 @@ curvature, with all other unknowns marginalised (Laplace).
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -38,9 +37,10 @@ from forcegp.analytical.joint_terms import INERTIAS, LAWS
 from forcegp.analytical.least_squares import correlation_time
 from forcegp.data import Dataset
 from forcegp.data.motion_records import RecordedMotions, all_motions
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_type
-from forcegp.inference import InducingPosterior, InducingWeights
+from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.inference import InducingPosterior
 from forcegp.inference.cholesky import factorize
+from forcegp.inference.engines import InducingWeights
 from forcegp.inference.inducing import WeightSpace, pivoted_cholesky
 from forcegp.integration.integrators import rows_jacobian
 from forcegp.integration.midpoint_sensitivities import Accelerations, Linear, WindowMotions, window_motions
@@ -54,8 +54,7 @@ STEP = 0.005
 POINTS = {1: 24, 2: 48}
 """Inducing points of a latent with so many features; `MORE` of others."""
 MORE = 96
-import os
-SPEED = float(os.environ.get("SP","0.05"))
+SPEED = 0.02
 """Standard deviation of a window's initial velocity, relative to that of all velocities: it comes from a filter."""
 ITERATIONS, ROUNDS = 12, 8
 """Most steps for given noise, and times that the noise is estimated anew."""
@@ -71,7 +70,7 @@ HELD = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Coordinates x of joint terms, bodies and latent weights, one after the other, and what they make of a posterior."""
+    """Coordinates x of joint terms, bodies and latent weights, in this order, and what they make of a posterior."""
 
     start: Structured
     space: WeightSpace
@@ -80,7 +79,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, posterior: Structured, dataset: Dataset, inertias: bool) -> "Unknowns":
-        """The laws of friction and rotors that the system lists, bodies where asked for, inducing points of the prior."""
+        """Laws of friction and rotors that the system lists, bodies where asked for, inducing points of the prior."""
         robot, _ = thickened(posterior.system.robot)
         system = posterior.system.with_robot(robot) if inertias else posterior.system
         listed = [type(force) for force in system.known_forces]
@@ -232,8 +231,8 @@ class MotionFit:
         if near is not None:
             guess = near.middle_q, near.middle_v
         accelerations = self.unknowns.accelerations(x)
-        start = states.split(nv, dim=-1)
-        motions = window_motions(accelerations, *start, self.u, self.h, guess, derivatives=True)
+        q0, v0 = states.split(nv, dim=-1)
+        motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True)
         residual = (motions.q - q) / noise
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
@@ -278,13 +277,20 @@ class MotionFit:
         return 0.5 * float(r.square().sum() + away.square().sum() + (values + jacobian @ dx).square().sum())
 
     def step(self, x: Tensor, N: Tensor, right: Tensor) -> Float[Tensor, " P"]:
-        """The change that solves N dx = right within the limits: what pushes against one stays there."""
+        """The change that solves N dx = right. Coordinates that it would take beyond their limits end there.
+
+        All others are solved for again, given those, for with latent functions beside them they depend on each other.
+        """
         low, high, longest = self.unknowns.limits
-        free = ~(((x <= low) & (right < 0.0)) | ((x >= high) & (right > 0.0)))
-        dx = torch.zeros_like(x)
-        dx[free] = torch.linalg.solve(N[free][:, free], right[free])
-        dx /= max(1.0, float((dx.abs() / longest).max())) if len(dx) else 1.0
-        return (x + dx).clamp(low, high) - x
+        free, dx = torch.ones_like(x, dtype=torch.bool), torch.zeros_like(x)
+        while bool(free.any()):
+            dx[free] = torch.linalg.solve(N[free][:, free], right[free] - N[free][:, ~free] @ dx[~free])
+            beyond = free & ((x + dx < low) | (x + dx > high))
+            if not bool(beyond.any()):
+                break
+            dx[beyond] = (x + dx).clamp(low, high)[beyond] - x[beyond]
+            free &= ~beyond
+        return dx / max(1.0, float((dx.abs() / longest).max())) if len(dx) else dx
 
     def minimized(
         self, here: _Point, noise: Tensor, sigma: Tensor, damping: float, report: Callable[[float], None]
@@ -307,6 +313,26 @@ class MotionFit:
                 report(float((self.q - here.motions.q).square().mean().sqrt()))
         return here, damping
 
+    def solved(self, report: Callable[[float], None], x: Tensor) -> tuple[_Point, Tensor, Tensor]:
+        """The minimum that is reached from x, with the noise and the sigma that residuals have there.
+
+        Raises NumericalError where no motion is found near the recorded one.
+        """
+        one = torch.ones(self.q.shape[-1], dtype=x.dtype)
+        here, damping = self.at(x, self.start, one, one, None), 1e-3
+        if not math.isfinite(here.cost):
+            raise NumericalError(
+                f"no motion of {self.h * self.u.shape[1]:g} s is found near the recorded one; give fewer seconds, or a "
+                "model that fits the accelerations better."
+            )
+        sigma, noise = self.noise(here.motions)
+        for _ in range(ROUNDS):
+            here, damping = self.minimized(here, noise, sigma, damping, report)
+            last, (sigma, noise) = noise, self.noise(here.motions)
+            if bool(((noise - last).abs() <= SETTLED * last).all()):
+                break
+        return here, noise, sigma
+
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
         """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
         residual = motions.q - self.q
@@ -319,32 +345,30 @@ class MotionFit:
 def refine_on_motions(
     posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None = None
 ) -> Structured:
-    """What `Structured.refined_on_motions` documents."""
+    """What `StructuredPosterior.refined_on_motions` documents."""
+    with torch.no_grad():
+        return _refine(posterior, dataset, seconds, inertias, report)
+
+
+def _refine(
+    posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None
+) -> Structured:
     require_type("dataset", dataset, Dataset)
     if isinstance(seconds, bool) or not (isinstance(seconds, int | float) and 0.0 < seconds < math.inf):
         raise InvalidInput(f"seconds is {seconds!r}; give the length of the windows as a positive number, such as 1.0.")
     if posterior.model.mean != "analytical":
         raise InvalidInput(
-            "the model has no analytical mean, so its processes hold gravity and inertia, which motions of some seconds "
-            "do not tell; fit with mean='analytical'."
+            "the model has no analytical mean, so its processes hold gravity and inertia, which motions of some "
+            "seconds do not tell; fit with mean='analytical'."
         )
     if posterior.identification is not None:
         raise InvalidInput(
-            "the model learned physical parameters with its accelerations; write its system, fit a model with that one "
-            "(forcegp fit --identified RUN), and refine this."
+            "the model learned physical parameters with its accelerations; fit a model of the identified system "
+            "(forcegp fit --identified RUN), and refine that one."
         )
     recorded, stride = all_motions(dataset, seconds, STEP)
-    fit = MotionFit(recorded, stride, Unknowns.of(posterior, dataset, inertias))
-    x, states = fit.unknowns.first, fit.start
-    one = torch.ones(states.shape[-1] // 2, dtype=x.dtype)
-    here = fit.at(x, states, one, one, None)
-    if not math.isfinite(here.cost):
-        raise NumericalError(
-            f"the model that is refined finds no motion near the recorded one within {seconds:g} s; give fewer seconds, "
-            "or a model that fits its accelerations better."
-        )
-    before = sigma, noise = fit.noise(here.motions)
-    done, settled, damping = 0, False, 1e-3
+    unknowns = Unknowns.of(posterior, dataset, inertias)
+    done = 0
 
     def say(rms: float) -> None:
         nonlocal done
@@ -352,47 +376,32 @@ def refine_on_motions(
         if report is not None:
             report(done, rms)
 
-    for _ in range(ROUNDS):
-        here, damping = fit.minimized(here, noise, sigma, damping, say)
-        last, (sigma, noise) = noise, fit.noise(here.motions)
-        settled = bool(((noise - last).abs() <= SETTLED * last).all())
-        if settled:
-            break
-    if not settled:
-        warnings.warn(
-            f"the noise of motions has not settled after {ROUNDS} rounds; give other seconds, or look at the errors",
-            NumericalWarning,
-            stacklevel=3,
-        )
-    return _refined(fit, here, noise, sigma, before[0], seconds)
+    fit = MotionFit(recorded, stride, unknowns)
+    return _refined(fit, *fit.solved(say, unknowns.first), seconds)
 
 
-def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, before: Tensor, seconds: float) -> Structured:
+def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float) -> Structured:
     """The posterior there, with the covariance of the weights."""
     N, *_ = fit.curvature(here, noise, sigma)
     unknowns = fit.unknowns
-    others = sum(unknowns.sizes[:2])
+    (in_terms, *_), others = unknowns.split(here.x), sum(unknowns.sizes[:2])
     space = replace(unknowns.space, mean=here.x[others:])
     if space.count:
         marginal = N[others:, others:]
         if others:
             marginal = marginal - N[others:, :others] @ torch.linalg.solve(N[:others, :others], N[:others, others:])
         space = replace(space, precision=factorize((0.5 * (marginal + marginal.mT)).clone))
-    deviation = torch.linalg.inv(N).diagonal()[: unknowns.sizes[0]].clamp_min(0.0).sqrt()
-    _, spread = unknowns.terms.prior()
-    slopes = torch.as_tensor(unknowns.terms.slopes(here.x[: unknowns.sizes[0]].numpy())).flatten()
-    values = unknowns.terms.values(here.x[: unknowns.sizes[0]].numpy()).ravel()
-    names = unknowns.terms.names
+    deviation = torch.linalg.inv(N).diagonal()[: len(in_terms)].clamp_min(0.0).sqrt().numpy()
+    names, (_, spread), slopes = unknowns.terms.names, unknowns.terms.prior(), unknowns.terms.slopes(in_terms).ravel()
     found = unknowns.posterior(here.x, space)
     engine = found.engine if not space.count else InducingWeights(tuple(len(z) for z in space.points))
     told = {
         "seconds": seconds,
-        "windows": len(fit.recorded.q),
+        "windows": len(fit.recorded.rows),
         "step": fit.h,
-        "rms_before": before.tolist(),
-        "rms_after": sigma.tolist(),
-        "parameters": dict(zip(names, values.tolist(), strict=True)),
+        "rms": sigma.tolist(),
+        "parameters": dict(zip(names, unknowns.terms.values(in_terms).ravel().tolist(), strict=True)),
         "standard_errors": dict(zip(names, (slopes * deviation).tolist(), strict=True)),
-        "not_told": [n for n, s, p in zip(names, deviation.tolist(), spread, strict=True) if s > HELD * p],
+        "not_told": [name for name, s, p in zip(names, deviation, spread, strict=True) if s > HELD * p],
     }
     return replace(found, engine=engine).with_settings(motions=told, engine=engine.to_dict(), widening=1.0)
