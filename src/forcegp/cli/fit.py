@@ -15,7 +15,7 @@ import forcegp.models
 import forcegp.robots
 from forcegp.cli.command import Debug, Json
 from forcegp.cli.model_choice import ModelOptions, make_model, resolved, search_arguments, window_observation
-from forcegp.cli.terminal import Terminal, facts, with_option_names
+from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.errors import InvalidInput
 
 
@@ -33,6 +33,7 @@ class Fit(ModelOptions):
       forcegp fit train.h5 --points 100 --restarts 8 --backend ray --address 10.0.0.1:6379 --out run
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
       forcegp fit raw.h5 --learn-from weak-form --window 0.1 --points 100 --out run
+      forcegp fit log.h5 --identified identified --prior joint-friction --points 400 --motions 1 --out run
     """
 
     json: Json = False
@@ -52,20 +53,22 @@ class Fit(ModelOptions):
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
         self._check(terminal, dataset, system, self.learn_from == "accelerations")
-        rows_note = None
+        recording, rows_note = dataset, None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)
         model = make_model(command, system.to(self.device), dataset)
         observe = window_observation(command.learn_from, command.window)
         points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
         posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
+        if self.motions is not None:
+            posterior = refined_with_progress(terminal, posterior, recording, self.motions)
         summary = fit_summary(posterior, time.monotonic() - start)
         command._write(posterior)
         if rows_note is not None:
             terminal.note(rows_note)
         for doubt in forcegp.evaluation.unfinished_search(posterior):
             terminal.warn(doubt)
-        terminal.show(*_report(self.out, summary))
+        terminal.show(*_report(self.out, summary), *motion_report(posterior))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 
 
@@ -90,6 +93,37 @@ def fit_with_progress(
 
         learn = model.identify if "learn" in how else model.fit_windows if "observe" in how else model.fit
         return learn(dataset, **how, progress=progress)
+
+
+def refined_with_progress(
+    terminal: Terminal, posterior: Any, dataset: forcegp.Dataset, seconds: float, **how: Any
+) -> Any:
+    """`refined_on_motions`, with a bar of steps and the error of the motions."""
+    steps = 100
+    with terminal.progress(f"motions of {seconds:g} s", may_end_early=True) as report:
+        return posterior.refined_on_motions(
+            dataset,
+            seconds,
+            **how,
+            report=lambda step, rms: report(min(step, steps), steps, f"step {step}, rms of q {rms:.3g}"),
+        )
+
+
+def motion_report(posterior: Any) -> list[Any]:
+    """What motions refined, as a table and a sentence; nothing where they did not."""
+    found = posterior.settings.get("motions")
+    if found is None:
+        return []
+    errors = found["standard_errors"]
+    rows = [[name, f"{value:.4g}", f"{errors[name]:.2g}"] for name, value in found["parameters"].items()]
+    error = " ".join(f"{1e3 * rms:.3g}" for rms in found["rms"])
+    summary = (
+        f"{found['windows']} windows of {found['seconds']:g} s, whose initial states are estimated, too: rms of q "
+        f"{error} mrad or mm."
+    )
+    weak = f"Not told by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
+    table = columns("refined on motions", ["", "value", "std. error"], rows)
+    return [*([table] if rows else []), summary, *([weak] if weak else [])]
 
 
 def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import forcegp.inference
 import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
-from forcegp.cli.fit import fit_summary, fit_with_progress
+from forcegp.cli.fit import fit_summary, fit_with_progress, motion_report, refined_with_progress
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import friction_laws, parse_learn, with_learned_forces
 from forcegp.cli.model_choice import FitOptions, resolved_noise
@@ -50,6 +50,9 @@ class IdentifyOptions(FitOptions):
     """With the last two models: count outliers by their absolute value."""
     test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none", Path)] = None
     """With the last two models: score on this recording, too."""
+    motions: Annotated[float | None, unless_given("SECONDS", "none", float)] = None
+    """With consistent: after that, refine all of it on the recorded positions, over windows so long. See
+    docs/motions.md."""
     prior_strength: Annotated[float | None, unless_given("W", "0; 1 for the last two models", float)] = None
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
     points: Annotated[int, arg(metavar="N")] = 200
@@ -71,6 +74,8 @@ INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
     _refuse_what_does_nothing(command)
+    if command.motions is not None and command.model != "consistent":
+        raise InvalidInput("--motions refines a robot, which least-squares need not find; use --model consistent.")
     friction = friction_laws(command.friction)
     command.require_free(command.out)
 
@@ -102,6 +107,12 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
     except NonPhysicalInertia as error:
         identified, why_not = None, str(error)
     content["robot"] = "no" if identified is None else "yes"
+    tables: list[Any] = []
+    if command.motions is not None and identified is not None:
+        model = forcegp.StructuredGP(identified, forcegp.NoForces(), noise=forcegp.Noise(None, learn=True))
+        rough = model.fit(dataset, points=min(command.points, len(dataset)), restarts=1)
+        refined = refined_with_progress(terminal, rough, dataset, command.motions)
+        identified, content["motions"], tables = refined.system, refined.settings["motions"], motion_report(refined)
     with command.folder(command.out, command._given()) as folder:
         write_json(folder / "identification.json", content)
         if identified is not None:
@@ -109,7 +120,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
             (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
-    terminal.show(*_report_of_regression(command, found, content, identified))
+    terminal.show(*tables, *_report_of_regression(command, found, content, identified))
     return {"run": str(command.out), "data": str(command.data), **content}
 
 
@@ -188,6 +199,7 @@ class Identify(IdentifyOptions):
 
     For instance:
       forcegp identify log.h5 --robot arm.urdf --model consistent --friction viscous,coulomb,offset --out identified
+      forcegp identify log.h5 --robot arm.urdf --model consistent --motions 1 --out identified
       forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
       forcegp identify log.h5 --robot arm.urdf --learn tool:mass,com,inertia --learn viscous-joint-friction=0.1
         --noise learned --out identified
@@ -204,6 +216,8 @@ class Identify(IdentifyOptions):
             raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
         if self.model in INERTIAS:
             return identify_by_regression(self, terminal)
+        if self.motions is not None:
+            raise InvalidInput("--motions goes with --model consistent; for the processes use forcegp fit --motions.")
         self.require_free(self.out)
         learn = parse_learn(self.learn)
 

@@ -77,6 +77,9 @@ class ModelOptions(FitOptions):
     which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
     window: Annotated[float | None, unless_given("SECONDS", f"{WINDOW}", float)] = None
     """Length of the windows."""
+    motions: Annotated[float | None, unless_given("SECONDS", "none", float)] = None
+    """After that, refine friction, inertias and the unknown forces on the recorded positions, over windows so long. See
+    docs/motions.md."""
     iterations: Annotated[int | None, unless_given("N", ITERATIONS_HINT, int)] = None
     """Most L-BFGS iterations of each start, or training steps of a network."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
@@ -99,6 +102,7 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "engine": ("structured", "unconstrained"),
     "learning_points": ("structured", "unconstrained"),
     "learn_from": ("structured", "unconstrained", "analytical"),
+    "motions": ("structured", "analytical"),
     "backend": SEARCHED,
     "address": SEARCHED,
     "adam_steps": (*SEARCHED, "analytical"),

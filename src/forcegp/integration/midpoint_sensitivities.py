@@ -127,7 +127,7 @@ def _residual(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: 
 
 def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
     """With dimensions (K, T, ...)."""
-    found = accelerations.linear(*(x.flatten(0, 1) for x in (q, v, u)), parameters)
+    found = accelerations.linear(q.flatten(0, 1), v.flatten(0, 1), u.flatten(0, 1), parameters)
     a, a_q, a_v = (x.unflatten(0, q.shape[:2]) for x in (found.a, found.a_q, found.a_v))
     return Linear(a, a_q, a_v, None if found.a_p is None else found.a_p.unflatten(0, q.shape[:2]))
 

@@ -37,7 +37,7 @@ from forcegp.analytical.joint_terms import INERTIAS, LAWS
 from forcegp.analytical.least_squares import correlation_time
 from forcegp.data import Dataset
 from forcegp.data.motion_records import RecordedMotions, all_motions
-from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError, require_type
 from forcegp.inference import InducingPosterior
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.engines import InducingWeights
@@ -135,7 +135,7 @@ class Unknowns:
     def posterior(self, x: Tensor, space: WeightSpace | None = None) -> Structured:
         """The posterior with that system and these weights."""
         space = replace(self.space, mean=self.split(x)[2]) if space is None else space
-        latent = InducingPosterior(self.start.kernels, space) if self.space.count else self.start.latent
+        latent = InducingPosterior(space.kernels, space) if self.space.count else self.start.latent
         return replace(self.start, target=self.system(x), latent=latent)
 
     def accelerations(self, x: Tensor) -> Accelerations:
@@ -172,7 +172,7 @@ def _space(posterior: Structured) -> WeightSpace:
         return posterior.latent.space
     with torch.no_grad():
         terms = posterior.likelihood.terms(posterior.parameters)
-        deflation, kernels = terms.deflated(), posterior.kernels
+        deflation, kernels = terms.deflated(), posterior.kernels.at(posterior.parameters)
         points = []
         for c, z in enumerate(terms.features):
             relevance = deflation.C[..., c].square().sum(1)
@@ -230,9 +230,13 @@ class MotionFit:
         guess = ((q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / self.h)
         if near is not None:
             guess = near.middle_q, near.middle_v
-        accelerations = self.unknowns.accelerations(x)
         q0, v0 = states.split(nv, dim=-1)
-        motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True)
+        try:
+            accelerations = self.unknowns.accelerations(x)
+            motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True)
+        except (NumericalError, NonPhysicalInertia):  # a step that went too far
+            nowhere = torch.full_like(q, math.nan)
+            motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
         residual = (motions.q - q) / noise
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)

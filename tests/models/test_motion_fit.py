@@ -1,0 +1,210 @@
+"""Models refined on recorded positions: derivatives, what is recovered, what is stored, what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp import (
+    Dataset,
+    JointFriction,
+    MechanicalSystem,
+    NeuralNetwork,
+    NoForces,
+    Robot,
+    StructuredGP,
+    load_posterior,
+    save_posterior,
+)
+from forcegp.data.motion_records import all_motions, recorded_motions
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.mechanics import Actuation, Armature, CoulombJointFriction, RigidBodyBias, ViscousJointFriction
+from forcegp.models import Noise
+from forcegp.models.structured.motion_fit import MotionFit, Unknowns
+
+URDF = """<robot name="slide"><link name="base"/><link name="cart"><inertial><mass value="5"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="x" type="prismatic">
+<parent link="base"/><child link="cart"/><axis xyz="1 0 0"/><limit lower="-5" upper="5" effort="99" velocity="9"/>
+</joint></robot>"""
+DT = 0.01
+QUIET = Noise(0.5)
+
+
+def slide(viscous: float, coulomb: float) -> MechanicalSystem:
+    friction = ViscousJointFriction(viscous), CoulombJointFriction(coulomb, 0.02)
+    return MechanicalSystem(Robot.from_urdf_text(URDF), (), (Actuation(), RigidBodyBias(), *friction))
+
+
+def line(v: float) -> float:
+    """Friction that the laws describe [N]."""
+    return 3.0 * v + 4.0 * np.tanh(v / 0.02)
+
+
+def bump(v: float) -> float:
+    """The same with a force at speeds near .3 m/s that no law has."""
+    return line(v) + 5.0 * np.exp(-(((v - 0.3) / 0.12) ** 2))
+
+
+def recording(friction, seed: int, seconds: float = 12.0) -> Dataset:
+    """The cart of 5 kg under forces that excite it and hold the middle; positions of .01 mm, bad accelerations."""
+    generator, rows = np.random.default_rng(seed), int(seconds / DT)
+    time, phase = DT * np.arange(rows), generator.uniform(0.0, 6.0, 3)
+    force = sum(9.0 * np.sin(w * time + p) for w, p in zip((1.3, 2.9, 5.1), phase, strict=True))
+    q, v, u = np.zeros((3, rows, 1))
+    for k in range(rows):
+        u[k] = force[k] - 12.0 * q[k]
+        if k + 1 < rows:
+            q[k + 1], v[k + 1] = pushed(friction, float(q[k, 0]), float(v[k, 0]), float(u[k, 0]))
+    a = np.gradient(v, DT, axis=0) + 0.5 * generator.standard_normal((rows, 1))
+    q = q + 1e-5 * generator.standard_normal((rows, 1))
+    return Dataset(q=q, v=v, u=u, a=a, time=time, system=slide(1.0, 1.0), noise_std=np.array([0.5]))
+
+
+def pushed(friction, q: float, v: float, u: float, parts: int = 20) -> tuple[float, float]:
+    """The state a row later, by Heun's method of `parts` steps."""
+    h = DT / parts
+    for _ in range(parts):
+        first = (u - friction(v)) / 5.0
+        second = (u - friction(v + h * first)) / 5.0
+        q, v = q + h * v + 0.5 * h * h * first, v + 0.5 * h * (first + second)
+    return q, v
+
+
+@pytest.fixture(scope="module")
+def along_the_law() -> Dataset:
+    return recording(line, 1)
+
+
+@pytest.fixture(scope="module")
+def beyond_the_law() -> tuple[Dataset, Dataset]:
+    return recording(bump, 2), recording(bump, 3)
+
+
+def analytical(data: Dataset):
+    return StructuredGP(slide(1.0, 1.0), NoForces(), noise=QUIET).fit(data, points=50, restarts=1)
+
+
+def motion_error(posterior, data: Dataset, seconds: float = 1.0) -> float:
+    """Root mean square of q after so long, from recorded states."""
+    recorded = recorded_motions(data, 10, seconds)
+    made = posterior.predictor(covariance="none", compile=False).rollouts(
+        recorded.q[:, 0], recorded.v[:, 0], recorded.u, recorded.dt, integrator="implicit-midpoint"
+    )
+    return float(np.sqrt(np.mean((made.q[:, -1].numpy() - recorded.q[:, -1]) ** 2)))
+
+
+def test_friction_is_recovered_from_positions(along_the_law):
+    before = analytical(along_the_law)
+    after = before.refined_on_motions(along_the_law, 1.0, inertias=False)
+    found = after.settings["motions"]
+    for name, truth in (("viscous.x", 3.0), ("coulomb.x", 4.0)):
+        error = found["standard_errors"][name]
+        assert found["parameters"][name] == pytest.approx(truth, abs=max(4.0 * error, 0.02 * truth))
+        assert 0.0 < error < 0.1 * truth
+    assert motion_error(after, along_the_law) < 1e-3 < 0.05 * motion_error(before, along_the_law)
+    named = {type(force): force for force in after.system.known_forces}
+    assert float(named[ViscousJointFriction].coefficients) == found["parameters"]["viscous.x"]
+    assert after.system.robot.link("cart").mass == 5.0
+    assert float(before.system.known_forces[2].coefficients) == 1.0  # the one that was given stays as it is
+
+
+def test_inertias_are_found_as_well(along_the_law):
+    light = slide(3.0, 4.0)
+    light = light.with_robot(Robot.from_urdf_text(URDF.replace('mass value="5"', 'mass value="4"')))
+    posterior = StructuredGP(light, NoForces(), noise=QUIET).fit(along_the_law, points=50, restarts=1)
+    after = posterior.refined_on_motions(along_the_law, 1.0)
+    assert after.system.robot.link("cart").mass == pytest.approx(5.0, rel=0.01)
+
+
+def test_processes_learn_from_motions_what_no_law_has(beyond_the_law):
+    train, test = beyond_the_law
+    parametric = analytical(train).refined_on_motions(train, 1.0)
+    prior = JointFriction(kernel="matern-3/2")
+    rough = StructuredGP(parametric.system, prior, noise=QUIET).fit(train, points=60, restarts=1)
+    refined = rough.refined_on_motions(train, 1.0)
+    errors = [motion_error(p, test) for p in (parametric, rough, refined)]
+    assert errors[2] < 0.25 * errors[0]
+    assert errors[2] < 0.5 * errors[1]
+    curve = refined.curve(refined.latent_names[0], np.array([0.3]))
+    assert 0.0 < float(curve.std[0]) < 2.0
+
+
+def test_what_is_stored_predicts_the_same(beyond_the_law, tmp_path):
+    train, _ = beyond_the_law
+    rough = StructuredGP(slide(3.0, 4.0), JointFriction(kernel="matern-3/2"), noise=QUIET).fit(
+        train, points=30, restarts=1
+    )
+    refined = rough.refined_on_motions(train, 0.5)
+    save_posterior(refined, tmp_path / "run")
+    again = load_posterior(tmp_path / "run")
+    rows = train.q[:50], train.v[:50], train.u[:50]
+    here, there = refined.predict(*rows), again.predict(*rows)
+    torch.testing.assert_close(there.mean, here.mean, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(there.variance, here.variance, rtol=1e-8, atol=1e-12)
+    assert again.settings["motions"]["windows"] == refined.settings["motions"]["windows"]
+    assert json.loads((tmp_path / "run" / "model.json").read_text())["engine"]["name"] == "inducing-weights"
+    predictor = refined.predictor(compile=False)
+    torch.testing.assert_close(predictor.mean(*rows), here.mean, rtol=1e-9, atol=1e-9)
+    with pytest.raises(InvalidInput, match="fit again, and refine again"):
+        again.engine.condition(again.kernels, again.likelihood.terms(again.parameters))
+
+
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_derivatives_in_every_unknown(contacts):
+    friction = ViscousJointFriction(0.3), CoulombJointFriction(0.2, 0.3), Armature(0.01)
+    system = arm_system(contacts, known_forces=(Actuation(), RigidBodyBias(), *friction))
+    data = arm_data(24, 5, system)
+    posterior = StructuredGP(system, JointFriction()).fit(data, points=24, restarts=1)
+    data = replace(data, v=0.2 * data.v, u=0.3 * data.u, truth={})
+    unknowns = Unknowns.of(posterior, data, True)
+    recorded, stride = all_motions(replace(data, q=data.q[:1].repeat(24, 0)), 0.05, 0.01)
+    fit = MotionFit(recorded, stride, unknowns)
+    generator = torch.Generator().manual_seed(0)
+    x = unknowns.first + 0.05 * torch.rand(len(unknowns.first), generator=generator, dtype=torch.float64)
+    one, small = torch.ones(3, dtype=torch.float64), 1e-5
+    here = fit.at(x, fit.start, one, one, None)
+    assert bool(here.motions.found.all())
+    scale = float(here.motions.in_parameters.abs().max())
+    for k in (*range(0, len(x), 7), len(x) - 1):
+        step = torch.zeros_like(x)
+        step[k] = small
+        ends = [fit.at(x + sign * step, fit.start, one, one, here.motions).motions.q for sign in (1.0, -1.0)]
+        expected = (ends[0] - ends[1]) / (2.0 * small)
+        torch.testing.assert_close(here.motions.in_parameters[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
+
+
+def test_what_cannot_be_refined_is_refused(along_the_law):
+    posterior, short = analytical(along_the_law), along_the_law.rows(slice(40))
+    for seconds in (0.0, -1.0, np.inf, True, "1"):
+        with pytest.raises(InvalidInput, match=r"seconds is .*; give the length"):
+            posterior.refined_on_motions(along_the_law, seconds)
+    with pytest.raises(InvalidInput, match=r"no stretch of 1 s has equal steps"):
+        posterior.refined_on_motions(short, 1.0)
+    uneven = replace(along_the_law, time=along_the_law.time + 4e-3 * np.sin(np.arange(len(along_the_law))))
+    with pytest.raises(InvalidInput, match="resample the recording"):
+        posterior.refined_on_motions(uneven, 1.0)
+    zero = StructuredGP(slide(1.0, 1.0), mean="zero", noise=QUIET).fit(short, points=20, restarts=1)
+    with pytest.raises(InvalidInput, match="fit with mean='analytical'"):
+        zero.refined_on_motions(along_the_law)
+    network = NeuralNetwork(slide(1.0, 1.0), steps=5).fit(short)
+    with pytest.raises(InvalidInput, match="no forces that motions could refine"):
+        network.refined_on_motions(along_the_law)
+    learned = StructuredGP(slide(1.0, 1.0), NoForces(), noise=QUIET).identify(
+        short, learn=[slide(1.0, 1.0).robot.link("cart").inertial("mass")], restarts=1
+    )
+    with pytest.raises(InvalidInput, match="fit a model of the identified system"):
+        learned.refined_on_motions(along_the_law)
+
+
+def test_a_model_without_motions_near_the_recorded_ones_is_refused(along_the_law):
+    class Wild(ViscousJointFriction):
+        def force(self, state):
+            return 1e6 * state.v * state.v.abs()
+
+    system = MechanicalSystem(Robot.from_urdf_text(URDF), (), (Actuation(), RigidBodyBias(), Wild(1.0)))
+    posterior = StructuredGP(system, NoForces(), noise=QUIET).fit(along_the_law, points=20, restarts=1)
+    with pytest.raises(NumericalError, match="give fewer seconds"):
+        posterior.refined_on_motions(along_the_law, 1.0)
