@@ -37,6 +37,17 @@ def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
             parse_arguments(shlex.split(command.partition(">")[0].replace("$seed", "1")))
 
 
+def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "motions.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    windows, rms = run_example(example, tmp_path).split()[:2]
+    assert windows == "7"
+    assert float(rms.strip("[]")) < 1e-3
+    (commands,) = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
+    for command in commands.splitlines():
+        parse_arguments(shlex.split(command)[1:])
+
+
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

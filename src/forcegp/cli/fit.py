@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,6 +45,8 @@ class Fit(ModelOptions):
         if self.seed < 0:
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         self.require_free(self.out)
+        if self.motions is not None and not 0.0 < self.motions < math.inf:
+            raise InvalidInput(f"--motions is {self.motions:g}; give the length of the windows in seconds, such as 1.")
         command = resolved(self)
         self._backend()  # refused now, not after the data are read
         assert command.points is not None, "a resolved command has points"
@@ -116,10 +119,11 @@ def motion_report(posterior: Any) -> list[Any]:
         return []
     errors = found["standard_errors"]
     rows = [[name, f"{value:.4g}", f"{errors[name]:.2g}"] for name, value in found["parameters"].items()]
-    error = " ".join(f"{1e3 * rms:.3g}" for rms in found["rms"])
+    units = ["mm" if joint.type == "prismatic" else "mrad" for joint in posterior.system.robot.joints]
+    error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in zip(found["rms"], units, strict=True))
     summary = (
-        f"{found['windows']} windows of {found['seconds']:g} s, whose initial states are estimated, too: rms of q "
-        f"{error} mrad or mm."
+        f"{found['windows']} windows of {found['seconds']:g} s, whose initial states are estimated, too; rms of q by "
+        f"joint: {error}."
     )
     weak = f"Not told by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
     table = columns("refined on motions", ["", "value", "std. error"], rows)

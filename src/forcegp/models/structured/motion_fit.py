@@ -64,6 +64,8 @@ MOST_DAMPING = 1e6
 """Beyond it steps are too small to matter."""
 SETTLED = 0.02
 """Relative change of the noise that ends the rounds."""
+SCALES = 0.1, 30.0
+"""Least and largest scale: accelerations may show less of a force than motions, and their noise more than there is."""
 HELD = 0.5
 """A parameter whose standard deviation is above this fraction of its prior's is one that the motions do not tell."""
 
@@ -76,6 +78,8 @@ class Unknowns:
     space: WeightSpace
     terms: Any
     bodies: ConsistentBodies | None
+    scales: Float[Tensor, " C"]
+    """Standard deviation of the weights of each latent a priori, over that of its kernel."""
 
     @classmethod
     def of(cls, posterior: Structured, dataset: Dataset, inertias: bool) -> "Unknowns":
@@ -87,7 +91,9 @@ class Unknowns:
         rotors = next((name for name, kind in INERTIAS.items() if kind in listed), None)
         terms = joint_terms(system, laws, rotors, dataset.q, dataset.v, dataset.u, dataset.a)
         bodies = ConsistentBodies(body_pseudo_inertias(robot).cpu().numpy()) if inertias else None
-        return cls(replace(posterior, target=system), _space(posterior), terms, bodies)
+        space = _space(posterior)
+        scales = torch.ones(len(space.points), dtype=torch.float64)
+        return cls(replace(posterior, target=system), space, terms, bodies, scales)
 
     @cached_property
     def sizes(self) -> tuple[int, int, int]:
@@ -120,7 +126,22 @@ class Unknowns:
         if self.bodies is not None:
             distance, jacobian = self.bodies.distance(in_bodies)
             values, blocks = [*values, torch.as_tensor(distance)], [*blocks, torch.as_tensor(jacobian)]
-        return torch.cat([*values, weights]), torch.block_diag(*blocks, torch.eye(len(weights), dtype=x.dtype))
+        sizes = torch.tensor([len(z) for z in self.space.points], dtype=torch.long)
+        each = self.scales.repeat_interleave(sizes)
+        return torch.cat([*values, weights / each]), torch.block_diag(*blocks, torch.diag(1.0 / each))
+
+    def rescaled(self, x: Tensor, N: Tensor) -> "Unknowns":
+        """With the scales that make these weights likely, given the curvature N of the objective at them.
+
+        s^2 = |w|^2 / gamma with gamma the number of weights that the data determine (MacKay, "Bayesian interpolation",
+        Neural Computation 1992, section 4.4).
+        """
+        spread, weights = torch.linalg.inv(N).diagonal()[-self.space.count :], self.split(x)[2]
+        scales = self.scales.clone()
+        for c, part in enumerate(self.space.slices):
+            told = (part.stop - part.start) - float(spread[part].sum() / scales[c] ** 2)
+            scales[c] = (weights[part].square().sum() / max(told, 1e-3)).sqrt().clamp(*SCALES)
+        return replace(self, scales=scales)
 
     def system(self, x: Tensor) -> MechanicalSystem:
         """The system with these terms and bodies."""
@@ -317,8 +338,8 @@ class MotionFit:
                 report(float((self.q - here.motions.q).square().mean().sqrt()))
         return here, damping
 
-    def solved(self, report: Callable[[float], None], x: Tensor) -> tuple[_Point, Tensor, Tensor]:
-        """The minimum that is reached from x, with the noise and the sigma that residuals have there.
+    def solved(self, report: Callable[[float], None], x: Tensor) -> tuple["MotionFit", _Point, Tensor, Tensor]:
+        """The minimum that is reached from x, the noise and sigma that residuals have there, and the scales of weights.
 
         Raises NumericalError where no motion is found near the recorded one.
         """
@@ -330,12 +351,16 @@ class MotionFit:
                 "model that fits the accelerations better."
             )
         sigma, noise = self.noise(here.motions)
+        fit = self
         for _ in range(ROUNDS):
-            here, damping = self.minimized(here, noise, sigma, damping, report)
-            last, (sigma, noise) = noise, self.noise(here.motions)
-            if bool(((noise - last).abs() <= SETTLED * last).all()):
+            here, damping = fit.minimized(here, noise, sigma, damping, report)
+            before, (sigma, noise) = torch.cat([noise, fit.unknowns.scales]), self.noise(here.motions)
+            if fit.unknowns.space.count:
+                N, *_ = fit.curvature(here, noise, sigma)
+                fit = replace(fit, unknowns=fit.unknowns.rescaled(here.x, N))
+            if bool(((torch.cat([noise, fit.unknowns.scales]) - before).abs() <= SETTLED * before).all()):
                 break
-        return here, noise, sigma
+        return fit, here, noise, sigma
 
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
         """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
@@ -381,7 +406,7 @@ def _refine(
             report(done, rms)
 
     fit = MotionFit(recorded, stride, unknowns)
-    return _refined(fit, *fit.solved(say, unknowns.first), seconds)
+    return _refined(*fit.solved(say, unknowns.first), seconds)
 
 
 def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float) -> Structured:
@@ -404,6 +429,7 @@ def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds
         "windows": len(fit.recorded.rows),
         "step": fit.h,
         "rms": sigma.tolist(),
+        "scales": unknowns.scales.tolist(),
         "parameters": dict(zip(names, unknowns.terms.values(in_terms).ravel().tolist(), strict=True)),
         "standard_errors": dict(zip(names, (slopes * deviation).tolist(), strict=True)),
         "not_told": [name for name, s, p in zip(names, deviation, spread, strict=True) if s > HELD * p],
