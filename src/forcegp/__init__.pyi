@@ -18,6 +18,7 @@ from .mechanics import CoulombJointFriction as CoulombJointFriction
 from .mechanics import StribeckJointFriction as StribeckJointFriction
 from .mechanics import LoadJointFriction as LoadJointFriction
 from .mechanics import ConstantJointForce as ConstantJointForce
+from .mechanics import DirectionalJointFriction as DirectionalJointFriction
 from .mechanics import Armature as Armature
 from .mechanics import RotorInertia as RotorInertia
 

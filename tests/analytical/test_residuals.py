@@ -16,6 +16,7 @@ from forcegp.mechanics import (
     Armature,
     ConstantJointForce,
     CoulombJointFriction,
+    DirectionalJointFriction,
     LoadJointFriction,
     RotorInertia,
     StribeckJointFriction,
@@ -28,6 +29,7 @@ FORCES = {
     "stribeck": StribeckJointFriction([0.5, 0.4, 0.3], [0.7, 0.4, 0.9], [0.5, 0.6, 0.7], [0.2, 0.3, 0.4]),
     "load": LoadJointFriction([0.1, 0.05, 0.2], 0.3, [0.2, 0.3, 0.4]),
     "offset": ConstantJointForce([0.5, -0.4, 0.1]),
+    "direction": DirectionalJointFriction([0.2, -0.1, 0.05]),
     "armature": Armature([0.01, 0.02, 0.03]),
     "rotor": RotorInertia([1e-3, 2e-3, 3e-3], [[3.0, 0.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 1.0, 2.0]]),
 }
@@ -36,6 +38,7 @@ CHOICES = [
     ("stribeck", "rotor"),
     ("load", "offset", "armature"),
     ("viscous", None),
+    ("viscous", "direction", "offset"),
 ]
 
 
@@ -102,7 +105,7 @@ def test_jacobians(names, likelihood):
 @pytest.mark.parametrize(
     ("friction", "rotors", "said"),
     [
-        (("sticky",), None, "out of viscous, coulomb, stribeck, load, offset"),
+        (("sticky",), None, "out of viscous, coulomb, stribeck, load, direction, offset"),
         (("coulomb", "stribeck"), None, "name one of them"),
         (("viscous",), "rotor", "lists none; add it to known_forces"),
         (("viscous",), "flywheel", "armature, rotor, or None"),

@@ -276,6 +276,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {"coulomb": 0.1, "static": 0.2, "stribeck_velocity": 0.1},
     ),
     "constant": (functools.partial(_forces, forcegp.ConstantJointForce), lambda: {"values": 0.1}),
+    "direction": (functools.partial(_forces, forcegp.DirectionalJointFriction), lambda: {"differences": 0.1}),
     "armature": (functools.partial(_forces, forcegp.Armature), lambda: {"inertia": 0.1}),
     "rotor": (functools.partial(_forces, forcegp.RotorInertia), lambda: {"inertia": 0.1, "transmission": None}),
     "named_prior": (named_prior, lambda: {"expression": "joint", "system": None}),

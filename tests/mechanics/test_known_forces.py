@@ -17,6 +17,7 @@ from forcegp.mechanics import (
     Armature,
     ConstantJointForce,
     CoulombJointFriction,
+    DirectionalJointFriction,
     KnownForce,
     LoadJointFriction,
     MechanicalSystem,
@@ -51,6 +52,7 @@ FORMULAS = {
         lambda q, v, u: -(0.7 + TENSOR * u.abs()) * (v / 0.02).tanh(),
     ),
     "constant": (lambda: ConstantJointForce(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
+    "direction": (lambda: DirectionalJointFriction(-TENSOR), lambda q, v, u: TENSOR * v.abs()),
     "armature": (lambda: Armature(NUMBERS), lambda q, v, u: torch.zeros_like(u)),
     "rotors": (lambda: RotorInertia(NUMBERS, TRANSMISSION), lambda q, v, u: torch.zeros_like(u)),
 }

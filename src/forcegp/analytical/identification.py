@@ -47,8 +47,8 @@ def identify_analytical(
     dataset: q, v, u and a, filtered alike (`forcegp.data.Preparation`); rows need not be in order of time.
     system: start and prior: the robot, friction it lists, and forces that are given. In no contact. None takes that of
         the dataset.
-    friction: out of "viscous", "coulomb" or "stribeck" or "load" (c + mu |u|), and "offset". Velocity scales are
-        estimated, too.
+    friction: out of "viscous", "coulomb" or "stribeck" or "load" (c + mu |u|), and "offset" and "direction"
+        (viscous friction that differs by direction). Velocity scales are estimated, too.
     rotors: "armature": one inertia per joint. "rotor": those of the system's RotorInertia. None: as listed.
     inertias: "consistent": every estimate belongs to a body (log-Cholesky coordinates, Rucker & Wensing 2022). "free":
         any numbers, that is, ordinary least squares of base parameters, which often give no robot.

@@ -16,6 +16,7 @@ from forcegp.mechanics import (
     Armature,
     ConstantJointForce,
     CoulombJointFriction,
+    DirectionalJointFriction,
     KnownForce,
     LoadJointFriction,
     MechanicalSystem,
@@ -89,6 +90,9 @@ LAWS: dict[str, Law] = {
     ),
     "load": Law(
         LoadJointFriction, (COULOMB, Field("load", "1", (0, 0, 0.1), highest=9.0, known="coefficients"), VELOCITY_SCALE)
+    ),
+    "direction": Law(
+        DirectionalJointFriction, (Field("direction", "force s", (1, -1, 0.1), lowest=-np.inf, known="differences"),)
     ),
     "offset": Law(ConstantJointForce, (Field("offset", "force", (1, 0, 0.1), lowest=-np.inf, known="values"),)),
 }

@@ -40,7 +40,8 @@ class IdentifyOptions(FitOptions):
     least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
     """
     friction: Annotated[str, arg(metavar="NAME,NAME")] = "viscous,coulomb"
-    """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset; none for no friction."""
+    """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset, direction (viscous
+    friction that differs by it); none for no friction."""
     rotors: Literal["armature", "rotor", "none"] = "armature"
     """With the last two models: armature: one rotor inertia per joint. rotor: those of the system's coupled rotors."""
     likelihood: Literal["torque", "acceleration"] = "torque"

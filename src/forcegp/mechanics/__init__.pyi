@@ -4,7 +4,8 @@ from .gauss_principle import (
 )
 from .known_forces import (
     KNOWN_FORCES as KNOWN_FORCES, Actuation as Actuation, Armature as Armature, ConstantJointForce as
-    ConstantJointForce, CoulombJointFriction as CoulombJointFriction, KnownForce as KnownForce, LoadJointFriction as
+    ConstantJointForce, CoulombJointFriction as CoulombJointFriction, DirectionalJointFriction as
+    DirectionalJointFriction, KnownForce as KnownForce, LoadJointFriction as
     LoadJointFriction, RigidBodyBias as RigidBodyBias, RotorInertia as RotorInertia, StribeckJointFriction as
     StribeckJointFriction, ViscousJointFriction as ViscousJointFriction,
 )

@@ -177,6 +177,23 @@ class ConstantJointForce(KnownForce):
 
 
 @dataclass(frozen=True, eq=False)
+class DirectionalJointFriction(KnownForce):
+    """-e |v| with e in Nms/rad or Ns/m, of either sign: viscous friction that differs by e from its mean by direction.
+
+    With `ViscousJointFriction` d it is d + e forwards and d - e backwards; `ConstantJointForce` does the same for dry
+    friction.
+    """
+
+    differences: PerJoint
+    per_joint: ClassVar[tuple[str, ...]] = ("differences",)
+    signed: ClassVar[tuple[str, ...]] = ("differences",)
+
+    @override
+    def force(self, state: State) -> Tensor:
+        return -self.differences * state.v.abs()  # type: ignore[operator]  # a tensor once it is bound
+
+
+@dataclass(frozen=True, eq=False)
 class Armature(KnownForce):
     """Rotor inertia seen at the joint (kg m^2 or kg), added to the mass matrix on top of the robot's own `armature`."""
 
@@ -241,6 +258,7 @@ KNOWN_FORCES: dict[str, type[KnownForce]] = {
     "stribeck-joint-friction": StribeckJointFriction,
     "load-joint-friction": LoadJointFriction,
     "constant-joint-force": ConstantJointForce,
+    "directional-joint-friction": DirectionalJointFriction,
     "armature": Armature,
     "rotor-inertia": RotorInertia,
 }
