@@ -73,7 +73,7 @@ def test_the_report_and_least_squares_that_belong_to_no_robot(forcegp, folder):
     [
         ("--model consistent --learn hand:mass", "--learn means nothing to --model consistent"),
         ("--model least-squares --likelihood acceleration", "inertias='consistent'"),
-        ("--model consistent --friction sticky", "out of viscous, coulomb, stribeck, load, offset"),
+        ("--model consistent --friction sticky", "out of viscous, coulomb, stribeck, load, direction, offset"),
         ("--model consistent --prior-strength 0", "must be > 0"),
         ("--model structured", "nothing to estimate; add --learn"),
     ],
