@@ -287,6 +287,29 @@ def test_the_form_for_acados_works_on_vectors_of_blasfeo(complete, posterior, st
     np.testing.assert_allclose(jacobian.reshape(9, 6), wanted, rtol=1e-9, atol=1e-9)
 
 
+def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
+    """Without an analytical mean, processes sum gravity and inertia up from terms thousands of times as large."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = StructuredGP(arm_system(), mean="zero")
+        smooth = model.fit(arm_data(60, 0), restarts=1, options=OptimizerOptions(iterations=60))
+    predictor, rows = smooth.predictor(covariance="none", compile=False), [torch.tensor(x) for x in states]
+    q, v, u = (x[None] if x.dim() == 1 else x for x in rows)
+    dynamics = smooth.dynamics(q, v, u)
+    W = dynamics.H @ smooth.model.prior.mixing(dynamics)
+    features = smooth.likelihood.standardization(smooth.model.prior.features(dynamics))
+    latent = smooth.latent
+    terms = [
+        (kernel.cross(z, at) * w).abs().sum(-1)
+        for kernel, z, at, w in zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
+    ]
+    largest = (W.abs() @ torch.stack(terms, dim=-1)[..., None]).max() / predictor.mean(q, v, u).abs().max()
+    assert predictor.rounding(q, v, u) == pytest.approx(2.0**-52 * float(largest), rel=1e-6)
+    assert 5e-12 < predictor.rounding(q, v, u) < 1e-6
+    made = export_c(smooth, tmp_path / "arm")
+    assert made.differences["arm_mean"] < 1e-7
+
+
 def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch):
     def spoiled(*arguments):
         return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")

@@ -1,7 +1,5 @@
 """`forcegp export`: write a fitted model as a program for other tools."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

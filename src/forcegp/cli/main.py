@@ -1,7 +1,5 @@
 """`forcegp`: read the arguments, run one command, and turn every failure into one line and an exit code."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -1,7 +1,5 @@
 """`forcegp reproduce`: every figure and number of the paper, from one command."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass

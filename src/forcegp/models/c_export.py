@@ -33,8 +33,8 @@ from forcegp.models.structured.predictor_preparation import sample_states
 
 STATES = 300
 """States at which the program is compared."""
-MEAN_TOLERANCE, TABLE_TOLERANCE = (5e-12, 5e-11), 1e-7
-"""Largest difference relative to the largest value: of sums over up to 100 and more points, and of tables."""
+MEAN_TOLERANCE, TABLE_TOLERANCE = 5e-12, 1e-7
+"""Largest difference relative to the largest value: of sums, unless `Predictor.rounding` is larger, and of tables."""
 LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3}
 """How many times as much as the mean these may differ: more cancels in them."""
 BETWEEN = ("linearize", "step", "step_jacobian")
@@ -174,7 +174,8 @@ def _checks(export: CFiles) -> list[Check]:
     away = torch.randn(len(sampled), 1, generator=torch.Generator().manual_seed(0)).double()
     moved = sampled + 1e-3 * sampled.std(0).clamp_min(1e-3) * away  # as some of these are by nothing
     between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
-    tolerance = TABLE_TOLERANCE if export.table_error else MEAN_TOLERANCE[len(training.q) > 100]
+    rounding = made.rounding(*sampled[finite].chunk(3, dim=-1))
+    tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, rounding)
     found = []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]

@@ -98,7 +98,7 @@ def export_casadi(
         functions[step] = casadi_function(posterior, steps=steps, integrator=integrator, name=step)
         predictor = posterior.predictor(covariance="none", compile=False)
         expected[step] = torch.cat(predictor.step(q, v, u, steps, integrator), dim=-1)
-    found = {}
+    rounding, found = posterior.predictor(covariance="none", compile=False).rounding(q, v, u), {}
     for file, function in functions.items():
         try:
             made = _evaluated(function, [x.numpy().T for x in (q, v, u)])
@@ -108,7 +108,7 @@ def export_casadi(
                 "written; give shorter steps, or export to C, whose Newton method shortens what overshoots."
             ) from None
         worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
-        if not worst <= (STEP_TOLERANCE if file != called else TOLERANCE):
+        if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, rounding):
             raise NumericalError(
                 f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
                 "to C, or fit with fewer points, which cancel less."

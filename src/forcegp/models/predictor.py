@@ -321,6 +321,16 @@ class Predictor(Summary):
         f, cross = self.prepared.mean(inputs)
         return offset + (W @ f[..., None])[..., 0], W, inputs, features, cross
 
+    def rounding(self, q: Tensor, v: Tensor, u: Tensor) -> float:
+        """What rounding of the sums over all points may change in the mean, relative to its largest value there."""
+        mean, W, _, _, cross = self._mean(q, v, u)
+        if not cross:
+            return 0.0
+        terms = self.prepared.ordered(
+            [(k * w).abs().sum(-1) for k, w in zip(cross, self.prepared.weights, strict=True)]
+        )
+        return torch.finfo(mean.dtype).eps * float((W.abs() @ terms[..., None]).max() / mean.abs().max())
+
     def _covariance(self, W: Tensor, inputs: list[Tensor], features: list[Tensor], cross: list[Tensor]) -> Tensor:
         """Of the latents, (n, C, C)."""
         if not W.shape[-1]:

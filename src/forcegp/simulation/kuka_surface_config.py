@@ -1,5 +1,7 @@
 """Scenarios by name, and every number of `kuka-surface`. Loads no library: a command line lists the options at once."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -314,7 +316,7 @@ class Scenario:
     config: type
     function: str
 
-    def simulate(self, config: Any, progress: Callable[[int, int], None] | None = None) -> "forcegp.data.Dataset":
+    def simulate(self, config: Any, progress: Callable[[int, int], None] | None = None) -> forcegp.data.Dataset:
         """Run it. `progress(steps done, steps in total)` is called now and then."""
         if not isinstance(config, self.config):
             raise InvalidInput(f"config is {type(config).__name__}; this scenario takes {self.config.__name__}.")
