@@ -1,14 +1,15 @@
 """The models of a comparison, by name: each fits a posterior to the same training rows.
 
 A name is an entry of `CANDIDATES`, a way to identify the system (`identified-torque`), or an expression of priors as in
-`forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. Add yours:
+`forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. With
+`/motions` at its end it is refined on the motions of all training rows (docs/motions.md). Add yours:
 
     CANDIDATES["mine"] = Candidate("what it is", "black box", fit_mine)
 """
 
 import difflib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -30,6 +31,10 @@ MEAN = "@"
 """Between a prior and the system that the mean takes, in the name of a model."""
 
 
+MOTIONS = "/motions"
+"""At the end of a name: the model refined on motions."""
+
+
 @dataclass(frozen=True, eq=False)
 class Training:
     """What a model is fitted to.
@@ -45,6 +50,7 @@ class Training:
     force_noise: where a learned noise of the joint forces begins [Nm or N]; None is none.
     measured_torque: whether predictions account for the noise of their u (`Noise`).
     levels: the noise about the identified system, where its identification estimates it; else it is learned.
+    recording, seconds: all training rows in the order of time, and the longest horizon that motions are scored at.
     """
 
     rows: Dataset
@@ -56,6 +62,8 @@ class Training:
     force_noise: float | None = None
     measured_torque: bool = False
     levels: NoiseLevels | None = None
+    recording: Dataset | None = None
+    seconds: float = 1.0
 
     @property
     def noise(self) -> Noise:
@@ -132,6 +140,11 @@ def _fit_network(kind: type[NeuralNetwork] | type[NetworkEnsemble], training: Tr
     return kind(training.given).fit(training.rows, seed=training.seed)
 
 
+def _fit_motions(fit: Callable[[Training], Posterior], training: Training) -> Posterior:
+    assert training.recording is not None, "a comparison gives all training rows"
+    return fit(training).refined_on_motions(training.recording, training.seconds)
+
+
 CANDIDATES: dict[str, Candidate] = {
     "analytical": Candidate(
         "the system as given (URDF and known forces), noise learned", "given", partial(_fit_system, "given")
@@ -177,6 +190,12 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
     """
     if name in CANDIDATES:
         return CANDIDATES[name]
+    if name.endswith(MOTIONS):
+        base = candidate(name.removesuffix(MOTIONS), system, identification)
+        if base.kind in ("black box", "given"):
+            raise InvalidInput(f"model {name!r} has no physics to refine on motions, or is the one that was given.")
+        summary = f"{base.summary}; refined on the motions of all training rows"
+        return replace(base, summary=summary, fit=partial(_fit_motions, base.fit), cost=5.0 * base.cost)
     if name.removeprefix(IDENTIFIED) in IDENTIFICATIONS and name.startswith(IDENTIFIED):
         return _identified_candidate(name.removeprefix(IDENTIFIED), identification)
     expression, at, mean = (part.strip() for part in name.partition(MEAN))

@@ -139,6 +139,8 @@ def _identify(comparison: Comparison, spec: Mapping[str, Any], work: Identificat
 
 def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], work: Candidate) -> dict[str, Any]:
     rows, test = _training_rows(comparison, spec)
+    split = comparison.splits[spec["split"]]
+    motions = comparison.motions(split)
     identified: dict[str, MechanicalSystem | str] = {}
     before, noise = 0.0, None
     if work.identification is not None:
@@ -153,6 +155,8 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
         comparison.force_noise,
         comparison.measured_torque,
         noise,
+        split.apply(comparison.rows)[0],
+        max(motions.horizons, default=1.0),
     )
     start = time.process_time()
     posterior = work.fit(training)
@@ -161,7 +165,6 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
     scores, doubted = acceleration_scores(posterior, test, mass)
     for sentence in doubted:
         warnings.warn(sentence, DataWarning, stacklevel=1)  # the page shows what was warned of in a job
-    motions = comparison.motions(comparison.splits[spec["split"]])
     scores["motions"] = motion_scores(posterior, motions, comparison.integrator)
     return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": len(rows), "test_rows": len(test), **scores}
 

@@ -1,0 +1,26 @@
+"""`NAME/motions`: models refined on the motions of all training rows, in a comparison with those that were not."""
+
+import pytest
+from tests.models.test_motion_fit import bump, recording
+from tests.validation.moving_arm import given_system
+
+from forcegp.errors import InvalidInput
+from forcegp.validation import Comparison, split_named, validate
+from forcegp.validation.candidates import candidates
+
+NAMES = "joint-friction@identified", "joint-friction@identified/motions"
+
+
+def test_refined_models_move_better(tmp_path):
+    data = recording(bump, 1, seconds=16.0)
+    splits = split_named(data, "blocks:4:2,4")
+    compared = Comparison(data, data, data.system, splits, points=60, horizons=(0.25, 0.5), starts=6, restarts=1)
+    found = validate(compared, tmp_path / "out", models=NAMES, seeds=1)
+    plain, refined = (found.document["models"][name]["motions"]["rms"][-1]["median"] for name in NAMES)
+    assert refined < 0.2 * plain
+
+
+@pytest.mark.parametrize("name", ["analytical/motions", "independent-gp/motions", "ensemble/motions"])
+def test_models_without_anything_to_refine_are_refused(name):
+    with pytest.raises(InvalidInput, match="no physics to refine on motions, or is the one that was given"):
+        candidates([name], given_system())
