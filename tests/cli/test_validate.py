@@ -11,6 +11,7 @@ from tests.models.arm import URDF
 from tests.validation.moving_arm import moving_arm
 
 MODELS = ("analytical", "identified-acceleration", "joint-friction", "joint-friction@identified")
+SAME = ("--identification", "acceleration")
 QUICK = ("--points", 40, "--restarts", 1, "--iterations", 30, "--horizon", "0.1,0.3", "--starts", 2)
 
 
@@ -26,7 +27,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(forcegp, folder):
-    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, "--models", *MODELS)
+    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, *SAME, "--models", *MODELS)
     done = forcegp(*words, "--out", "results", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -60,10 +61,12 @@ def test_the_page_says_what_was_done(found, folder):
     assert "trained on whole episodes (episode 0), tested on others (episode 1)" in page
     assert "no filter; every 2nd row." in page
     assert "the same 40 rows" in page
+    assert re.search(r"^\| error of predicted motions \| \*\*[\w@-]+\*\* \| ", page, re.M)
+    assert found["winners"]["motion"]["model"] in MODELS
     assert "the system identified with seed 0 by maximum likelihood of accelerations" in page
     for name in MODELS:
         assert re.search(rf"^\| {re.escape(name)} \| [*\d]", page, re.M)
-    assert "Does a Gaussian process on forces beat the identified model?\n  * **" in page
+    assert "Does a Gaussian process on forces beat the best parametric model?\n  * **" in page
     stored = json.loads((folder / "results" / "results.json").read_text())
     assert {name: stored[name] for name in found if name != "out"} == {k: v for k, v in found.items() if k != "out"}
     assert len(stored["source"]["sha256"]) == 64
@@ -75,7 +78,7 @@ def test_the_page_says_what_was_done(found, folder):
 
 
 def test_the_same_command_goes_on_and_another_is_refused(forcegp, found, folder):
-    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, *QUICK, "--out", "results")
+    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, *QUICK, *SAME, "--out", "results")
     (lost,) = (folder / "results" / "jobs").glob("*seed1-analytical")
     shutil.rmtree(lost)
     done = forcegp(*words, "--seeds", 2, "--models", *MODELS, "--json", folder=folder)
@@ -126,7 +129,7 @@ WRONG = [
     (f"validate log.h5 {OUT} --models anaytical", "did you mean 'analytical'"),
     (f"validate log.h5 {OUT} --identification magic", "no identification is called 'magic'"),
     (f"validate log.h5 {OUT} --cutoff 80", "cutoff is 80.0 Hz"),
-    (f"validate log.h5 {OUT} --measured-torque", "needs a noise of the forces"),
+    (f"validate log.h5 {OUT} --identification acceleration --measured-torque", "needs a noise of the forces"),
     (f"validate log.h5 {OUT} --backend ray", "does not share files"),
     ("validate log.h5 --out log.h5", "log.h5 would be written over log.h5"),
 ]

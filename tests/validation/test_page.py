@@ -48,7 +48,7 @@ def test_its_example_runs(page, tmp_path):
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     moving_arm(1.5, 2).save(tmp_path / "log.h5")
     printed = run_example(example, tmp_path)
-    assert "Does a Gaussian process on forces beat the identified model?" in printed
+    assert "Does a Gaussian process on forces beat the best parametric model?" in printed
     assert "mine / identified-acceleration" in printed
     assert "'median'" in printed.splitlines()[-1]
     assert (tmp_path / "mine" / "report.md").exists()

@@ -56,7 +56,7 @@ def test_a_run_goes_on_where_it_was_and_grows(data, tmp_path):
     assert notes[-1][0] == notes[-1][1]
     kept = changed(folder)
     assert set(kept) == {  # the identification for the mass matrix, and the model
-        "episodes-1-seed0-identification-acceleration",
+        "episodes-1-seed0-identification-acceleration-all",
         "episodes-1-seed0-analytical",
     }
     assert set(first.document["models"]) == {"analytical"}

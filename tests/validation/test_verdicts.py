@@ -1,55 +1,97 @@
-"""Verdicts against Student's paired test of scipy, and the models that they are about."""
+"""Verdicts against Student's paired test of scipy and against simulated recordings, and the models they are about."""
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 from scipy.stats import ttest_rel
 
-from forcegp.validation.paired_tests import against_baseline, best_of, conclusions, paired_test
+from forcegp.validation.paired_tests import against_baseline, best_of, conclusions, paired_test, winners
 
 
-@pytest.mark.parametrize("score", ["nlpd", "force_rms"])
-def test_intervals_are_those_of_the_paired_test(score):
+@pytest.mark.parametrize("axis", [0, 2], ids=["seeds", "stretches"])
+def test_intervals_of_densities_are_those_of_the_paired_test(axis):
     generator = np.random.default_rng(1)
     other = generator.uniform(1.0, 2.0, 6)
     one = other * generator.uniform(0.7, 1.05, 6)
-    found = paired_test(score, "a", "b", one.tolist(), other.tolist())
-    change = (lambda x: x) if score == "nlpd" else np.log
-    interval = ttest_rel(change(one), change(other)).confidence_interval(0.95)
-    back = (lambda x: x) if score == "nlpd" else np.exp
-    assert np.allclose(found.interval, [back(interval.low), back(interval.high)])
-    assert found.value == pytest.approx(back(np.mean(change(one) - change(other))))
-    assert (found.runs, found.wins) == (6, int((one < other).sum()))
+    shape = [1, 1, 1]
+    shape[axis] = 6
+    found = paired_test("nlpd", "a", "b", one.reshape(shape), other.reshape(shape))
+    interval = ttest_rel(one, other).confidence_interval(0.95)
+    assert np.allclose(found.interval, [interval.low, interval.high])
+    assert found.value == pytest.approx(np.mean(one - other))
+    assert (found.runs, found.stretches) == ((6, 1) if axis == 0 else (1, 6))
+    assert (found.wins, found.ahead)[axis // 2] == int((one < other).sum())
 
 
-def test_the_verdict_needs_an_interval_on_one_side():
-    better = paired_test("nrmse", "a", "b", [0.5, 0.52, 0.48], [1.0, 1.0, 1.0])
+def test_chance_of_seeds_and_of_stretches_adds_up():
+    difference = np.random.default_rng(2).normal(size=(4, 1, 7))
+    found = paired_test("nlpd", "a", "b", difference, np.zeros_like(difference))
+    seeds, stretches = (difference.mean(axis=axis).ravel() for axis in (2, 0))
+    parts = [each.var(ddof=1) / len(each) for each in (seeds, stretches)]
+    freedom = sum(parts) ** 2 / (parts[0] ** 2 / 3 + parts[1] ** 2 / 6)
+    assert np.ptp(found.interval) / 2 == pytest.approx(student.ppf(0.975, freedom) * np.sqrt(sum(parts)))
+
+
+def test_the_interval_of_a_ratio_holds_the_true_one():
+    """Two models of expected squared errors 1 and .81, over few stretches and seeds, both with effects of their own."""
+    generator = np.random.default_rng(3)
+    held = []
+    for _ in range(200):
+        level = generator.gamma(4.0, 0.25, size=(1, 1, 12))  # stretches that are hard for both
+        own = generator.gamma(20.0, 0.05, size=(2, 1, 1, 12)) * generator.gamma(20.0, 0.05, size=(2, 4, 1, 1))
+        found = paired_test("motion", "a", "b", 0.81 * level * own[0], level * own[1])
+        held.append(found.interval[0] < 0.9 < found.interval[1])
+    assert 0.88 < np.mean(held) < 0.995
+
+
+def errors(*values: float) -> np.ndarray:
+    return np.square(np.array(values))[None, None]
+
+
+def test_the_verdict_needs_an_interval_on_one_side_and_a_margin():
+    better = paired_test("nrmse", "a", "b", errors(0.5, 0.52, 0.48), errors(1.0, 1.0, 1.0))
     assert better.outcome == "better"
     assert better.sentence.startswith("**Yes** by the normalised error of the acceleration: a / b = 0.5")
-    assert paired_test("nrmse", "a", "b", [1.0, 1.0, 1.0], [0.5, 0.52, 0.48]).outcome == "worse"
-    assert paired_test("nlpd", "a", "b", [-2.0, 3.0, 1.0], [0.0, 0.0, 0.0]).outcome == "undecided"
-    one = paired_test("nrmse", "a", "b", [0.1], [1.0])
-    assert (one.outcome, one.interval) == ("undecided", None)
-    assert "one run, so no interval" in one.sentence
-    assert paired_test("nrmse", "a", "b", [], []) is None
-    assert paired_test("nrmse", "a", "b", [0.0], [1.0]) is None
+    assert "better in 1 of 1 runs and in 3 of 3 held-out stretches of time" in better.sentence
+    assert paired_test("nrmse", "a", "b", errors(1.0, 1.0, 1.0), errors(0.5, 0.52, 0.48)).outcome == "worse"
+    assert paired_test("nrmse", "a", "b", errors(0.3, 2.0, 1.0), errors(1.0, 1.0, 1.0)).outcome == "no difference"
+    certain = paired_test("motion", "a", "b", errors(0.99, 0.991, 0.99), errors(1.0, 1.0, 1.0))
+    assert certain.interval[1] < 1.0
+    assert certain.outcome == "no difference"  # for one percent matters to nobody
+    assert paired_test("motion", "a", "b", errors(0.99, 0.991), errors(1.0, 1.0), margin=0.0).outcome == "better"
+    one = paired_test("nrmse", "a", "b", errors(0.1), errors(1.0))
+    assert (one.outcome, one.interval) == ("no difference", None)
+    assert "one stretch and one seed, so no interval" in one.sentence
+    assert paired_test("nrmse", "a", "b", errors(), errors()) is None
+    assert paired_test("nrmse", "a", "b", errors(0.0), errors(1.0)) is None
 
 
-def cell(seed: int, force: float | None, diverged: int = 0, motion: float | None = 0.1) -> dict:
+def test_models_without_chance_have_an_interval():
+    """Two deterministic models are the same for every seed; what other stretches would show is still open."""
+    one, other = (np.broadcast_to(errors(*values), (5, 1, 3)) for values in ((1.0, 0.8, 1.3), (1.0, 1.1, 0.9)))
+    found = paired_test("force_rms", "a", "b", one, other)
+    assert np.ptp(found.interval) > 0.2
+    assert found.outcome == "no difference"
+
+
+def test_motions_that_diverged_are_left_out():
+    one = errors(0.5, np.nan, 0.48)
+    assert paired_test("motion", "a", "b", one, errors(1.0, 1.0, 1.0)).stretches == 2
+
+
+def cell(seed: int, force: float | None, diverged: int = 0, motion: float = 0.1) -> dict:
     if force is None:
         return {"split": "s", "seed": seed, "result": None}
-    motions = {"rms": [motion], "diverged": [diverged]}
-    result = {"nrmse": [force], "force_rms": [force, force], "nlpd": -1.0 / force, "motions": motions}
-    result["stretches"] = {name: [force, 0.7] for name in ("nrmse", "force_rms", "nlpd")}  # equal in the second
+    squared = [[motion**2] * 3, [None] * diverged + [4.0 * motion**2] * (3 - diverged)]
+    result = {"nlpd": -1.0 / force, "motions": {"squared": squared}}
+    result["stretches"] = {name: [force, 0.5 * force] for name in ("nrmse", "force_rms")}
+    result["stretches"]["nlpd"] = [-1.0 / force, 3.0 - 1.0 / force]  # one that is hard for all
     return {"split": "s", "seed": seed, "result": result}
 
 
 def summary(kinds: dict[str, str], cells: dict[str, list[dict]]) -> dict:
-    out = {}
-    for name, kind in kinds.items():
-        results = [each["result"] for each in cells[name] if each["result"] is not None]
-        lost = sum(result["motions"]["diverged"][-1] for result in results)
-        out[name] = {"kind": kind, "runs": len(results), "motions": {"diverged": [lost]} if results else None}
-    return out
+    runs = {name: sum(each["result"] is not None for each in cells[name]) for name in kinds}
+    return {name: {"kind": kind, "runs": runs[name]} for name, kind in kinds.items()}
 
 
 KINDS = {"urdf": "given", "ls": "identified", "ls2": "identified", "gp": "force prior", "net": "black box"}
@@ -69,26 +111,41 @@ def test_every_question_is_answered_by_the_best_of_each_kind():
     found = conclusions(told, cells)
     assert [item["question"] for item in found] == [
         "Is the identified model better than the system as given?",
-        "Does a Gaussian process on forces beat the identified model?",
+        "Does a Gaussian process on forces beat the best parametric model?",
     ]
     for item in found:
-        assert {a["score"]: a["verdict"] for a in item["answers"] if a["score"] != "motion"} == dict.fromkeys(
-            ("nrmse", "force_rms", "nlpd"), "better"
-        )
+        assert {a["score"]: a["verdict"] for a in item["answers"]} == {
+            "nrmse": "better", "force_rms": "better", "nlpd": "better", "motion": "no difference"
+        }  # fmt: skip
     against = against_baseline(told, cells)
     assert against["baseline"] == "ls"
     assert set(against["models"]) == {"urdf", "ls2", "gp"}
     assert against["models"]["ls2"]["force_rms"]["runs"] == 2
     assert against["models"]["urdf"]["force_rms"]["verdict"] == "worse"
     gp, urdf = (against["models"][name]["force_rms"] for name in ("gp", "urdf"))
-    assert (gp["ahead"], urdf["ahead"], gp["stretches"]) == (1, 0, 2)
-    assert "better in 3 of 3 runs and in 1 of 2 held-out stretches of time" in gp["sentence"]
-    assert "stretches" not in against["models"]["gp"]["motion"]["sentence"]
+    assert (gp["wins"], gp["ahead"], urdf["ahead"], gp["stretches"]) == (3, 2, 0, 2)
+
+
+def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():
+    cells = {
+        "urdf": [cell(k, 2.0, motion=0.4) for k in range(3)],
+        "ls": [cell(k, 1.0, motion=0.1) for k in range(3)],
+        "gp": [cell(k, 0.5 + 0.01 * k, motion=0.0999) for k in range(3)],
+        "net": [cell(k, 0.6 + 0.01 * k, motion=0.3) for k in range(3)],
+    }
+    found = winners(summary({name: KINDS[name] for name in cells}, cells), cells)
+    assert {score: each["model"] for score, each in found.items()} == {
+        "motion": "ls", "force_rms": "gp", "nrmse": "gp", "nlpd": "gp"
+    }  # fmt: skip
+    assert "No difference" in found["motion"]["why"]
+    assert found["nrmse"]["why"].startswith("**Yes**")
+    alone = winners({"net": {"kind": "black box", "runs": 3}}, {"net": cells["net"]})
+    assert {each["model"] for each in alone.values()} == {"net"}
 
 
 def test_a_model_whose_motions_diverge_is_not_the_best():
     kinds = {"a": "force prior", "b": "force prior"}
-    cells = {"a": [cell(0, 1.0, diverged=3, motion=0.01)], "b": [cell(0, 1.0, diverged=0, motion=0.5)]}
+    cells = {"a": [cell(0, 1.0, diverged=2, motion=0.01)], "b": [cell(0, 1.0, diverged=0, motion=0.5)]}
     assert best_of(summary(kinds, cells), cells, ("force prior",), "motion") == "b"
 
 

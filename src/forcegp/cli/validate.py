@@ -54,19 +54,23 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     models: Annotated[tuple[str, ...], unless_given("NAME", "all but single networks")] = ()
     """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
     PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
-    identified from the same rows."""
-    identification: Annotated[str, arg(metavar="METHOD")] = "acceleration"
-    """What @identified takes, and whose mass matrix turns errors of accelerations into forces: acceleration, torque or
-    least-squares, or from all training rows acceleration-all or torque-all."""
+    identified. NAME/motions: refined on the motions of the training rows."""
+    identification: Annotated[str, arg(metavar="METHOD")] = "acceleration-all"
+    """What @identified takes, and whose mass matrix turns errors of accelerations into forces: from all training rows
+    acceleration-all or torque-all, from --points acceleration, torque or least-squares."""
     friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,coulomb"
-    """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, and offset; or none."""
+    """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, offset and direction; or
+    none."""
     points: Annotated[int, arg(metavar="N")] = 100
-    """Rows that every model learns from: those that lie farthest apart among two thirds of the training rows."""
+    """Rows that models learn from: those that lie farthest apart among two thirds of the training rows. Friction of the
+    joints and other functions of one or two inputs learn from all, as identifications do."""
+    margin: Annotated[float, arg(metavar="RATIO")] = 0.02
+    """Models whose errors differ by less count as equal."""
     seeds: Annotated[int, arg(metavar="N")] = 5
     """So many choices of these rows."""
     horizon: Annotated[str, arg(metavar="S,S...")] = "0.1,0.2,0.5,1.0"
     """Lengths of the motions that are predicted from held-out states, in s."""
-    starts: Annotated[int, arg(metavar="N")] = 5
+    starts: Annotated[int, arg(metavar="N")] = 10
     """Motions from every held-out stretch of time."""
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
     """Of these motions: rk4, symplectic-euler, implicit-midpoint or projected."""
@@ -101,12 +105,13 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
                 seeds=self.seeds,
                 backend=backend,
                 source=self._source(),
+                margin=self.margin,
                 overwrite=self.overwrite,
                 progress=report,
             )
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
         terminal.show(*self._report(validation.document))
-        brief = ("models", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
+        brief = ("models", "winners", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
         return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
 
     def _comparison(self, terminal: Terminal, horizons: tuple[float, ...]) -> forcegp.Comparison:
@@ -181,10 +186,8 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             if model["failures"]
         ]
         answers = [
-            Text(f"{item['question']} {answer['sentence'].replace('**', '')}")
-            for item in document["verdicts"]
-            for answer in item["answers"]
-            if answer["score"] == "force_rms"
+            Text(f"By the {forcegp.validation.SCORES[score]} take {found['model']}: {found['why'].replace('**', '')}")
+            for score, found in document["winners"].items()
         ]
         page = Text(f"The page: {self.out / 'report.md'}")
         return [columns(title, header, rows, long_names=True), *failed, *answers, page]

@@ -66,8 +66,8 @@ def pivoted_cholesky(
 ) -> Pivots:
     """Greedy pivots, each where the relevance times what is left of k(z, z) is largest.
 
-    At most `most` of them; fewer where the sum of relevance times remainder falls below `tolerance`, or nothing but
-    rounding is left. Time O(N m^2), memory O(N m).
+    At most `most` of them; fewer where the sum of relevance times remainder falls below `tolerance`, but at least one,
+    or nothing but rounding is left. Time O(N m^2), memory O(N m).
     Source: Fine & Scheinberg (2001), "Efficient SVM training using low-rank kernel representations"; Harbrecht, Peters
     & Schneider (2012), "On the low-rank approximation by the pivoted Cholesky decomposition".
     """
@@ -80,7 +80,7 @@ def pivoted_cholesky(
         while len(indices) < len(rows):
             score = relevance * remainder
             pivot = int(score.argmax())
-            if float(score.sum()) <= tolerance or float(remainder[pivot]) <= floor:
+            if (indices and float(score.sum()) <= tolerance) or float(remainder[pivot]) <= floor:
                 break
             done = len(indices)
             column = kernel.cross(z[pivot : pivot + 1], z)[0]

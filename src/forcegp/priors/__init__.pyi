@@ -1,5 +1,7 @@
 from .contact_friction import ContactFriction as ContactFriction
-from .force_prior import ForcePrior as ForcePrior, Scaling as Scaling, SumPrior as SumPrior
+from .force_prior import (
+    ForcePrior as ForcePrior, Scaling as Scaling, SumPrior as SumPrior, has_few_inputs as has_few_inputs,
+)
 from .joint_forces import (
     JointAccelerations as JointAccelerations, JointForces as JointForces, NoForces as NoForces,
     JointFriction as JointFriction, PeriodicJointForces as PeriodicJointForces,

@@ -218,3 +218,12 @@ def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Te
     return tuple(
         kernel_of(expression, dimension, variance) for dimension, variance in zip(dimensions, variances, strict=True)
     )
+
+
+FEW_INPUTS = 2
+
+
+def has_few_inputs(prior: ForcePrior, robot: Robot) -> bool:
+    """Whether every function of the prior has one or two inputs: then some dozens of points stand for all rows."""
+    names = prior.feature_names(robot)
+    return names is not None and all(0 < len(inputs) <= FEW_INPUTS for inputs in names)

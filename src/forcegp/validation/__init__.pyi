@@ -6,6 +6,7 @@ from .figures import figures_of as figures_of
 from .jobs import (
     IDENTIFICATIONS as IDENTIFICATIONS, Identification as Identification, training_subset as training_subset,
 )
+from .paired_tests import SCORES as SCORES
 from .run import Validation as Validation, validate as validate
 from .splits import (
     Split as Split, Stretch as Stretch, hold_out_blocks as hold_out_blocks, hold_out_episodes as hold_out_episodes,

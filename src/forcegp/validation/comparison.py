@@ -91,7 +91,7 @@ IDENTIFICATIONS: dict[str, Identification] = {
 FRICTION = ("viscous", "coulomb")
 """Laws that are identified where nothing else is asked for."""
 
-DEFAULT_IDENTIFICATION = "acceleration"
+DEFAULT_IDENTIFICATION = "acceleration-all"
 """What `@identified` and the mass matrix of force errors take where nothing else is asked for."""
 
 

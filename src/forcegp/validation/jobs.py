@@ -156,6 +156,7 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
         comparison.measured_torque,
         noise,
         split.apply(comparison.rows)[0],
+        split.apply(comparison.recording)[0],
         max(motions.horizons, default=1.0),
     )
     start = time.process_time()

@@ -23,7 +23,7 @@ def page(document: Mapping[str, Any]) -> str:
     finished = {name: model for name, model in models.items() if model["runs"]}
     source = document["source"]
     parts = [f"# Validation{' of ' + source['title'] if source.get('title') else ''}", *_done(document)]
-    parts += ["## Conclusions", _conclusions(document["verdicts"])]
+    parts += ["## Conclusions", *_winners(document["winners"]), _conclusions(document)]
     parts += _against_baseline(document["against_baseline"])
     if finished:
         parts += ["## All joints", _overall(finished, document)]
@@ -49,9 +49,11 @@ def _done(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"* Split: {split['words']} ({sides}).")
         lines += [f"* {note[0].upper()}{note[1:]}" for note in split["notes"]]
     lines.append(
-        f"* Every model learns from the same {document['points']} rows: those that lie farthest apart among two thirds "
-        f"of the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. Tables show the median "
-        "over runs (seeds and splits) and the range from the best to the worst."
+        f"* Models learn from the same {document['points']} rows: those that lie farthest apart among two thirds of the "
+        f"training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. All training rows are used by "
+        "identifications that say so, by functions of one or two inputs, as friction of the joints, and by what is "
+        "refined on motions. Tables show the median over runs (seeds and splits) and the range from the best to the "
+        "worst."
     )
     lines.append(
         "* Noise: learned by every model from the same start, what the data state or else a tenth of the scatter of "
@@ -83,7 +85,13 @@ def _done(document: Mapping[str, Any]) -> list[str]:
     return ["\n".join(lines)]
 
 
-def _conclusions(found: Sequence[Mapping[str, Any]]) -> str:
+def _winners(found: Mapping[str, Mapping[str, str]]) -> list[str]:
+    rows = [[SCORES[score], f"**{each['model']}**", each["why"]] for score, each in found.items()]
+    return [markdown_table(["by the", "take", "because"], rows)] if rows else []
+
+
+def _conclusions(document: Mapping[str, Any]) -> str:
+    found = document["verdicts"]
     if not found:
         return "There are no two finished models to compare for any question."
     lines = []
@@ -91,9 +99,10 @@ def _conclusions(found: Sequence[Mapping[str, Any]]) -> str:
         lines.append(f"* {item['question']}")
         lines += [f"  * {answer['sentence']}" for answer in item["answers"]]
     lines.append(
-        "\nOf each kind the model with the lowest median is taken, which favours kinds with many models a little. "
-        "Pairs share their training rows and held-out rows; intervals are Student's over runs, which do not hold for "
-        "other recordings."
+        "\nOf each kind the model with the lowest error is taken, which favours kinds with many models a little. Pairs "
+        "share their training rows and held-out rows. Intervals are for other held-out stretches of time and other "
+        "choices of training rows, of recordings like this one; ratios within "
+        f"{100.0 * document['margin']:g} % of 1 count as no difference."
     )
     return "\n".join(lines)
 
@@ -121,7 +130,7 @@ def _against_baseline(found: Mapping[str, Any] | None) -> list[str]:
     ]
     sentences.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
     header = ["model", *(f"{SCORES[score]}{', difference' if score == 'nlpd' else ', ratio'}" for score in scores)]
-    text = "Paired over runs, with 95 % intervals; bold where the interval shows the model to be better."
+    text = "With 95 % intervals over stretches and seeds; bold where the model is shown to be better."
     return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(sentences)]
 
 

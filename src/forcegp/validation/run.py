@@ -19,7 +19,7 @@ from forcegp.validation.candidates import DEFAULT_MODELS, Candidate, candidates
 from forcegp.validation.comparison import Comparison
 from forcegp.validation.jobs import jobs_of, kept
 from forcegp.validation.page import page
-from forcegp.validation.paired_tests import against_baseline, conclusions
+from forcegp.validation.paired_tests import MARGIN, against_baseline, conclusions, winners
 from forcegp.validation.scores import over_joints
 
 
@@ -194,6 +194,7 @@ def validate(
     jobs: int | None = None,
     backend: Backend | str | None = None,
     source: Mapping[str, Any] | None = None,
+    margin: float = MARGIN,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Validation:
@@ -208,6 +209,7 @@ def validate(
     seeds: how many choices of training rows, numbered from 0.
     jobs, backend: how many pieces at once, and where: in this process, or in several of this machine.
     source: where the data come from, for the page: "title", and "data", a list of lines; plain JSON values.
+    margin: ratios of errors within it of 1 count as no difference.
     overwrite: compute everything anew, also where the folder holds results.
 
     Raises
@@ -220,13 +222,15 @@ def validate(
         raise InvalidInput(f"the backend {workers.name} does not share files; choose serial or joblib.")
     if isinstance(seeds, bool) or seeds < 1:
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
+    if not 0.0 <= margin < 1.0:
+        raise InvalidInput(f"the margin is {margin:g}; it must be at least 0 and below 1, such as {MARGIN}.")
     chosen = candidates(models, comparison.system, comparison.identification)
     configuration = comparison.configuration()
     store = JobStore.open(Path(folder), KIND, configuration, overwrite=overwrite)
     identifications, fits = jobs_of(comparison, chosen, seeds)
     run_jobs(store, [*identifications, *fits], workers, progress)
     runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
-    document = _document(comparison, runs, chosen, seeds)
+    document = _document(comparison, runs, chosen, seeds, margin)
     document |= {"configuration": {"forcegp": __version__, **configuration}, "source": dict(source or {})}
     document["identifications"] = [_brief(kept(store, job.name)) for job in identifications]
     with store.locked():
@@ -240,7 +244,11 @@ def validate(
 
 
 def _document(
-    comparison: Comparison, runs: Mapping[str, Sequence[Mapping[str, Any]]], chosen: Mapping[str, Any], seeds: int
+    comparison: Comparison,
+    runs: Mapping[str, Sequence[Mapping[str, Any]]],
+    chosen: Mapping[str, Any],
+    seeds: int,
+    margin: float,
 ) -> dict[str, Any]:
     summary = summary_of(runs, chosen)
     units = {name: comparison.rows.units[name] for name in ("q", "u", "a")}
@@ -258,8 +266,10 @@ def _document(
             {run["result"]["mass_matrix"] for each in runs.values() for run in each if run["result"] is not None}
         ),
         "models": summary,
-        "verdicts": conclusions(summary, runs),
-        "against_baseline": against_baseline(summary, runs),
+        "margin": margin,
+        "winners": winners(summary, runs, margin),
+        "verdicts": conclusions(summary, runs, margin),
+        "against_baseline": against_baseline(summary, runs, margin),
         "runs": {name: [_brief(run) for run in each] for name, each in runs.items()},
     }
 

@@ -121,7 +121,7 @@ def over_joints(score: str, values: Sequence[float | None]) -> float | None:
 
 
 HORIZONS = (0.1, 0.2, 0.5, 1.0)
-STARTS = 5
+STARTS = 10
 GAP = 1.5
 """A pause of more than this many median steps is a gap, over which no motion goes."""
 
@@ -180,7 +180,7 @@ def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: st
 
     `rms_per_joint` (horizons, nv) is the root mean square over the motions of |q - q_recorded|, `rms` over joints as
     well, in rad or m; both over the motions that had not diverged by then (None where all had), and `diverged`
-    (horizons,) counts the others.
+    (horizons,) counts the others. `squared` (horizons, motions) is the mean over joints of the squared error of each.
     """
     motions = held_out.motions
     if motions is None:
@@ -190,7 +190,7 @@ def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: st
     )
     squared = np.square(rollout.q.cpu().numpy() - motions.q)
     scores: dict[str, Any] = {"horizons": list(held_out.horizons), "motions": len(motions.q), "integrator": integrator}
-    scores |= {"dt": motions.dt, "rms_per_joint": [], "rms": [], "diverged": []}
+    scores |= {"dt": motions.dt, "rms_per_joint": [], "rms": [], "diverged": [], "squared": []}
     for horizon in held_out.horizons:
         here = squared[:, round(horizon / motions.dt)]
         lasting = np.isfinite(here).all(axis=-1)
@@ -198,6 +198,7 @@ def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: st
         scores["rms_per_joint"].append(plain(per_joint))
         scores["rms"] += plain(np.sqrt(np.square(per_joint).mean(keepdims=True)))
         scores["diverged"].append(int((~lasting).sum()))
+        scores["squared"].append(plain(np.where(lasting, here.mean(axis=-1), np.nan)))
     return scores
 
 
