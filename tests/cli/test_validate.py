@@ -27,7 +27,20 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(forcegp, folder):
-    words = ("validate", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, *SAME, "--models", *MODELS)
+    words = (
+        "validate",
+        "log.h5",
+        "--split",
+        "episodes:1",
+        "--every",
+        2,
+        "--seeds",
+        2,
+        *QUICK,
+        *SAME,
+        "--models",
+        *MODELS,
+    )
     done = forcegp(*words, "--out", "results", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -38,8 +38,8 @@ def test_every_model_that_it_names_exists(page):
     system = moving_arm(0.1, 1).system
     (table,) = re.findall(r"\| `--models` \|.*?\n\n", page, re.DOTALL)
     cells = [row.split("|")[1] for row in table.splitlines()[2:] if row.startswith("|")]
-    named = {name for cell in cells for name in re.findall(r"`([\w +-]+)`", cell) if not name.startswith("forcegp")}
-    named = {name for name in named if not name.startswith("-")}
+    named = {name for cell in cells for name in re.findall(r"`([\w +/-]+)`", cell) if not name.startswith("forcegp")}
+    named = {name for name in named if not name.startswith(("-", "/"))}
     assert set(candidates(sorted(named), system)) == named
     assert {name for name in DEFAULT_MODELS if "@" not in name} <= named
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,21 @@ import forcegp
 import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
+import forcegp.priors
 import forcegp.robots
 from forcegp.cli.command import Debug, Json
-from forcegp.cli.model_choice import ModelOptions, make_model, resolved, search_arguments, window_observation
+from forcegp.cli.model_choice import (
+    POINTS,
+    ModelOptions,
+    make_model,
+    resolved,
+    resolved_noise,
+    search_arguments,
+    window_observation,
+)
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.errors import InvalidInput
+from forcegp.evaluation.prior_choice import LOOK
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +59,6 @@ class Fit(ModelOptions):
             raise InvalidInput(f"--motions is {self.motions:g}; give the length of the windows in seconds, such as 1.")
         command = resolved(self)
         self._backend()  # refused now, not after the data are read
-        assert command.points is not None, "a resolved command has points"
-
         forcegp.robots.usable_device(self.device)
         start = time.monotonic()
         dataset = forcegp.Dataset.load(self.data)
@@ -59,20 +67,47 @@ class Fit(ModelOptions):
         recording, rows_note = dataset, None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)
-        model = make_model(command, system.to(self.device), dataset)
         observe = window_observation(command.learn_from, command.window)
-        points = min(command.points, len(dataset) if observe is None else observe.count(dataset))
+        prior_note, independent_note = None, None
+        if command.model == "structured" and not command.prior:
+            command, prior_note = self._with_prior(command, dataset, system)
+        model = make_model(command, system.to(self.device), dataset)
+        if command.points is None and observe is None and learns_from_all_rows(command, model):
+            dataset, independent_note = forcegp.evaluation.independent_rows(model, dataset, command.seed)
+            command = replace(command, points=len(dataset))
+        rows = len(dataset) if observe is None else observe.count(dataset)
+        points = min(POINTS if command.points is None else command.points, rows)
+        command = replace(command, points=points)
         posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
         if self.motions is not None:
             posterior = refined_with_progress(terminal, posterior, recording, self.motions)
         summary = fit_summary(posterior, time.monotonic() - start)
         command._write(posterior)
-        if rows_note is not None:
-            terminal.note(rows_note)
+        for note in (rows_note, prior_note, independent_note):
+            if note is not None:
+                terminal.note(note)
         for doubt in forcegp.evaluation.unfinished_search(posterior):
             terminal.warn(doubt)
         terminal.show(*_report(self.out, summary), *motion_report(posterior))
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
+
+    def _with_prior(self, command: Fit, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[Fit, str]:
+        """The command with the prior that a look at some rows prefers, and the reason."""
+        if command.mean == "zero":
+            return replace(command, prior=("joint",)), "prior: joint, since the processes hold the known forces, too"
+        if command.learn_from != "accelerations":
+            name = forcegp.evaluation.usual_prior(system)
+            return replace(command, prior=(name,)), f"prior: {name}, the usual one; windows are not looked at"
+        noise = resolved_noise(command.noise, dataset, command.force_noise)
+        options = replace(forcegp.models.default_options(LOOK), iterations=command.iterations)
+        name, why = forcegp.evaluation.choose_prior(dataset, system, noise=noise, seed=command.seed, options=options)
+        return replace(command, prior=(name,)), f"prior: {why}"
+
+
+def learns_from_all_rows(command: Fit, model: Any) -> bool:
+    """Whether its functions have so few inputs that inducing points stand for any number of rows."""
+    few = command.model == "structured" and command.engine in ("auto", "inducing")
+    return few and forcegp.priors.has_few_inputs(model.prior, model.system.robot)
 
 
 def fit_with_progress(

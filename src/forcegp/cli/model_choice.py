@@ -22,7 +22,7 @@ ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp
 LearnFrom = Literal["accelerations", "increments", "weak-form"]
 
 POINTS, NETWORK_POINTS = 200, 10_000
-POINTS_HINT = f"{POINTS}; networks {NETWORK_POINTS}"
+POINTS_HINT = f"{POINTS}; all for functions of one or two inputs, as friction of the joints; networks {NETWORK_POINTS}"
 WINDOW = 0.1
 """Length of a window where none is given, in s."""
 ITERATIONS = 200
@@ -67,11 +67,13 @@ class ModelOptions(FitOptions):
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
     prior: Annotated[
         UseAppendAction[tuple[str, ...]],
-        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(repeatable, they add up; default: joint)"),
+        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(repeatable, they add up; default: forcegp looks)"),
     ] = ()
     """What the unknown forces may be. joint: a force at every joint, on (q, v, u). joint-friction: on its own velocity.
     tool-friction: tangential forces at the contact, on its velocity. contact-friction: isotropic; load-friction:
-    the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md."""
+    the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md.
+    By default joint-friction, in contact tool-friction, unless stretches of time left out show joint, or the sum of
+    both, to be better."""
     learn_from: Annotated[LearnFrom, arg(metavar="accelerations|increments|weak-form")] = "accelerations"
     """accelerations: of the dataset. increments, weak-form: from raw velocities or positions over short windows, of
     which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
@@ -131,12 +133,12 @@ def resolved(command: Options) -> Options:
         raise InvalidInput("--window means nothing to accelerations; add --learn-from weak-form, or leave it out.")
     network = command.model in NETWORKS
     changes: dict[str, Any] = {}
-    if command.points is None:
+    if command.points is None and command.model != "structured":  # there the prior decides
         changes["points"] = NETWORK_POINTS if network else POINTS
     if command.iterations is None and not network:
         changes["iterations"] = ITERATIONS
     if command.model == "structured":
-        changes |= {"mean": command.mean or "analytical", "prior": command.prior or ("joint",)}
+        changes["mean"] = command.mean or "analytical"
     return replace(command, **changes)
 
 

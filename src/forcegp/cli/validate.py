@@ -111,7 +111,17 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             )
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
         terminal.show(*self._report(validation.document))
-        brief = ("models", "winners", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
+        brief = (
+            "models",
+            "winners",
+            "verdicts",
+            "against_baseline",
+            "splits",
+            "preparation",
+            "mass_matrix",
+            "seeds",
+            "points",
+        )
         return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
 
     def _comparison(self, terminal: Terminal, horizons: tuple[float, ...]) -> forcegp.Comparison:

@@ -74,10 +74,11 @@ def window_motions(
     guess: tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"]],
     *,
     derivatives: bool,
+    patient: bool = True,
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
-    Windows that `MOST_PASSES` do not find are stepped through one by one; where that fails, too, `found` is False.
+    Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
@@ -92,11 +93,10 @@ def window_motions(
         left = left[~found[left] & change.isfinite()]
         if not len(left):
             break
-    for row in left.tolist():
-        there = _step_by_step(accelerations, q0[row], v0[row], u[row], h)
-        found[row] = there is not None
-        if there is not None:
-            middle_q[row], middle_v[row] = there
+    if len(left) and patient:
+        there_q, there_v, ended = _step_by_step(accelerations, q0[left], v0[left], u[left], h)
+        found[left] = ended
+        middle_q[left[ended]], middle_v[left[ended]] = there_q[ended], there_v[ended]
     at = _at(accelerations, middle_q, middle_v, u, derivatives)
     q, v, slopes = _pass(at, q0, v0, middle_q, middle_v, h)
     if not derivatives:
@@ -107,22 +107,36 @@ def window_motions(
 
 def _step_by_step(
     accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float
-) -> tuple[Float[Tensor, "T nv"], Float[Tensor, "T nv"]] | None:
-    """The middles of one motion, by Newton's method with shorter steps; None where it has no end."""
-    middles = []
-    for force in u[:, None]:
-        at, found = find_roots(_residual(accelerations, q[None], v[None], force, h), v[None])
-        if not bool(found.all()):
-            return None
-        middle = at[0]
-        middles.append((q + 0.5 * h * middle, middle))
+) -> tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"], Bool[Tensor, " K"]]:
+    """The middles of motions, by Newton's method with shorter steps, and which of them have an end."""
+    positions, velocities, ended = [], [], torch.ones(len(q), dtype=torch.bool, device=q.device)
+    for force in u.unbind(1):
+        residual, linearize = _step(accelerations, q, v, force, h)
+        middle, found = find_roots(residual, v, linearize)
+        ended &= found
+        middle = torch.where(ended[:, None], middle, v)  # the others only stay finite
+        positions.append(q + 0.5 * h * middle)
+        velocities.append(middle)
         q, v = q + h * middle, 2.0 * middle - v
-    positions, velocities = zip(*middles, strict=True)
-    return torch.stack(positions), torch.stack(velocities)
+        if not bool(ended.any()):
+            return u.new_zeros(u.shape), u.new_zeros(u.shape), ended
+    return torch.stack(positions, dim=1), torch.stack(velocities, dim=1), ended
 
 
-def _residual(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float) -> Callable[[Tensor], Tensor]:
-    return lambda at: at - v - 0.5 * h * accelerations.mean(q + 0.5 * h * at, at, u)
+def _step(
+    accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float
+) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], tuple[Tensor, Tensor]]]:
+    """What a step's middle velocity must bring to zero, and the same with its Jacobian."""
+
+    def residual(at: Tensor) -> Tensor:
+        return at - v - 0.5 * h * accelerations.mean(q + 0.5 * h * at, at, u)
+
+    def linearize(at: Tensor) -> tuple[Tensor, Tensor]:
+        here = accelerations.linear(q + 0.5 * h * at, at, u, False)
+        identity = torch.eye(at.shape[-1], dtype=at.dtype, device=at.device)
+        return at - v - 0.5 * h * here.a, identity - 0.5 * h * (0.5 * h * here.a_q + here.a_v)
+
+    return residual, linearize
 
 
 def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:

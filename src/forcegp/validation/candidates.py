@@ -16,6 +16,7 @@ from typing import Literal, get_args
 from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
+from forcegp.evaluation import independent_rows
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
@@ -104,6 +105,7 @@ class Candidate:
     kind: which questions it answers.
     fit: makes the posterior.
     identification: the one that it builds on, a key of `IDENTIFICATIONS`; None for none.
+    all_rows: whether it learns from all training rows alone, so that one seed stands for all.
     cost: CPU time relative to others, for the remaining time alone.
     """
 
@@ -112,6 +114,7 @@ class Candidate:
     fit: Callable[[Training], Posterior]
     identification: str | None = None
     cost: float = 1.0
+    all_rows: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
@@ -133,7 +136,8 @@ def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
     if training.all_rows is not None and has_few_inputs(forces, system.robot):
         # held-out noise contains the misfit that the forces are to learn; so many rows show their own
         model = StructuredGP(system, forces, "analytical", replace(training, levels=None).noise)
-        return model.fit(training.all_rows, seed=training.seed, restarts=training.restarts)
+        rows, _ = independent_rows(model, training.all_rows, training.seed)
+        return model.fit(rows, seed=training.seed, restarts=training.restarts)
     model = StructuredGP(system, forces, "analytical", training.noise)
     return model.fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
 
@@ -211,7 +215,7 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
         allowed = ", ".join(("given", "identified", *IDENTIFICATIONS))
         raise InvalidInput(f"model {name!r} takes its mean from {mean!r}; give PRIOR{MEAN}MEAN with one of {allowed}.")
     try:
-        named_prior(expression, system)
+        prior = named_prior(expression, system)
     except InvalidInput as error:
         known = [*CANDIDATES, *(f"{IDENTIFIED}{method}" for method in IDENTIFICATIONS)]
         close = difflib.get_close_matches(name, known, n=1)
@@ -227,6 +231,7 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
         partial(_fit_forces, expression, "given" if method is None else method),
         method,
         cost=10.0,
+        all_rows=has_few_inputs(prior, system.robot) and (method is None or IDENTIFICATIONS[method].all_rows),
     )
 
 
@@ -234,7 +239,7 @@ def _identified_candidate(method: str) -> Candidate:
     chosen = IDENTIFICATIONS[method]
     noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
     summary = f"the system identified by {chosen.summary}; {noise}"
-    return Candidate(summary, "identified", partial(_fit_system, method), method)
+    return Candidate(summary, "identified", partial(_fit_system, method), method, all_rows=chosen.all_rows)
 
 
 def candidates(

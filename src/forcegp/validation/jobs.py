@@ -29,7 +29,7 @@ IDENTIFICATION, MODEL = "identification", "model"
 
 
 def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Job], list[Job]]:
-    """Identifications, and the models, which read their results."""
+    """Identifications, and the models, which read their results; those that use all rows with the first seed only."""
     shared = Shared(comparison)
     configuration = hashlib.sha256(json.dumps(comparison.configuration(), sort_keys=True).encode()).hexdigest()
     wanted = {each.identification for each in models.values() if each.identification is not None}
@@ -52,6 +52,8 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
                     found = job(IDENTIFICATION, name, split, seed, work, {})
                     identifications[found.name] = found
             for name, each in models.items():
+                if each.all_rows and seed:
+                    continue
                 read = {"mass_matrix": _identification_name(comparison, comparison.identification, split, 0)}
                 if each.identification is not None:
                     read["mean"] = _identification_name(comparison, each.identification, split, seed)

@@ -49,9 +49,9 @@ def _done(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"* Split: {split['words']} ({sides}).")
         lines += [f"* {note[0].upper()}{note[1:]}" for note in split["notes"]]
     lines.append(
-        f"* Models learn from the same {document['points']} rows: those that lie farthest apart among two thirds of the "
-        f"training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. All training rows are used by "
-        "identifications that say so, by functions of one or two inputs, as friction of the joints, and by what is "
+        f"* Models learn from the same {document['points']} rows: those that lie farthest apart among two thirds of "
+        f"the training rows, drawn anew for each of {seeds} seed{'s' if seeds > 1 else ''}. All training rows are used "
+        "by identifications that say so, by functions of one or two inputs, as friction of the joints, and by what is "
         "refined on motions. Tables show the median over runs (seeds and splits) and the range from the best to the "
         "worst."
     )

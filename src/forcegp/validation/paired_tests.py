@@ -35,7 +35,11 @@ QUESTIONS: Sequence[tuple[str, tuple[str, ...], tuple[str, ...]]] = (
     ("Is the identified model better than the system as given?", ("identified",), ("given",)),
     ("Does a Gaussian process on forces beat the best parametric model?", ("force prior",), PARAMETRIC),
     ("Does a model without physics beat the best parametric model?", ("black box",), PARAMETRIC),
-    ("Does a Gaussian process on forces beat models without force priors?", ("force prior",), ("black box", "residual")),
+    (
+        "Does a Gaussian process on forces beat models without force priors?",
+        ("force prior",),
+        ("black box", "residual"),
+    ),
 )
 """Question, kinds of the challenger and of the baseline; of both the one with the lowest error is taken."""
 
@@ -138,9 +142,7 @@ def paired_test(
         interval = (shown(value - half), shown(value + half))
     wins = int((one.mean(axis=(1, 2)) < other.mean(axis=(1, 2))).sum())
     ahead = int((one.mean(axis=(0, 1)) < other.mean(axis=(0, 1))).sum())
-    return PairedTest(
-        score, challenger, baseline, len(one), wins, shown(value), interval, ahead, one.shape[2], margin
-    )
+    return PairedTest(score, challenger, baseline, len(one), wins, shown(value), interval, ahead, one.shape[2], margin)
 
 
 def conclusions(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) -> list[dict[str, Any]]:

@@ -230,6 +230,8 @@ def validate(
     identifications, fits = jobs_of(comparison, chosen, seeds)
     run_jobs(store, [*identifications, *fits], workers, progress)
     runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
+    for name in (name for name, model in chosen.items() if model.all_rows):
+        runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]
     document = _document(comparison, runs, chosen, seeds, margin)
     document |= {"configuration": {"forcegp": __version__, **configuration}, "source": dict(source or {})}
     document["identifications"] = [_brief(kept(store, job.name)) for job in identifications]

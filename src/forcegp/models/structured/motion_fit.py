@@ -254,7 +254,9 @@ class MotionFit:
         q0, v0 = states.split(nv, dim=-1)
         try:
             accelerations = self.unknowns.accelerations(x)
-            motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True)
+            # a trial step that leads to motions so far from these is too long, whatever they are
+            patient = near is None
+            motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True, patient=patient)
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
             nowhere = torch.full_like(q, math.nan)
             motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))

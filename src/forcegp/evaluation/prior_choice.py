@@ -1,0 +1,75 @@
+"""What to learn where nobody says it: which prior, by a look at a few rows, and which of all rows are independent."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from forcegp.analytical.least_squares import correlation_time
+from forcegp.data import Dataset
+from forcegp.errors import ForceGPError
+from forcegp.evaluation.prior_comparison import compare_priors
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models import Noise, StructuredGP
+from forcegp.priors import named_prior
+
+FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
+IN_CONTACT = "tool-friction", "joint", "tool-friction + joint-friction"
+"""Priors that are looked at, the one that is taken without a look first."""
+
+LOOK = 100
+"""Rows of the look."""
+RESIDUALS = 20_000
+"""Rows whose residuals show how long errors resemble each other."""
+FEWEST = 400
+"""Rows that thinning leaves, if there are so many."""
+
+
+def usual_prior(system: MechanicalSystem) -> str:
+    """The prior that is taken without a look: friction of the joints, in contact forces at the tool."""
+    return (IN_CONTACT if system.contacts else FREE_MOTION)[0]
+
+
+def choose_prior(
+    dataset: Dataset, system: MechanicalSystem, *, noise: Noise | None = None, seed: int = 0, **how: Any
+) -> tuple[str, str]:
+    """Name of the prior to learn with, and why, in a sentence.
+
+    In free motion friction of the joints, in contact forces at the tool, unless left-out stretches of `LOOK` rows show
+    a force at every joint, or the sum with friction of the joints, to be better (`compare_priors`). `how` are other
+    arguments of that. Where nothing can be compared (too few rows), the first one is taken, and the reason says so.
+    """
+    names = IN_CONTACT if system.contacts else FREE_MOTION
+    where = "in contact" if system.contacts else "in free motion"
+    priors = {name: named_prior(name, system) for name in names}
+    points = min(LOOK, len(dataset))
+    try:
+        found = compare_priors(dataset, priors, points=points, system=system, noise=noise, restarts=1, seed=seed, **how)
+    except ForceGPError as error:
+        return names[0], f"{names[0]}, the usual one {where}; others could not be compared with it ({error})"
+    others = ", ".join(name for name in names if name != found.preferred.name)
+    return (
+        found.preferred.name,
+        f"{found.preferred.name} {where}, compared with {others} on {points} rows: {found.verdict}",
+    )
+
+
+def independent_rows(model: StructuredGP, dataset: Dataset, seed: int = 0) -> tuple[Dataset, str | None]:
+    """Every k-th row, so that what the model leaves of the acceleration is about independent; and a note if k > 1.
+
+    Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would
+    count as 20,000 facts. k is the integrated correlation time of the residuals of a fit to `LOOK` rows, in rows.
+    """
+    if len(dataset) <= FEWEST or not dataset.time_ordered:
+        return dataset, None
+    rough = model.fit(dataset, points=LOOK, restarts=1, seed=seed)
+    some = dataset.rows(slice(RESIDUALS))
+    residual = rough.predict(some.q, some.v, some.u).mean.cpu().numpy() - some.a
+    spread = residual.std(axis=0)
+    time = correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)
+    every = max(1, min(round(float(np.median(time))), len(dataset) // FEWEST))
+    if every == 1:
+        return dataset, None
+    kept = dataset.rows(slice(0, None, every))
+    note = f"errors resemble each other over {every} rows: every {every}th row was learned from, {len(kept)} in all"
+    return replace(kept, system=dataset.system), note
