@@ -160,7 +160,9 @@ def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, 
         told = refused([*IMPORT.split(), "--out", "out"], capfd)
         assert Path("out").read_text() == "theirs"
     else:
-        change = meanwhile(forcegp.StructuredGP.fit, lambda: (Path("out").mkdir(), Path("out/a").write_text("theirs")))
+        change = meanwhile(
+            forcegp.StructuredGP.fit, lambda: (Path("out").mkdir(exist_ok=True), Path("out/a").write_text("theirs"))
+        )
         monkeypatch.setattr(forcegp.StructuredGP, "fit", change)
         told = refused(["fit", "arm.h5", *QUICK.split(), "--out", "out"], capfd)
         assert Path("out/a").read_text() == "theirs"

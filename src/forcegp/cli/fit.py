@@ -27,7 +27,6 @@ from forcegp.cli.model_choice import (
 )
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.prior_choice import LOOK
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +67,7 @@ class Fit(ModelOptions):
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)
         observe = window_observation(command.learn_from, command.window)
-        prior_note, independent_note = None, None
+        prior_note, independent_note, intervals_note = None, None, None
         if command.model == "structured" and not command.prior:
             command, prior_note = self._with_prior(command, dataset, system)
         model = make_model(command, system.to(self.device), dataset)
@@ -81,9 +80,10 @@ class Fit(ModelOptions):
         posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
         if self.motions is not None:
             posterior = refined_with_progress(terminal, posterior, recording, self.motions)
+            posterior, intervals_note = calibrated_with_progress(terminal, posterior, recording)
         summary = fit_summary(posterior, time.monotonic() - start)
         command._write(posterior)
-        for note in (rows_note, prior_note, independent_note):
+        for note in (rows_note, prior_note, independent_note, intervals_note):
             if note is not None:
                 terminal.note(note)
         for doubt in forcegp.evaluation.unfinished_search(posterior):
@@ -99,7 +99,7 @@ class Fit(ModelOptions):
             name = forcegp.evaluation.usual_prior(system)
             return replace(command, prior=(name,)), f"prior: {name}, the usual one; windows are not looked at"
         noise = resolved_noise(command.noise, dataset, command.force_noise)
-        options = replace(forcegp.models.default_options(LOOK), iterations=command.iterations)
+        options = replace(forcegp.models.default_options(forcegp.evaluation.LOOK), iterations=command.iterations)
         name, why = forcegp.evaluation.choose_prior(dataset, system, noise=noise, seed=command.seed, options=options)
         return replace(command, prior=(name,)), f"prior: {why}"
 
@@ -145,6 +145,15 @@ def refined_with_progress(
             **how,
             report=lambda step, rms: report(min(step, steps), steps, f"step {step}, rms of q {rms:.3g}"),
         )
+
+
+def calibrated_with_progress(terminal: Terminal, posterior: Any, dataset: forcegp.Dataset) -> tuple[Any, str | None]:
+    """`calibrated_on_motions` with a bar; the posterior itself, and why, where the recording is too short for it."""
+    with terminal.progress("intervals of motions") as report:
+        try:
+            return posterior.calibrated_on_motions(dataset, report=report), None
+        except InvalidInput as error:
+            return posterior, f"intervals of motions are not calibrated: {error}"
 
 
 def motion_report(posterior: Any) -> list[Any]:

@@ -211,17 +211,18 @@ def _number(values: Any, statistic: str) -> float | None:
 
 
 def _report(summary: Mapping[str, Any]) -> list[Any]:
-    contacts, samples = summary["constraint_max"] is not None, summary["samples"] > 0
+    contacts = summary["constraint_max"] is not None
+    intervals = any(moment["inside_95"] is not None for moment in summary["moments"])
     header = ["after", "motions", "joint error,\nmedian", "\nlargest"]
     header += ["tool error,\nmedian", "largest |c|\nso far"] if contacts else []
-    header += ["in 95 % of\nsamples"] if samples else []
+    header += ["in 95 %\ninterval"] if intervals else []
     rows = []
     for moment in summary["moments"]:
         cells = [f"{moment['time']:.3g} s", str(moment["lasting"])]
         cells += [number(moment["joint_error_median"]), number(moment["joint_error_max"])]
         if contacts:
             cells += [_millimetres(moment["tool_error_median"]), _millimetres(moment["constraint_max"])]
-        rows.append([*cells, percent(moment["inside_95"])] if samples else cells)
+        rows.append([*cells, percent(moment["inside_95"])] if intervals else cells)
     count = len(summary["rows"])
     title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
     ended = sum(row >= 0 for row in summary["diverged_at"])

@@ -1,5 +1,6 @@
 """What to learn where nobody says it: which prior, by a look at a few rows, and which of all rows are independent."""
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -7,15 +8,30 @@ import numpy as np
 
 from forcegp.analytical.least_squares import correlation_time
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError
+from forcegp.errors import DataWarning, ForceGPError
 from forcegp.evaluation.prior_comparison import compare_priors
-from forcegp.mechanics import MechanicalSystem
+from forcegp.mechanics import (
+    CoulombJointFriction,
+    DirectionalJointFriction,
+    LoadJointFriction,
+    MechanicalSystem,
+    StribeckJointFriction,
+    ViscousJointFriction,
+)
 from forcegp.models import Noise, StructuredGP
 from forcegp.priors import named_prior
 
 FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
 IN_CONTACT = "tool-friction", "joint", "tool-friction + joint-friction"
 """Priors that are looked at, the one that is taken without a look first."""
+
+FRICTION = (
+    CoulombJointFriction,
+    DirectionalJointFriction,
+    LoadJointFriction,
+    StribeckJointFriction,
+    ViscousJointFriction,
+)
 
 LOOK = 100
 """Rows of the look."""
@@ -37,14 +53,22 @@ def choose_prior(
 
     In free motion friction of the joints, in contact forces at the tool, unless left-out stretches of `LOOK` rows show
     a force at every joint, or the sum with friction of the joints, to be better (`compare_priors`). `how` are other
-    arguments of that. Where nothing can be compared (too few rows), the first one is taken, and the reason says so.
+    arguments of that. A system with friction laws was identified: what is missing is the rest of the friction, and
+    functions of positions and torques only fit what filters leave. Where nothing can be compared (too few rows), the
+    first one is taken as well, and the reason says so.
     """
     names = IN_CONTACT if system.contacts else FREE_MOTION
     where = "in contact" if system.contacts else "in free motion"
+    if any(isinstance(force, FRICTION) for force in system.known_forces):
+        return names[0], f"{names[0]} {where}, beside the friction laws that the system lists"
     priors = {name: named_prior(name, system) for name in names}
     points = min(LOOK, len(dataset))
     try:
-        found = compare_priors(dataset, priors, points=points, system=system, noise=noise, restarts=1, seed=seed, **how)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # the fit gives it
+            found = compare_priors(
+                dataset, priors, points=points, system=system, noise=noise, restarts=1, seed=seed, **how
+            )
     except ForceGPError as error:
         return names[0], f"{names[0]}, the usual one {where}; others could not be compared with it ({error})"
     others = ", ".join(name for name in names if name != found.preferred.name)
@@ -62,7 +86,9 @@ def independent_rows(model: StructuredGP, dataset: Dataset, seed: int = 0) -> tu
     """
     if len(dataset) <= FEWEST or not dataset.time_ordered:
         return dataset, None
-    rough = model.fit(dataset, points=LOOK, restarts=1, seed=seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # the fit gives it
+        rough = model.fit(dataset, points=LOOK, restarts=1, seed=seed)
     some = dataset.rows(slice(RESIDUALS))
     residual = rough.predict(some.q, some.v, some.u).mean.cpu().numpy() - some.a
     spread = residual.std(axis=0)

@@ -21,8 +21,8 @@ class RolloutErrors:
     tool: (B, T+1) largest distance of a contact point from the recorded one in m; None without contacts.
     constraint: (B, T+1) largest |c(q)| of a contact in m; None without contacts. recorded_constraint: that of the
         recording.
-    spread: (B, T+1, nv) half the width of the 95 % interval of the sampled q; None without samples.
-    inside: (B, T+1, nv) whether the recorded q lies in that interval (NaN where there is none); None without samples.
+    spread: (B, T+1, nv) half the width of the 95 % interval of q (`Rollout.interval`); None where there is none.
+    inside: (B, T+1, nv) whether the recorded q lies in that interval (NaN after a divergence); None without one.
     diverged_at: (B,) see `Rollout`.
     """
 
@@ -50,8 +50,8 @@ def rollout_errors(rollout: Rollout, recorded: RecordedMotions, system: Mechanic
         constraint = rollout.constraint.abs().amax(-1).cpu().numpy()
         distances = [contact.distance(there).abs() for contact in system.contacts]
         recorded_constraint = torch.stack(distances).amax(0).cpu().numpy()
-    if rollout.samples is not None:
-        low, high = rollout.quantiles(INTERVAL, "q").cpu().numpy()
+    if rollout.samples is not None or rollout.intervals is not None:
+        low, high = (end.cpu().numpy() for end in rollout.interval())
         spread = 0.5 * (high - low)
         inside = np.where(np.isnan(spread), np.nan, (low <= recorded.q) & (recorded.q <= high))
     return RolloutErrors(

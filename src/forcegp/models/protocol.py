@@ -17,6 +17,7 @@ from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
+from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
 from forcegp.models.prediction import Prediction, Rows, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
@@ -246,7 +247,12 @@ class Posterior(Summary, ABC):
         """
         model = self.accelerations(baumgarte)
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed, "grad": grad}
-        return roll_out(model, q0, v0, u, dt, **how, progress=progress)
+        return replace(roll_out(model, q0, v0, u, dt, **how, progress=progress), intervals=self.motion_intervals)
+
+    @property
+    def motion_intervals(self) -> MotionIntervals | None:
+        """Widths of the intervals of motions, where they were calibrated; a rollout carries them."""
+        return None
 
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
         """How well training rows are predicted from those outside their block: in closed form, without another fit.
@@ -311,6 +317,33 @@ class Posterior(Summary, ABC):
         """
         raise InvalidInput(
             f"a {self.description} has no forces that motions could refine; fit a StructuredGP or an analytical model."
+        )
+
+    def calibrated_on_motions(
+        self: AnyPosterior,
+        dataset: Dataset,
+        horizons: Sequence[float] = HORIZONS,
+        *,
+        integrator: str = "rk4",
+        report: Callable[[int, int], None] | None = None,
+    ) -> AnyPosterior:
+        """The same model with intervals of motions that hold: of stretches of the training time, left out in turn.
+
+        For each of four stretches the model is made again from the other rows at the same hyper-parameters (refined on
+        their motions if it was), and predicts motions in the stretch. `rollout(...).interval()` then uses the widths.
+
+        Parameters
+        ----------
+        dataset: the recording that the model learned from, in equal steps of time.
+        horizons: lengths of the motions in s, at which widths are found.
+        integrator: of these motions, as for `rollout`.
+        report: called as report(stretch, stretches).
+
+        Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
+        """
+        raise InvalidInput(
+            f"a {self.description} would have to be trained again for every stretch that is left out; take a "
+            "StructuredGP or an analytical model."
         )
 
     def with_system(self: AnyPosterior, system: MechanicalSystem) -> AnyPosterior:

@@ -15,6 +15,7 @@ from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integ
 from forcegp.integration.integrators import ImplicitMidpoint, Integrator, check_time_step
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
+from forcegp.models.motion_intervals import MotionIntervals
 from forcegp.models.search import blas_threads
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
 
@@ -66,6 +67,7 @@ class Rollout:
     integrator, baumgarte: how the motion was computed.
     samples: with samples=S, the same for S functions drawn from the model's posterior, shapes (S, ..., T+1, nv);
         None without. Each sample is one function: it answers the same state always with the same force.
+    intervals: calibrated widths of intervals, of the model; None without.
     """
 
     time: Float[Tensor, " rows"]
@@ -79,6 +81,20 @@ class Rollout:
     integrator: str
     baumgarte: Baumgarte | None
     samples: "Rollout | None" = None
+    intervals: MotionIntervals | None = None
+
+    def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
+        """Lower and upper ends (..., T+1, nv) of the 95 % interval.
+
+        Of a model with calibrated intervals (`Posterior.calibrated_on_motions`) those, centred on the mean; else the
+        quantiles of the samples. Raises InvalidInput where there is neither.
+        """
+        if self.intervals is None:
+            low, high = self.quantiles((0.025, 0.975), quantity)
+            return low, high
+        center, enough = getattr(self, quantity), self.samples is not None and len(self.samples.q) > 1
+        half = self.intervals.half_width(quantity, self.time, self.std(quantity) if enough else None)
+        return center - half, center + half
 
     def std(self, quantity: Quantity = "q") -> Tensor:
         """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.

@@ -31,9 +31,10 @@ def rollout_figure(
     names, units = style.short_joint_names(dataset.joint_names), style.joint_units(dataset, "q")
     mean = rollout.q[0].cpu().numpy()
     band, label = None, ""
-    if rollout.samples is not None:
-        band = rollout.quantiles(INTERVAL, "q").cpu().numpy()[:, 0]
-        label = f"95 % of {len(rollout.samples.q)} samples"
+    if errors.spread is not None:
+        band = np.stack([end.cpu().numpy()[0] for end in rollout.interval()])
+        label = "95 % interval" if rollout.samples is None else f"95 % of {len(rollout.samples.q)} samples"
+        label = label if rollout.intervals is None else "95 % interval, calibrated"
     for joint, panel in enumerate(axes.flat):
         if joint >= nv:
             panel.set_visible(False)

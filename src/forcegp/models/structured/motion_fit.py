@@ -428,6 +428,7 @@ def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds
     engine = found.engine if not space.count else InducingWeights(tuple(len(z) for z in space.points))
     told = {
         "seconds": seconds,
+        "inertias": unknowns.bodies is not None,
         "windows": len(fit.recorded.rows),
         "step": fit.h,
         "rms": sigma.tolist(),

@@ -31,6 +31,7 @@ from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Mechani
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
+from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
 from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -39,6 +40,7 @@ from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.components import Components, Curve, Latents, components_of, term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
+from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
@@ -258,7 +260,9 @@ class StructuredPosterior(Posterior):
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
         self.model.prior.mixing(system.dynamics(q, v, u, inertials_of(self.parameters) or None))
         # the training rows are always conditioned in their own system: nothing is factorised again, no number changes
-        return replace(self, target=system)
+        # widths of intervals of motions were found in the system before
+        kept = {name: value for name, value in self.settings.items() if name != "motion_intervals"}
+        return replace(self, target=system, settings=kept)
 
     @override
     def to(self, device: torch.device | str) -> "StructuredPosterior":
@@ -290,6 +294,24 @@ class StructuredPosterior(Posterior):
         report: Callable[[int, float], None] | None = None,
     ) -> "StructuredPosterior":
         return refine_on_motions(self, dataset, seconds, inertias, report)
+
+    @override
+    def calibrated_on_motions(
+        self,
+        dataset: Dataset,
+        horizons: Sequence[float] = HORIZONS,
+        *,
+        integrator: str = "rk4",
+        report: Callable[[int, int], None] | None = None,
+    ) -> "StructuredPosterior":
+        intervals = calibrate_motions(self, dataset, horizons, integrator, report)
+        return self.with_settings(motion_intervals=intervals.to_dict())
+
+    @property
+    @override
+    def motion_intervals(self) -> MotionIntervals | None:
+        stored = self.settings.get("motion_intervals")
+        return None if stored is None else MotionIntervals.from_dict(stored)
 
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:

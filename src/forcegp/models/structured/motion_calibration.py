@@ -1,0 +1,121 @@
+"""Calibration of the intervals of motions on stretches of training time that are left out in turn."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.data.motion_records import RecordedMotions, recorded_motions
+from forcegp.errors import InvalidInput, require_type
+from forcegp.models.motion_intervals import DEVIATIONS, MotionIntervals
+from forcegp.models.rollout import Rollout
+from forcegp.models.training_data import TrainingData
+
+FOLDS = 4
+SAMPLES = 16
+STEP = 0.005
+"""Longest step in s, of several rows where the recording has shorter ones."""
+STARTS = 4
+"""Motions that begin within one longest horizon."""
+LEVEL = 0.95
+Structured = Any
+"""A `StructuredPosterior`, whose module imports this one."""
+
+
+def calibrate_motions(
+    posterior: Structured,
+    dataset: Dataset,
+    horizons: Sequence[float],
+    integrator: str,
+    report: Callable[[int, int], None] | None,
+) -> MotionIntervals:
+    """What `StructuredPosterior.calibrated_on_motions` documents."""
+    require_type("dataset", dataset, Dataset)
+    wanted = tuple(sorted(set(horizons)))
+    if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
+        raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
+    parts = _folds(dataset, wanted[-1])
+    errors, spreads, kept = [], [], wanted
+    for number, inside in enumerate(parts):
+        if report is not None:
+            report(number, len(parts))
+        motions = _motions(dataset.rows(inside), wanted[-1])
+        kept = tuple(h for h in wanted if h >= motions.dt)
+        other = _without(posterior, dataset.rows(~inside))
+        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES if len(other.latent_names) else 0}
+        rollout: Rollout = other.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, **how)
+        rows = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
+        error, spread = [], []
+        for name in ("q", "v"):
+            there = getattr(rollout, name)[:, rows]
+            error.append(np.abs(there.cpu().numpy() - getattr(motions, name)[:, rows]))
+            sampled = rollout.samples is not None
+            spread.append(rollout.std(name)[:, rows].cpu().numpy() if sampled else np.zeros_like(error[-1]))
+        errors.append(np.stack(error, axis=2))
+        spreads.append(np.stack(spread, axis=2))
+    error, spread = np.concatenate(errors), np.concatenate(spreads)  # (motions, H, 2, nv)
+    lasting = np.isfinite(error + spread).all(axis=(1, 2, 3))
+    if not lasting.any():
+        raise InvalidInput(f"no motion of {wanted[-1]:g} s could be predicted to its end; give shorter horizons.")
+    error, spread = error[lasting], spread[lasting]
+    rms = np.sqrt(np.square(error).mean(0)).clip(np.finfo(float).tiny)
+    level = min(1.0, LEVEL * (1.0 + 1.0 / len(error)))
+    scores = [error / np.sqrt(np.square(s) + np.square(rms)) for s in (spread, np.zeros_like(spread))]
+    factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
+    return MotionIntervals(np.array(kept), rms, factors)
+
+
+def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
+    """Rows of stretches of time that are left out in turn: quarters of every episode, or of all episodes."""
+    numbers = np.zeros(len(dataset), dtype=int)
+    long = 0
+    for episode in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == episode)
+        lasting = float(np.ptp(dataset.time[rows]))
+        if lasting >= FOLDS * seconds:
+            numbers[rows] = np.minimum((np.arange(len(rows)) * FOLDS) // len(rows), FOLDS - 1)
+        else:
+            numbers[rows], long = long % FOLDS, long + (lasting >= seconds)
+    parts = [numbers == fold for fold in range(FOLDS)]
+    used = [part for part in parts if _lasts(dataset, part, seconds)]
+    if len(used) < 2:
+        raise InvalidInput(
+            f"intervals need two stretches of {seconds:g} s at least, of which one is left out in turn; give shorter "
+            "horizons, or a longer recording."
+        )
+    return used
+
+
+def _lasts(dataset: Dataset, part: np.ndarray, seconds: float) -> bool:
+    return any(
+        float(np.ptp(dataset.time[rows])) >= seconds
+        for episode in dataset.episodes
+        if len(rows := np.flatnonzero(part & (dataset.episode == episode)))
+    )
+
+
+def _motions(part: Dataset, seconds: float) -> RecordedMotions:
+    """Motions of that length all over the rows, `STARTS` in the time of one."""
+    count = max(1, int(STARTS * sum(np.ptp(part.time[part.episode == e]) for e in part.episodes) / seconds))
+    found = recorded_motions(part, count, seconds)
+    stride = max(1, int(STEP / found.dt))
+    steps = found.u.shape[1] // stride
+    u = found.u[:, : steps * stride].reshape(len(found.u), steps, stride, -1).mean(axis=2)
+    ends = slice(0, steps * stride + 1, stride)
+    return RecordedMotions(found.rows, stride * found.dt, found.q[:, ends], found.v[:, ends], u)
+
+
+def _without(posterior: Structured, rest: Dataset) -> Structured:
+    """The model from the other rows: as many of them, at the same hyper-parameters; refined on motions if it was."""
+    refined = posterior.settings.get("motions")
+    if refined is not None:
+        return posterior.refined_on_motions(rest, refined["seconds"], inertias=refined["inertias"])
+    own = posterior.training
+    rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
+    given = replace(TrainingData.of(rows, own.q.device), reference=own.reference or own)
+    model, parameters = posterior.model, posterior.parameters
+    other = model.condition(given, parameters, posterior.result, posterior.settings, posterior.engine)
+    return replace(other, target=posterior.target)
