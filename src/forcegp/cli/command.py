@@ -29,6 +29,14 @@ def unless_given(metavar: str, default: str, constructor: type | None = None) ->
     return arg(metavar=metavar, constructor=constructor, help_behavior_hint=f"(default: {default})")
 
 
+def numbers_of(text: str, complaint: str, *, one: bool = False) -> list[float]:
+    """The numbers between the commas of an option, of which there may be `one`. Raises InvalidInput as complained."""
+    try:
+        return [float(part) for part in ([text] if one else text.split(","))]
+    except ValueError:
+        raise InvalidInput(complaint) from None
+
+
 @dataclass(frozen=True)
 class InputPath:
     """Annotates a field with a path that must be there: `refusal` follows the path in the error where it is not."""

@@ -15,7 +15,7 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import require_unchanged
-from forcegp.cli.command import IDENTIFIED, URDF, Command, unless_given
+from forcegp.cli.command import IDENTIFIED, URDF, Command, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -156,12 +156,10 @@ def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
 
 
 def _finite(text: str, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    complaint = f"{what}: {text!r} is not a finite number."
+    [value] = numbers_of(text, complaint, one=True)
     if not math.isfinite(value):
-        raise InvalidInput(f"{what}: {text!r} is not a finite number.")
+        raise InvalidInput(complaint)
     return value
 
 
@@ -201,7 +199,8 @@ class CutoffOptions(Command):
         if self.cutoff in ("none", "auto"):
             cutoff = None if self.cutoff == "none" else "auto"
         else:
-            cutoff = _number("--cutoff", self.cutoff, "a frequency in Hz, auto or none")
+            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
+            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
         return forcegp.Preparation(cutoff=cutoff, differentiate=self.differentiate)
 
 
@@ -219,18 +218,9 @@ class PreparationOptions(CutoffOptions):
 
     @override
     def _preparation(self) -> forcegp.Preparation:
-        delay: float | tuple[float, ...] | Literal["auto"]
-        if self.delay == "auto":
-            delay = "auto"
-        else:
-            allowed = "seconds, one per joint with commas, or auto"
-            each = tuple(_number("--delay", word, allowed) for word in self.delay.split(","))
+        delay: float | tuple[float, ...] | Literal["auto"] = "auto"
+        if self.delay != "auto":
+            wrong = "--delay is {!r}; give seconds, one per joint with commas, or auto.".format
+            each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in self.delay.split(","))
             delay = each[0] if len(each) == 1 else each
         return replace(super()._preparation(), delay=delay, every=self.every, trim=self.trim)
-
-
-def _number(option: str, word: str, allowed: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise InvalidInput(f"{option} is {word!r}; give {allowed}.") from None

@@ -18,16 +18,12 @@ import forcegp.data
 import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
-from forcegp.cli.command import DATASET, BackendOptions, unless_given
+from forcegp.cli.command import DATASET, BackendOptions, numbers_of, unless_given
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
-SYNTAX = {
-    "plane": ("nx,ny,nz,offset", 4),
-    "sphere": ("cx,cy,cz,radius", 4),
-    "cylinder": ("px,py,pz,ax,ay,az,radius", 7),
-}
+SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
 """Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
 
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
@@ -49,32 +45,24 @@ def parse_contact(text: str) -> forcegp.Contact:
     """
     place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
     if kind not in SYNTAX or not place:
-        forms = ", ".join(f"{name}:{form}" for name, (form, _) in SYNTAX.items())
+        forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
         raise InvalidInput(
             f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
         )
-    form, count = SYNTAX[kind]
-    values = _numbers(text, kind, numbers, form, count)
+    *given, size = _numbers(text, kind, numbers, SYNTAX[kind])
+    vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
     frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
-    x, y, z = _numbers(text, "the point", point, "x,y,z", 3)
-    if kind == "plane":
-        surface = forcegp.Plane((values[0], values[1], values[2]), values[3])
-    elif kind == "sphere":
-        surface = forcegp.Sphere((values[0], values[1], values[2]), values[3])
-    else:
-        surface = forcegp.Cylinder((values[0], values[1], values[2]), (values[3], values[4], values[5]), values[6])
-    return forcegp.Contact(frame, (x, y, z), surface)
+    x, y, z = _numbers(text, "the point", point, "x,y,z")
+    surface: Any = forcegp.mechanics.SURFACES[kind]
+    return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
 
 
-def _numbers(text: str, what: str, given: str, form: str, count: int) -> list[float]:
-    try:
-        values = [float(entry) for entry in given.split(",")]
-    except ValueError:
-        values = []
+def _numbers(text: str, what: str, given: str, form: str) -> list[float]:
+    count = form.count(",") + 1
+    complaint = f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
+    values = numbers_of(given, complaint)
     if len(values) != count:
-        raise InvalidInput(
-            f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
-        )
+        raise InvalidInput(complaint)
     return values
 
 
@@ -89,7 +77,9 @@ def parse_learn(words: Sequence[str]) -> tuple[forcegp.models.Learned, ...]:
         name, _, listed = what.rpartition(":") if ":" in what else (what, "", "")
         entries = tuple(entry for entry in listed.split(",") if entry)
         if name in forces:
-            learned.append(forcegp.Coefficients(name, entries or None, _number(word, start) if start else None))
+            complaint = f"--learn {word}: {start!r} is not a number; give a start value such as =0.1."
+            value = numbers_of(start, complaint, one=True)[0] if start else None
+            learned.append(forcegp.Coefficients(name, entries or None, value))
         elif entries and not start:
             learned.append(forcegp.robots.LinkInertia(name, entries))
         else:
@@ -104,34 +94,19 @@ def with_learned_forces(
     system: forcegp.MechanicalSystem, learn: Sequence[forcegp.models.Learned]
 ) -> tuple[forcegp.MechanicalSystem, list[str]]:
     """The system with every learned force in its list, from the URDF's coefficients, and the names that were added."""
-    make = {
-        "viscous-joint-friction": (
-            forcegp.ViscousJointFriction,
-            lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
-        ),
-        "coulomb-joint-friction": (
-            forcegp.CoulombJointFriction,
-            lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
-        ),
-        "load-joint-friction": (forcegp.LoadJointFriction, lambda: forcegp.LoadJointFriction(0.0, 0.0, 0.1)),
-        "armature": (forcegp.Armature, lambda: forcegp.Armature(0.0)),
-        "rotor-inertia": (forcegp.RotorInertia, lambda: forcegp.RotorInertia(0.0)),
-    }
     added: dict[str, None] = {}
-    for entry in learn:
-        if isinstance(entry, forcegp.Coefficients) and not any(
-            type(f) is make[entry.force][0] for f in system.known_forces
-        ):
-            system = replace(system, known_forces=(*system.known_forces, make[entry.force][1]()))
-            added[entry.force] = None
+    for name in (entry.force for entry in learn if isinstance(entry, forcegp.Coefficients)):
+        if not any(type(force) is forcegp.mechanics.KNOWN_FORCES[name] for force in system.known_forces):
+            system = replace(system, known_forces=(*system.known_forces, _known_force(name, system)))
+            added[name] = None
     return system, list(added)
 
 
-def _number(word: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InvalidInput(f"--learn {word}: {text!r} is not a number; give a start value such as =0.1.") from None
+def _known_force(name: str, system: forcegp.MechanicalSystem) -> forcegp.mechanics.KnownForce:
+    """The force of that name, with the coefficients of the URDF, or else values from which an estimate begins."""
+    kind: Any = forcegp.mechanics.KNOWN_FORCES[name]
+    begin = {"load-joint-friction": (0.0, 0.0, 0.1), "armature": (0.0,), "rotor-inertia": (0.0,)}
+    return kind.from_robot(system.robot) if hasattr(kind, "from_robot") else kind(*begin.get(name, ()))
 
 
 def friction_laws(words: str) -> tuple[str, ...]:
@@ -269,7 +244,8 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.contact:
             system = system.with_contacts(contacts)
         if self.known_force:
-            system = _with_known_forces(system, self.known_force)
+            names = dict.fromkeys(self.known_force)
+            system = replace(system, known_forces=tuple(_known_force(name, system) for name in names))
         return system
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
@@ -285,13 +261,3 @@ class LearningOptions(BackendOptions, RobotOptions):
         }
         data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
         return {"options": options, "data": data}
-
-
-def _with_known_forces(system: forcegp.MechanicalSystem, names: tuple[str, ...]) -> forcegp.MechanicalSystem:
-    made = {
-        "actuation": lambda: forcegp.Actuation(),
-        "rigid-body-bias": lambda: forcegp.RigidBodyBias(),
-        "viscous-joint-friction": lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
-        "coulomb-joint-friction": lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
-    }
-    return replace(system, known_forces=tuple(made[name]() for name in dict.fromkeys(names)))

@@ -14,7 +14,7 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, numbers_of, unless_given
 from forcegp.cli.input_options import SystemChoice, carried_over
 from forcegp.cli.terminal import NONE, Terminal, columns, facts, number, percent
 from forcegp.errors import InvalidInput
@@ -176,13 +176,10 @@ def parse_baumgarte(given: str) -> forcegp.Baumgarte | None:
     """`none`, `OMEGA` or `OMEGA,ZETA`. Raises InvalidInput for anything else."""
     if given == "none":
         return None
-    try:
-        numbers = [float(part) for part in given.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 2):
-        raise InvalidInput(f"--baumgarte is {given!r}; give none, OMEGA or OMEGA,ZETA, for example 10,1.")
-
+    complaint = f"--baumgarte is {given!r}; give none, OMEGA or OMEGA,ZETA, for example 10,1."
+    numbers = numbers_of(given, complaint)
+    if len(numbers) > 2:
+        raise InvalidInput(complaint)
     return forcegp.Baumgarte(*numbers)
 
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.errors import BackendError, InvalidInput, MissingExtra
-from forcegp.parallel.backend import MOST_DEATHS, Backend, Joblib, Pool, Serial, Shared, Workers, check_jobs, replayed
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Joblib, Pool, Serial, Shared, check_jobs, replayed
 
 ANSWER_SECONDS = 10
 """So long a machine is given to answer."""
@@ -184,10 +184,10 @@ class Ray(Backend):
         return _Cluster(connected(self.address, self.jobs), self.jobs)
 
 
-class _Cluster(Workers):
+class _Cluster(Pool):
     def __init__(self, ray: Any, jobs: int | None) -> None:
-        self._ray = ray
         super().__init__(float("inf") if jobs is None else jobs)
+        self._ray = ray
         if not any(node["Alive"] and node["Resources"].get("CPU", 0) >= 1 for node in ray.nodes()):
             raise BackendError("no machine of the Ray cluster has a processor to offer; start one with --num-cpus")
         self._work = ray.remote(num_cpus=1, max_retries=MOST_DEATHS, scheduling_strategy="SPREAD")(_portable_work())

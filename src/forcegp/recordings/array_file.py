@@ -18,7 +18,7 @@ from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
     Source,
-    as_column,
+    columns_of,
     element_names,
     reading,
     require_plausible_size,
@@ -103,11 +103,7 @@ class ArrayFile(Source):
             )
         for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
             tables = dict(zip(arrays, pieces, strict=True))
-            columns: Columns = {}
-            for name in names:
-                array, index = self._places[name]
-                columns[name] = as_column(tables[array] if index is None else tables[array][:, index])
-            yield columns
+            yield columns_of(tables, {name: self._places[name] for name in names})
 
 
 def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
@@ -118,6 +114,11 @@ def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
             "save it as an array of numbers."
         )
     return dtype.kind in "fiu"
+
+
+def pieces_of(values: np.ndarray, rows: int) -> Iterator[np.ndarray]:
+    """An array that is in memory, as `ArrayFile.blocks` gives it."""
+    return (values[start : start + rows] for start in range(0, len(values), rows))
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
@@ -170,16 +171,15 @@ class NumpyArchive(ArrayFile):
     @override
     def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
         member, shape, column_major, dtype = self._arrays[name]
-        length = self.shapes()[name][0]
         with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive, archive.open(member) as stream:
             _header(stream)
             if column_major and len(shape) > 1:  # its first row ends where the array ends: there are no pieces
                 table = np.frombuffer(stream.read(), dtype, count=math.prod(shape)).reshape(shape, order="F")
-                yield from (table[start : start + rows] for start in range(0, length, rows))
+                yield from pieces_of(table, rows)
                 return
             row_bytes = dtype.itemsize * math.prod(shape[1:])
-            for start in range(0, length, rows):
-                count = min(rows, length - start)
+            for start in range(0, shape[0], rows):
+                count = min(rows, shape[0] - start)
                 data = stream.read(count * row_bytes)
                 if len(data) < count * row_bytes:
                     raise EOFError(f"{name!r} ends before its last row")

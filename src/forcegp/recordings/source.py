@@ -112,6 +112,14 @@ def as_column(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
+def columns_of(tables: Mapping[str, np.ndarray], places: Mapping[str, tuple[str, int | None]]) -> Columns:
+    """Columns out of tables (rows,) or (rows, k): name of a column -> its table, and where it is in that."""
+    return {
+        name: as_column(tables[own] if index is None else tables[own][:, index])
+        for name, (own, index) in places.items()
+    }
+
+
 @contextmanager
 def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
     """Turn what a library meets in a damaged file into a FileFormatError that names the path.
