@@ -75,7 +75,9 @@ class Demo(Command):
             for name, (place, mean) in MODELS.items():
                 models[name], fit_seconds[name] = self._fitted(terminal, folder / place, train, name, mean)
                 evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
-            pictures = _draw_all(terminal, folder, models, test)
+            pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
+            histories = {name: posterior.result.history for name, posterior in models.items()}
+            forcegp.evaluation.save_figure(forcegp.evaluation.likelihood_figure(histories), folder / "likelihood.png")
             terminal.note(f"drew {', '.join(pictures)}")
             wall_seconds = time.monotonic() - start
             results = self._results(models, evaluations, fit_seconds, wall_seconds) | {"machine": machine}
@@ -163,14 +165,3 @@ class Demo(Command):
 def _multiplier_line(evaluations: Mapping[str, forcegp.Evaluation]) -> str:
     scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
     return f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
-
-
-def _draw_all(
-    terminal: Terminal, folder: Path, models: Mapping[str, forcegp.models.StructuredPosterior], test: forcegp.Dataset
-) -> list[str]:
-    pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-    forcegp.evaluation.save_figure(
-        forcegp.evaluation.likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
-        folder / "likelihood.png",
-    )
-    return pictures

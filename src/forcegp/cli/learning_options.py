@@ -53,7 +53,7 @@ def parse_contact(text: str) -> forcegp.Contact:
     vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
     frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
     x, y, z = _numbers(text, "the point", point, "x,y,z")
-    surface: Any = forcegp.mechanics.SURFACES[kind]
+    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere, "cylinder": forcegp.Cylinder}[kind]
     return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
 
 

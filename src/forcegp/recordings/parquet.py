@@ -17,6 +17,7 @@ from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
     Source,
+    arrow_numbers,
     columns_of,
     element_names,
     reading,
@@ -87,7 +88,7 @@ class ParquetFile(Source):
 
     def _table(self, column: pa.Array, name: str, row: int) -> np.ndarray:
         if name not in self._widths:
-            return _plain(column)
+            return arrow_numbers(column)
         width = self._widths[name]
         lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
         wrong = np.flatnonzero(lengths != width)
@@ -96,12 +97,7 @@ class ParquetFile(Source):
                 f"{self.path}: column {name!r} has {lengths[wrong[0]]} elements at {self.place(row + int(wrong[0]))}, "
                 f"{width} before. Lists must be of one length."
             )
-        return _plain(column.flatten()).reshape(len(column), width)
-
-
-def _plain(column: pa.Array) -> np.ndarray:
-    values = column.to_numpy(zero_copy_only=False)
-    return values.astype(np.float64) if values.dtype == object or column.null_count else values
+        return arrow_numbers(column.flatten()).reshape(len(column), width)
 
 
 def _is_number(kind: pa.DataType) -> bool:

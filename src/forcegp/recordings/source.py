@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -118,6 +118,12 @@ def columns_of(tables: Mapping[str, np.ndarray], places: Mapping[str, tuple[str,
         name: as_column(tables[own] if index is None else tables[own][:, index])
         for name, (own, index) in places.items()
     }
+
+
+def arrow_numbers(column: Any) -> np.ndarray:
+    """A column of pyarrow; a missing value is NaN."""
+    values = column.to_numpy(zero_copy_only=False)
+    return values.astype(np.float64) if values.dtype == object or column.null_count else values
 
 
 @contextmanager
