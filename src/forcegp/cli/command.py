@@ -183,10 +183,7 @@ class BackendOptions(Command):
     """The head of the Ray cluster, for --backend ray."""
 
     def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
-        """The backend that is asked for, or else the default: this process for one job, several for more.
-
-        Raises InvalidInput for options that contradict each other.
-        """
+        """The backend that is asked for, or else the default. Raises InvalidInput for contradicting options."""
         if self.backend is None and self.address is not None:
             raise InvalidInput(f"--address is {self.address}, that of a cluster; add --backend ray.")
         name = self.backend or default
@@ -200,10 +197,7 @@ class BackendOptions(Command):
 def require_free_file(
     path: Path, *, overwrite: bool, own: Callable[[Path], bool], what: str = "a dataset of forcegp"
 ) -> None:
-    """Refuse what exists, unless it is `own` or empty and --overwrite is given, and what cannot be written.
-
-    Raises InvalidInput or OSError before any work is done.
-    """
+    """Refuse what exists (but `own` or empty, with --overwrite) or cannot be written: InvalidInput, OSError."""
     if path.is_dir():
         raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
     if path.exists() and not path.is_file():

@@ -67,10 +67,7 @@ class RobotOptions(Command):
         return self._made(recorded, changes)
 
     def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
-        """What is known about the robot of `dataset`, which came from `path`: its own system, with what is replaced.
-
-        Raises InvalidInput where it carries none and none is given, or where joints differ.
-        """
+        """The dataset's own system, with what is replaced. Raises InvalidInput for none, and where joints differ."""
         system = dataset.system
         found = self._identified_system()
         if found is not None and system is not None:

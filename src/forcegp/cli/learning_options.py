@@ -39,10 +39,7 @@ def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
 
 
 def parse_contact(text: str) -> forcegp.Contact:
-    """`FRAME@x,y,z:SURFACE:numbers` as a contact; without `@x,y,z` the point is the origin of the frame.
-
-    Raises InvalidInput saying what is wrong with the text, and what is right.
-    """
+    """`FRAME@x,y,z:SURFACE:numbers`, without `@x,y,z` at the frame's origin. Raises InvalidInput with an example."""
     place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
     if kind not in SYNTAX or not place:
         forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
@@ -120,34 +117,6 @@ NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
 HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
-
-
-def rows_to_learn(
-    dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, choice: RowsChoice
-) -> tuple[forcegp.Dataset, str | None]:
-    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and a note on it.
-
-    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all, with a note.
-    The note is printed after the fit, so that an error before it stands alone. Raises ContactError with "in-contact" if
-    there are none.
-    """
-    if choice == "all" or not system.contacts:
-        return dataset, None
-    try:
-        touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
-    except ContactError:
-        if choice == "in-contact":
-            raise
-        return dataset, None  # the fit raises a clearer error
-    share = len(touching) / len(dataset)
-    if choice == "auto" and share >= NEARLY_ALL:
-        return dataset, None
-    text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
-    if choice == "auto" and share < HARDLY_ANY:
-        return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
-    return replace(
-        touching, system=dataset.system
-    ), f"{text}; these alone were learned from (--rows all takes every row)"
 
 
 MOST = 3
@@ -249,8 +218,27 @@ class LearningOptions(BackendOptions, RobotOptions):
         return system
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
-        """The rows to learn from, and a note to print after the fit."""
-        return rows_to_learn(dataset, system, self.rows)
+        """The rows in which all contacts act (`forcegp.data.rows_in_contact`), or all, as --rows asks.
+
+        And a note to print after the fit, so that an error before it stands alone. Raises ContactError with in-contact
+        if there are none.
+        """
+        if self.rows == "all" or not system.contacts:
+            return dataset, None
+        try:
+            touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
+        except ContactError:
+            if self.rows == "in-contact":
+                raise
+            return dataset, None  # the fit raises a clearer error
+        share = len(touching) / len(dataset)
+        if self.rows == "auto" and share >= NEARLY_ALL:
+            return dataset, None
+        text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+        if self.rows == "auto" and share < HARDLY_ANY:
+            return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
+        note = f"{text}; these alone were learned from (--rows all takes every row)"
+        return replace(touching, system=dataset.system), note
 
     def _given(self) -> dict[str, Any]:
         """Options and data, as a folder remembers them."""

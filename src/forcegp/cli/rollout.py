@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,7 +96,12 @@ class Rollout(Command):
         options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
         content = {"options": {name: summary[name] for name in options}}
         with self.folder(self.out, content) as folder:
-            self._write(folder, rollout, recorded, errors, dataset, summary)
+            write_json(folder / "rollout.json", summary)
+            _write_arrays(folder / "rollout.h5", rollout, recorded, dataset.joint_names)
+            stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
+            title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
+            figure = forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title)
+            forcegp.evaluation.save_figure(figure, folder / "rollout.png")
         terminal.note(f"figure: {self.out / 'rollout.png'}")
         terminal.show(*_report(summary))
         return summary
@@ -129,11 +134,8 @@ class Rollout(Command):
             "seconds": float(errors.time[-1]),
             "steps": steps,
             "unit": dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m",
-            "system": self.system,
-            "integrator": self.integrator,
+            **{name: getattr(self, name) for name in ("system", "integrator", "samples", "seed")},
             "baumgarte": None if baumgarte is None else {"omega": baumgarte.omega, "zeta": baumgarte.zeta},
-            "samples": self.samples,
-            "seed": self.seed,
             "diverged_at": errors.diverged_at.tolist(),
             "initial_correction": rollout.initial_correction.amax(0).tolist(),
             "cpu_seconds": cpu_seconds,
@@ -142,34 +144,20 @@ class Rollout(Command):
             "moments": [_moment(errors, row) for row in at],
         }
 
-    def _write(
-        self,
-        folder: Path,
-        rollout: forcegp.models.Rollout,
-        recorded: forcegp.data.RecordedMotions,
-        errors: forcegp.evaluation.RolloutErrors,
-        dataset: forcegp.Dataset,
-        summary: Mapping[str, Any],
-    ) -> None:
-        from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
 
-        write_json(folder / "rollout.json", summary)
-        arrays = {"time": rollout.time, "q": rollout.q, "v": rollout.v, "a": rollout.a}
-        arrays |= {"constraint": rollout.constraint, "diverged_at": rollout.diverged_at}
-        if rollout.samples is not None:
-            arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
-        with NewFile(folder / "rollout.h5") as file:
-            for name, values in arrays.items():
-                file[name] = values.cpu().numpy()
-            for name in ("q", "v", "u"):
-                file[f"recorded/{name}"] = getattr(recorded, name)
-            file["recorded/row"] = list(recorded.rows)
-            file.attrs["joint_names"] = list(dataset.joint_names)
-        stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
-        title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
-        forcegp.evaluation.save_figure(
-            forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png"
-        )
+def _write_arrays(path: Path, rollout: Any, recorded: forcegp.data.RecordedMotions, joint_names: Sequence[str]) -> None:
+    from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
+
+    arrays = {name: getattr(rollout, name) for name in ("time", "q", "v", "a", "constraint", "diverged_at")}
+    if rollout.samples is not None:
+        arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
+    with NewFile(path) as file:
+        for name, values in arrays.items():
+            file[name] = values.cpu().numpy()
+        for name in ("q", "v", "u"):
+            file[f"recorded/{name}"] = getattr(recorded, name)
+        file["recorded/row"] = list(recorded.rows)
+        file.attrs["joint_names"] = list(joint_names)
 
 
 def parse_baumgarte(given: str) -> forcegp.Baumgarte | None:

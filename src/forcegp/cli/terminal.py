@@ -46,9 +46,7 @@ ELSEWHERE = {
 def with_option_names(message: str, options: Collection[str]) -> str:
     """The message with --points for `points` and --points 5 for `points=5`, where the command has such an option.
 
-    The library marks arguments in its messages by backquotes, and options have the same names.
-
-    Arguments that the command does not have stay as they are.
+    The library marks arguments by backquotes, and options have the same names; those of other commands stay.
     """
 
     def option(found: re.Match[str]) -> str:

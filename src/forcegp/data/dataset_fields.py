@@ -34,10 +34,7 @@ class FrozenDict(dict[str, Any]):
 
 
 def frozen_json(metadata: Mapping[str, Any]) -> FrozenDict:
-    """Copy of a JSON-able mapping, frozen at every level (lists become tuples).
-
-    Raises DatasetError where JSON has no such value: arrays, NaN, keys that are not text.
-    """
+    """A mapping frozen at every level (lists become tuples). Raises DatasetError for what JSON does not have."""
     try:
         _require_text_keys(metadata)
         plain = json.loads(json.dumps(metadata, allow_nan=False))

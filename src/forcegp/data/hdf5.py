@@ -27,10 +27,7 @@ _LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that cla
 
 
 def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
-    """Write the fields of a Dataset to a temporary file in the same folder and rename it.
-
-    Raises InvalidInput if the folder does not exist or `path` is a folder.
-    """
+    """Write the fields of a Dataset, as `atomic_file` writes and raises."""
     arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
     with atomic_file(path) as temporary, NewFile(temporary) as file:

@@ -48,10 +48,7 @@ class ArrayFile(Source):
         """The array of that full name in pieces of exactly `rows` rows, but for the last."""
 
     def episodes(self, pattern: str) -> list[str]:
-        """Names of arrays or groups that a pattern such as `piece*` or `data/demo_*` matches, in the order of numbers.
-
-        Raises InvalidInput if there is none.
-        """
+        """Names that a pattern such as `data/demo_*` matches, in the order of numbers. Raises InvalidInput for none."""
         depth = pattern.count(SEPARATOR) + 1
         names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.shapes())
         found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]

@@ -93,10 +93,7 @@ WORDS = {
 
 
 def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple[str, ...] | None:
-    """One column per joint whose names are the joint's name in a text that means `signal`; None if there is none.
-
-    Raises InvalidInput if several sets of columns could be meant.
-    """
+    """One column per joint, its name in a text that means `signal`; None for none. Raises InvalidInput for several."""
     templates: dict[tuple[str, str], dict[str, str]] = {}
     for column in source.columns():
         for joint in joints:
@@ -143,10 +140,7 @@ NAME_LETTER = re.compile(r"\w")
 
 @dataclass(frozen=True)
 class LinearExpression:
-    """`constant + sum of weight * column`.
-
-    `weights` maps column names to their weights, none of them twice.
-    """
+    """`constant + sum of weight * column`; `weights` maps names of columns to their weights."""
 
     weights: Mapping[str, float]
     constant: float = 0.0

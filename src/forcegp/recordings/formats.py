@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 
 import h5py
@@ -65,8 +66,7 @@ class SideBySide(Source):
         own = {source: [self._owners[name][1] for name in names if self._owners[name][0] is source] for source in used}
         streams = [_exact(source.chunks(list(dict.fromkeys(own[source])), rows), rows) for source in used]
         counts = dict.fromkeys(used, 0)
-        while True:
-            pieces = [next(stream, None) for stream in streams]
+        for pieces in zip_longest(*streams):
             lengths = [len(next(iter(piece.values()))) if piece else 0 for piece in pieces]
             for source, length in zip(used, lengths, strict=True):
                 counts[source] += length
@@ -76,8 +76,6 @@ class SideBySide(Source):
                 listed = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
                 raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
             found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
-            if not found:
-                return
             yield {name: found[self._owners[name][0]][self._owners[name][1]] for name in names}
 
 
