@@ -147,13 +147,10 @@ class Demo(Command):
         rows.insert(0, ["known physics alone", *known, *[NONE] * 4])
         rows.append(["noise floor", number(first.noise_floor), NONE, number(0.0), *[NONE] * 4])
         title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
+        scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
+        multipliers = f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
         terminal.show(
             columns(title, header, rows),
-            *([_multiplier_line(evaluations)] if first.multiplier_mae is not None else []),
+            *([multipliers] if first.multiplier_mae is not None else []),
             f"{self.out}/summary.png shows it; results.json, models and data lie beside it ({wall_seconds:.0f} s).",
         )
-
-
-def _multiplier_line(evaluations: Mapping[str, forcegp.Evaluation]) -> str:
-    scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
-    return f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."

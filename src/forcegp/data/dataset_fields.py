@@ -23,10 +23,8 @@ class FrozenDict(dict[str, Any]):
     __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
     clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[FrozenDict], tuple[dict[str, Any]]]:  # the default would fill through __setitem__
-        return FrozenDict, (dict(self),)
+    def __reduce__(self) -> tuple[type[FrozenDict], tuple[dict[str, Any]]]:
+        return FrozenDict, (dict(self),)  # the default would fill through __setitem__
 
     def copy(self) -> dict[str, Any]:
         """An ordinary dictionary with the same items."""

@@ -172,7 +172,10 @@ def _read(path: Path, file: h5py.File) -> dict[str, Any]:
     values: dict[str, Any] = {name: _array(path, file, name) for name in COLUMNS}
     values["units"] = {name: _units(path, file, name) for name in ("q", "v", "u", "a", "time")}
     values["joint_names"] = tuple(_texts(path, file, "joint_names"))
-    values["metadata"] = _json(path, "metadata", _text(path, file, "metadata"))
+    metadata = json.loads(_text(path, file, "metadata"))
+    if not isinstance(metadata, dict):
+        raise FileFormatError(f"{path}: 'metadata' must be a JSON object; it is {type(metadata).__name__}.")
+    values["metadata"] = metadata
     values["noise_std"] = _array(path, file, "noise_std") if "noise_std" in file else None
     values["truth"] = {name: _array(path, file, f"truth/{name}") for name in _truth_names(path, file)}
     values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
@@ -230,13 +233,6 @@ def _units(path: Path, file: h5py.File, name: str) -> str | tuple[str, ...]:
     if units is None:
         raise FileFormatError(f"{path}: {name!r} has no attribute 'units'.")
     return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))
-
-
-def _json(path: Path, name: str, text: str) -> dict[str, Any]:
-    value = json.loads(text)
-    if not isinstance(value, dict):
-        raise FileFormatError(f"{path}: {name!r} must be a JSON object; it is {type(value).__name__}.")
-    return value
 
 
 def _system(path: Path, text: str) -> Any:

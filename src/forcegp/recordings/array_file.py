@@ -175,8 +175,9 @@ class NumpyArchive(ArrayFile):
                 yield from pieces_of(table, rows)
                 return
             row_bytes = dtype.itemsize * math.prod(shape[1:])
-            for start in range(0, shape[0], rows):
-                count = min(rows, shape[0] - start)
+            length = self.shapes()[name][0]
+            for start in range(0, length, rows):
+                count = min(rows, length - start)
                 data = stream.read(count * row_bytes)
                 if len(data) < count * row_bytes:
                     raise EOFError(f"{name!r} ends before its last row")

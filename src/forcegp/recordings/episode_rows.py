@@ -191,9 +191,12 @@ class EpisodeRows:
 
     def pieces(self, spool: Spool, rows: int = ROWS_AT_A_TIME) -> Iterator[dict[str, np.ndarray]]:
         """Time and the signals q, v, u, a, `rows` at a time."""
-        recording, numbers = self.stretch.recording, self._numbers
-        stamps = recording.time[numbers]
-        time = self._times(stamps)
+        recording, first = self.stretch.recording, self.stretch.start
+        numbers = first + np.flatnonzero(self.kept[first : self.stretch.end])  # rows of the recording that are used
+        time = stamps = recording.time[numbers]
+        if self.step is not None:
+            count = int(np.floor((stamps[-1] - stamps[0]) / self.step * (1 + 1e-12))) + 1
+            time = np.minimum(stamps[0] + self.step * np.arange(count), stamps[-1])
 
         def logged(start: int, end: int) -> np.ndarray:
             used = numbers[start:end]
@@ -201,9 +204,9 @@ class EpisodeRows:
             return table if len(table) == len(used) else table[used - used[0]]
 
         def interpolated(at: np.ndarray) -> np.ndarray:
-            first = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
-            last = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
-            return make_interp_spline(stamps[first:last], logged(first, last), k=3)(at)
+            low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
+            high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
+            return make_interp_spline(stamps[low:high], logged(low, high), k=3)(at)
 
         for start in range(0, len(time), rows):
             end = min(start + rows, len(time))
@@ -215,19 +218,3 @@ class EpisodeRows:
                     signals[name] = differentiate(signals[source], time[low:high])
             own = slice(start - low, end - low)
             yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}
-
-    @property
-    def count(self) -> int:
-        """Number of rows."""
-        return len(self._times(self.stretch.recording.time[self._numbers]))
-
-    @property
-    def _numbers(self) -> np.ndarray:
-        """Rows of the recording that are used."""
-        return self.stretch.start + np.flatnonzero(self.kept[self.stretch.start : self.stretch.end])
-
-    def _times(self, stamps: np.ndarray) -> np.ndarray:
-        if self.step is None:
-            return stamps
-        count = int(np.floor((stamps[-1] - stamps[0]) / self.step * (1 + 1e-12))) + 1
-        return np.minimum(stamps[0] + self.step * np.arange(count), stamps[-1])

@@ -136,7 +136,9 @@ def open_source(
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:
         if kind != ".npz" and h5py.is_hdf5(path):
-            _require_foreign(path)
+            with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
+                if file.attrs.get("format") == "forcegp-dataset":
+                    raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
         return ARRAYS[kind](path, within=within)
     return LeRobotFolder(path) if kind == "lerobot" else RosBag(path) if kind == "ros2" else TABLES[kind](path)
 
@@ -165,9 +167,3 @@ def _kind(path: Path) -> str:
     if path.stat().st_size == 0:
         raise FileFormatError(f"{path} is empty; give a log with rows.")
     return kind
-
-
-def _require_foreign(path: Path) -> None:
-    with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
-        if file.attrs.get("format") == "forcegp-dataset":
-            raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")

@@ -132,7 +132,10 @@ def import_recordings(
                 before = writer.rows
                 for piece in rows.pieces(spool):
                     writer.append(**piece, episode=number)
-                done["episodes"].append(_episode(rows, writer.rows - before))
+                recording, begin = rows.stretch.recording, rows.stretch.start
+                stamp = recording.begin + float(recording.time[begin])
+                own = {"recording": recording.label, "number": rows.stretch.number, "row": begin, "begin": stamp}
+                done["episodes"].append({**own, "rows": writer.rows - before})
             done["rows"] = writer.rows
             writer.finish({"import": done})
     return done
@@ -193,18 +196,6 @@ def _require_no_jumps(stretch: Stretch) -> None:
                 f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
                 "is in degrees. Add `unwrap`, or `unit` q=deg."
             )
-
-
-def _episode(rows: EpisodeRows, count: int) -> dict[str, Any]:
-    recording = rows.stretch.recording
-    begin = recording.time[rows.stretch.start]
-    return {
-        "recording": recording.label,
-        "number": rows.stretch.number,
-        "row": rows.stretch.start,
-        "begin": recording.begin + float(begin),
-        "rows": count,
-    }
 
 
 def _what_was_done(
