@@ -91,7 +91,8 @@ class Command(ABC):
                 raise InvalidInput(f"the name {str(path)!r} is not UTF-8, so it could not be reported; rename it.")
         for place, path in enumerate(outputs):
             for other in (*inputs, *outputs[:place], *outputs[place + 1 :]):
-                if _same(path, other) or (self.replaces and _within(other, path)):
+                within = Path(os.path.realpath(other)).is_relative_to(os.path.realpath(path))
+                if _same(path, other) or (self.replaces and within):
                     does = "reads" if other in inputs else "writes, too"
                     raise InvalidInput(
                         f"{path} would be written over {other}, which this command {does}; choose another name."
@@ -165,10 +166,6 @@ def _same(one: Path, other: Path) -> bool:
     with contextlib.suppress(OSError):  # one of them does not exist
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
-
-
-def _within(inner: Path, outer: Path) -> bool:
-    return Path(os.path.realpath(inner)).is_relative_to(os.path.realpath(outer))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -125,16 +125,13 @@ class Compare(LearningOptions):
                 priors,
                 points=points,
                 system=system,
-                mean=self.mean,
                 noise=resolved_noise(self.noise, dataset, self.force_noise),
                 restarts=restarts,
-                seed=self.seed,
                 backend=self._backend(),
-                hyperprior=self.hyperprior,
                 options=options,
-                block_seconds=self.block_seconds,
                 test=test,
                 progress=progress,
+                **{name: getattr(self, name) for name in ("mean", "seed", "hyperprior", "block_seconds")},
             )
 
     def _report(self, comparison: forcegp.PriorComparison, folders: Mapping[str, str]) -> list[Any]:

@@ -83,8 +83,7 @@ class Demo(Command):
             results = {
                 "out": str(self.out),
                 "seeds": self._seeds(),
-                "seconds": self.seconds,
-                "points": self.points,
+                **{name: options[name] for name in ("seconds", "points")},
                 "models": {
                     name: {
                         "run": str(self.out / place),

@@ -16,7 +16,7 @@ import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, numbers_of, unless_given
 from forcegp.cli.input_options import SystemChoice, carried_over
-from forcegp.cli.terminal import NONE, Terminal, columns, facts, number, percent
+from forcegp.cli.terminal import Terminal, columns, facts, number, percent, shown
 from forcegp.errors import InvalidInput
 
 DEFAULT_STARTS = 10
@@ -79,17 +79,9 @@ class Rollout(Command):
         recorded = forcegp.data.recorded_motions(dataset, rows, self.seconds)
         begun = time.process_time()
         with terminal.progress(f"rolling out: {len(recorded.rows)} motions of {recorded.time[-1]:.3g} s") as report:
-            rollout = posterior.rollout(
-                recorded.q[:, 0],
-                recorded.v[:, 0],
-                recorded.u,
-                recorded.dt,
-                integrator=self.integrator,
-                baumgarte=baumgarte,
-                samples=self.samples,
-                seed=self.seed,
-                progress=report,
-            )
+            how = {name: getattr(self, name) for name in ("integrator", "samples", "seed")}
+            begin = recorded.q[:, 0], recorded.v[:, 0]
+            rollout = posterior.rollout(*begin, recorded.u, recorded.dt, **how, baumgarte=baumgarte, progress=report)
         cpu_seconds = time.process_time() - begun
         errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.system)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
@@ -205,7 +197,7 @@ def _report(summary: Mapping[str, Any]) -> list[Any]:
         cells = [f"{moment['time']:.3g} s", str(moment["lasting"])]
         cells += [number(moment["joint_error_median"]), number(moment["joint_error_max"])]
         if contacts:
-            cells += [_millimetres(moment["tool_error_median"]), _millimetres(moment["constraint_max"])]
+            cells += [shown(moment[name], "{:.3g} mm", 1e3) for name in ("tool_error_median", "constraint_max")]
         rows.append([*cells, percent(moment["inside_95"])] if samples else cells)
     count = len(summary["rows"])
     title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
@@ -216,7 +208,3 @@ def _report(summary: Mapping[str, Any]) -> list[Any]:
         values["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
     values["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
     return [columns(title, header, rows), facts("", values)]
-
-
-def _millimetres(metres: float | None) -> str:
-    return NONE if metres is None else f"{1e3 * metres:.3g} mm"

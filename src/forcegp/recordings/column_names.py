@@ -130,12 +130,10 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     return bool(words & WORDS[signal])
 
 
-WORD_ENDS = r"(?!\w)"
 FACTOR = (
     r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?))(?!\w)|(?P<pi>pi)(?!\w)"
     r"|(?P<word>[^\s+*/`]+)"
 )
-NAME_LETTER = re.compile(r"\w")
 
 
 @dataclass(frozen=True)
@@ -179,7 +177,7 @@ class _Parser:
         self.text, self.columns, self.owner = text, columns, owner
         self.rest = text.lstrip()
         longest_first = sorted(columns, key=len, reverse=True)
-        names = "|".join(re.escape(name) + (WORD_ENDS if NAME_LETTER.match(name[-1]) else "") for name in longest_first)
+        names = "|".join(re.escape(name) + (r"(?!\w)" if re.match(r"\w", name[-1]) else "") for name in longest_first)
         self.factor = re.compile(FACTOR % names)
 
     def expression(self) -> LinearExpression:

@@ -26,7 +26,7 @@ class SideBySide(Source):
 
     def __init__(self, sources: Sequence[Source]) -> None:
         super().__init__(Path(", ".join(str(source.path) for source in sources)))
-        self.sources = {stem(source.path): source for source in sources}
+        self.sources = {source.path.name.split(".")[0]: source for source in sources}
         if len(self.sources) < len(sources):
             raise InvalidInput(f"{self.path}: two files have the same name up to the first dot; rename one.")
 
@@ -77,11 +77,6 @@ class SideBySide(Source):
                 raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
             found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
             yield {name: found[self._owners[name][0]][self._owners[name][1]] for name in names}
-
-
-def stem(path: Path) -> str:
-    """The name of a file up to its first dot."""
-    return path.name.split(".")[0]
 
 
 def _exact(pieces: Iterator[Columns], rows: int) -> Iterator[Columns]:
