@@ -16,7 +16,7 @@ import forcegp.evaluation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Debug, Json, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
-from forcegp.cli.terminal import NONE, Terminal, columns
+from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import DatasetError
 
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
@@ -91,16 +91,13 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[
 
 
 def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:
-    def shown(value: float | None, pattern: str = "{:.3g}") -> str:
-        return NONE if value is None else pattern.format(value)
-
     cutoff = content["cutoff"]
     filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
     header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered, "times M"]
     rows = [
         [
             each["joint"],
-            shown(None if each["unexplained"] is None else 100.0 * each["unexplained"], "{:.2g} %"),
+            shown(each["unexplained"], "{:.2g} %", 100.0),
             *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after", "noise_torque")),
         ]
         for each in content["joints"]

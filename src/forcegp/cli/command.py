@@ -29,6 +29,14 @@ def unless_given(metavar: str, default: str, constructor: type | None = None) ->
     return arg(metavar=metavar, constructor=constructor, help_behavior_hint=f"(default: {default})")
 
 
+def numbers_of(text: str, complaint: str, *, one: bool = False) -> list[float]:
+    """The numbers between the commas of an option, of which there may be `one`. Raises InvalidInput as complained."""
+    try:
+        return [float(part) for part in ([text] if one else text.split(","))]
+    except ValueError:
+        raise InvalidInput(complaint) from None
+
+
 @dataclass(frozen=True)
 class InputPath:
     """Annotates a field with a path that must be there: `refusal` follows the path in the error where it is not."""
@@ -83,7 +91,8 @@ class Command(ABC):
                 raise InvalidInput(f"the name {str(path)!r} is not UTF-8, so it could not be reported; rename it.")
         for place, path in enumerate(outputs):
             for other in (*inputs, *outputs[:place], *outputs[place + 1 :]):
-                if _same(path, other) or (self.replaces and _within(other, path)):
+                within = Path(os.path.realpath(other)).is_relative_to(os.path.realpath(path))
+                if _same(path, other) or (self.replaces and within):
                     does = "reads" if other in inputs else "writes, too"
                     raise InvalidInput(
                         f"{path} would be written over {other}, which this command {does}; choose another name."
@@ -159,10 +168,6 @@ def _same(one: Path, other: Path) -> bool:
     return os.path.realpath(one) == os.path.realpath(other)
 
 
-def _within(inner: Path, outer: Path) -> bool:
-    return Path(os.path.realpath(inner)).is_relative_to(os.path.realpath(outer))
-
-
 @dataclass(frozen=True, kw_only=True)
 class BackendOptions(Command):
     """What every command asks that can compute in several processes, or on several machines."""
@@ -175,10 +180,7 @@ class BackendOptions(Command):
     """The head of the Ray cluster, for --backend ray."""
 
     def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
-        """The backend that is asked for, or else the default: this process for one job, several for more.
-
-        Raises InvalidInput for options that contradict each other.
-        """
+        """The backend that is asked for, or else the default. Raises InvalidInput for contradicting options."""
         if self.backend is None and self.address is not None:
             raise InvalidInput(f"--address is {self.address}, that of a cluster; add --backend ray.")
         name = self.backend or default
@@ -192,10 +194,7 @@ class BackendOptions(Command):
 def require_free_file(
     path: Path, *, overwrite: bool, own: Callable[[Path], bool], what: str = "a dataset of forcegp"
 ) -> None:
-    """Refuse what exists, unless it is `own` or empty and --overwrite is given, and what cannot be written.
-
-    Raises InvalidInput or OSError before any work is done.
-    """
+    """Refuse what exists (but `own` or empty, with --overwrite) or cannot be written: InvalidInput, OSError."""
     if path.is_dir():
         raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
     if path.exists() and not path.is_file():

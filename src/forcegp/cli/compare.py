@@ -82,7 +82,10 @@ class Compare(LearningOptions):
         content |= comparison.to_dict()
         folders = _folders(comparison)
         if self.out is not None:
-            self._write(self.out, comparison, content, folders)
+            with self.folder(self.out, self._given()) as folder:
+                for name, posterior in comparison.posteriors.items():
+                    forcegp.save_posterior(posterior, folder / folders[name])
+                write_json(folder / "comparison.json", {**content, "models": folders})
         if rows_note is not None:
             terminal.note(rows_note)
         terminal.show(*self._report(comparison, folders))
@@ -122,25 +125,14 @@ class Compare(LearningOptions):
                 priors,
                 points=points,
                 system=system,
-                mean=self.mean,
                 noise=resolved_noise(self.noise, dataset, self.force_noise),
                 restarts=restarts,
-                seed=self.seed,
                 backend=self._backend(),
-                hyperprior=self.hyperprior,
                 options=options,
-                block_seconds=self.block_seconds,
                 test=test,
                 progress=progress,
+                **{name: getattr(self, name) for name in ("mean", "seed", "hyperprior", "block_seconds")},
             )
-
-    def _write(
-        self, out: Path, comparison: forcegp.PriorComparison, content: Mapping[str, Any], folders: Mapping[str, str]
-    ) -> None:
-        with self.folder(out, self._given()) as folder:
-            for name, posterior in comparison.posteriors.items():
-                forcegp.save_posterior(posterior, folder / folders[name])
-            write_json(folder / "comparison.json", {**content, "models": dict(folders)})
 
     def _report(self, comparison: forcegp.PriorComparison, folders: Mapping[str, str]) -> list[Any]:
         header = ["prior", "latents,\nparam.", "NLL", "row\nout", "stretch\nout", "below\nthe best"]

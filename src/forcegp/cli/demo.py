@@ -71,14 +71,31 @@ class Demo(Command):
         start = time.monotonic()
         with self.folder(self.out, {"options": options, "machine": machine}) as folder:
             train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
-            models, evaluations, fit_seconds = {}, {}, {}
+            models, evaluations, fits = {}, {}, {}
             for name, (place, mean) in MODELS.items():
-                models[name], fit_seconds[name] = self._fitted(terminal, folder / place, train, name, mean)
+                models[name], fits[name] = self._fitted(terminal, folder / place, train, name, mean)
                 evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
-            pictures = _draw_all(terminal, folder, models, test)
+            pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
+            histories = {name: posterior.result.history for name, posterior in models.items()}
+            forcegp.evaluation.save_figure(forcegp.evaluation.likelihood_figure(histories), folder / "likelihood.png")
             terminal.note(f"drew {', '.join(pictures)}")
             wall_seconds = time.monotonic() - start
-            results = self._results(models, evaluations, fit_seconds, wall_seconds) | {"machine": machine}
+            results = {
+                "out": str(self.out),
+                "seeds": self._seeds(),
+                **{name: options[name] for name in ("seconds", "points")},
+                "models": {
+                    name: {
+                        "run": str(self.out / place),
+                        "fit": fits[name],
+                        "evaluation": evaluations[name].to_dict(),
+                        "published_mae": PUBLISHED_MAE[name].get(self.points),
+                    }
+                    for name, (place, _) in MODELS.items()
+                },
+                "wall_seconds": wall_seconds,
+                "machine": machine,
+            }
             write_json(folder / "results.json", results)
         self._show(terminal, evaluations, wall_seconds)
         return results
@@ -95,8 +112,8 @@ class Demo(Command):
 
     def _fitted(
         self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: Any
-    ) -> tuple[forcegp.models.StructuredPosterior, float]:
-        """The fitted model, and the seconds that the fit alone took."""
+    ) -> tuple[forcegp.models.StructuredPosterior, dict[str, Any]]:
+        """The fitted model, and what the fit came to."""
         assert train.system is not None
         start = time.monotonic()
         posterior = fit_with_progress(
@@ -114,31 +131,7 @@ class Demo(Command):
         forcegp.save_posterior(posterior, run)
         iterations = len(posterior.result.history) - 1
         terminal.note(f"fitted {name}: {iterations} iterations ({seconds:.1f} s)")
-        return posterior, seconds
-
-    def _results(
-        self,
-        models: Mapping[str, forcegp.models.StructuredPosterior],
-        evaluations: Mapping[str, forcegp.Evaluation],
-        fit_seconds: Mapping[str, float],
-        wall_seconds: float,
-    ) -> dict[str, Any]:
-        return {
-            "out": str(self.out),
-            "seeds": self._seeds(),
-            "seconds": self.seconds,
-            "points": self.points,
-            "models": {
-                name: {
-                    "run": str(self.out / MODELS[name][0]),
-                    "fit": fit_summary(models[name], fit_seconds[name]),
-                    "evaluation": evaluations[name].to_dict(),
-                    "published_mae": PUBLISHED_MAE[name].get(self.points),
-                }
-                for name in models
-            },
-            "wall_seconds": wall_seconds,
-        }
+        return posterior, fit_summary(posterior, seconds)
 
     def _show(self, terminal: Terminal, evaluations: Mapping[str, forcegp.Evaluation], wall_seconds: float) -> None:
         header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
@@ -153,24 +146,10 @@ class Demo(Command):
         rows.insert(0, ["known physics alone", *known, *[NONE] * 4])
         rows.append(["noise floor", number(first.noise_floor), NONE, number(0.0), *[NONE] * 4])
         title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
+        scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
+        multipliers = f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
         terminal.show(
             columns(title, header, rows),
-            *([_multiplier_line(evaluations)] if first.multiplier_mae is not None else []),
+            *([multipliers] if first.multiplier_mae is not None else []),
             f"{self.out}/summary.png shows it; results.json, models and data lie beside it ({wall_seconds:.0f} s).",
         )
-
-
-def _multiplier_line(evaluations: Mapping[str, forcegp.Evaluation]) -> str:
-    scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
-    return f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
-
-
-def _draw_all(
-    terminal: Terminal, folder: Path, models: Mapping[str, forcegp.models.StructuredPosterior], test: forcegp.Dataset
-) -> list[str]:
-    pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-    forcegp.evaluation.save_figure(
-        forcegp.evaluation.likelihood_figure({name: posterior.result.history for name, posterior in models.items()}),
-        folder / "likelihood.png",
-    )
-    return pictures

@@ -92,8 +92,9 @@ class Evaluate(Command):
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
             terminal.note(f"plots: {self.plots}")
-        learned = NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
-        forces_table = force_facts(forces, learned if _learns_forces(posterior) else NORMAL_FORCES_KNOWN)
+        known = isinstance(posterior, forcegp.models.StructuredPosterior) and not posterior.latent_names
+        why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
+        forces_table = force_facts(forces, why)
         terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
         return scores
 
@@ -129,11 +130,6 @@ def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, 
             report(done, len(figures), name)
             forcegp.evaluation.save_figure(figure(), folder / name)
     return list(figures)
-
-
-def _learns_forces(posterior: forcegp.models.Posterior) -> bool:
-    """False for known forces alone."""
-    return not isinstance(posterior, forcegp.models.StructuredPosterior) or bool(posterior.latent_names)
 
 
 def _report(

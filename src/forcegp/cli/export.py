@@ -62,16 +62,9 @@ class Export(Command):
 
 
 def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
-    made = forcegp.export_c(
-        posterior,
-        folder,
-        covariance=options.covariance,
-        jacobian=options.jacobian,
-        steps=options.steps,
-        integrator=options.integrator or "symplectic-euler",
-        source=str(options.run_folder),
-        unchecked=options.unchecked,
-    )
+    same = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
+    integrator = options.integrator or "symplectic-euler"
+    made = forcegp.export_c(posterior, folder, **same, integrator=integrator, source=str(options.run_folder))
     terminal.show(
         columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
     )

@@ -172,10 +172,7 @@ class Import(PreparationOptions, RobotOptions):
 
 
 def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[str, Any]:
-    """Prepare the dataset in a file, in its place, and return what was done.
-
-    Raises NotEnoughMemory where the whole of it does not fit into memory, which filters need.
-    """
+    """Prepare the dataset in a file, in its place. Raises NotEnoughMemory where it does not fit into memory whole."""
     import torch  # 2 s that only a preparation costs
 
     required = COPIES * path.stat().st_size

@@ -15,7 +15,7 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import require_unchanged
-from forcegp.cli.command import IDENTIFIED, URDF, Command, unless_given
+from forcegp.cli.command import IDENTIFIED, URDF, Command, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -67,10 +67,7 @@ class RobotOptions(Command):
         return self._made(recorded, changes)
 
     def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
-        """What is known about the robot of `dataset`, which came from `path`: its own system, with what is replaced.
-
-        Raises InvalidInput where it carries none and none is given, or where joints differ.
-        """
+        """The dataset's own system, with what is replaced. Raises InvalidInput for none, and where joints differ."""
         system = dataset.system
         found = self._identified_system()
         if found is not None and system is not None:
@@ -156,12 +153,10 @@ def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
 
 
 def _finite(text: str, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    complaint = f"{what}: {text!r} is not a finite number."
+    [value] = numbers_of(text, complaint, one=True)
     if not math.isfinite(value):
-        raise InvalidInput(f"{what}: {text!r} is not a finite number.")
+        raise InvalidInput(complaint)
     return value
 
 
@@ -201,7 +196,8 @@ class CutoffOptions(Command):
         if self.cutoff in ("none", "auto"):
             cutoff = None if self.cutoff == "none" else "auto"
         else:
-            cutoff = _number("--cutoff", self.cutoff, "a frequency in Hz, auto or none")
+            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
+            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
         return forcegp.Preparation(cutoff=cutoff, differentiate=self.differentiate)
 
 
@@ -219,18 +215,9 @@ class PreparationOptions(CutoffOptions):
 
     @override
     def _preparation(self) -> forcegp.Preparation:
-        delay: float | tuple[float, ...] | Literal["auto"]
-        if self.delay == "auto":
-            delay = "auto"
-        else:
-            allowed = "seconds, one per joint with commas, or auto"
-            each = tuple(_number("--delay", word, allowed) for word in self.delay.split(","))
+        delay: float | tuple[float, ...] | Literal["auto"] = "auto"
+        if self.delay != "auto":
+            wrong = "--delay is {!r}; give seconds, one per joint with commas, or auto.".format
+            each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in self.delay.split(","))
             delay = each[0] if len(each) == 1 else each
         return replace(super()._preparation(), delay=delay, every=self.every, trim=self.trim)
-
-
-def _number(option: str, word: str, allowed: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise InvalidInput(f"{option} is {word!r}; give {allowed}.") from None

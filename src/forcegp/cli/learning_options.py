@@ -18,16 +18,12 @@ import forcegp.data
 import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
-from forcegp.cli.command import DATASET, BackendOptions, unless_given
+from forcegp.cli.command import DATASET, BackendOptions, numbers_of, unless_given
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
-SYNTAX = {
-    "plane": ("nx,ny,nz,offset", 4),
-    "sphere": ("cx,cy,cz,radius", 4),
-    "cylinder": ("px,py,pz,ax,ay,az,radius", 7),
-}
+SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
 """Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
 
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
@@ -43,38 +39,27 @@ def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
 
 
 def parse_contact(text: str) -> forcegp.Contact:
-    """`FRAME@x,y,z:SURFACE:numbers` as a contact; without `@x,y,z` the point is the origin of the frame.
-
-    Raises InvalidInput saying what is wrong with the text, and what is right.
-    """
+    """`FRAME@x,y,z:SURFACE:numbers`, without `@x,y,z` at the frame's origin. Raises InvalidInput with an example."""
     place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
     if kind not in SYNTAX or not place:
-        forms = ", ".join(f"{name}:{form}" for name, (form, _) in SYNTAX.items())
+        forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
         raise InvalidInput(
             f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
         )
-    form, count = SYNTAX[kind]
-    values = _numbers(text, kind, numbers, form, count)
+    *given, size = _numbers(text, kind, numbers, SYNTAX[kind])
+    vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
     frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
-    x, y, z = _numbers(text, "the point", point, "x,y,z", 3)
-    if kind == "plane":
-        surface = forcegp.Plane((values[0], values[1], values[2]), values[3])
-    elif kind == "sphere":
-        surface = forcegp.Sphere((values[0], values[1], values[2]), values[3])
-    else:
-        surface = forcegp.Cylinder((values[0], values[1], values[2]), (values[3], values[4], values[5]), values[6])
-    return forcegp.Contact(frame, (x, y, z), surface)
+    x, y, z = _numbers(text, "the point", point, "x,y,z")
+    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere, "cylinder": forcegp.Cylinder}[kind]
+    return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
 
 
-def _numbers(text: str, what: str, given: str, form: str, count: int) -> list[float]:
-    try:
-        values = [float(entry) for entry in given.split(",")]
-    except ValueError:
-        values = []
+def _numbers(text: str, what: str, given: str, form: str) -> list[float]:
+    count = form.count(",") + 1
+    complaint = f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
+    values = numbers_of(given, complaint)
     if len(values) != count:
-        raise InvalidInput(
-            f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
-        )
+        raise InvalidInput(complaint)
     return values
 
 
@@ -89,7 +74,9 @@ def parse_learn(words: Sequence[str]) -> tuple[forcegp.models.Learned, ...]:
         name, _, listed = what.rpartition(":") if ":" in what else (what, "", "")
         entries = tuple(entry for entry in listed.split(",") if entry)
         if name in forces:
-            learned.append(forcegp.Coefficients(name, entries or None, _number(word, start) if start else None))
+            complaint = f"--learn {word}: {start!r} is not a number; give a start value such as =0.1."
+            value = numbers_of(start, complaint, one=True)[0] if start else None
+            learned.append(forcegp.Coefficients(name, entries or None, value))
         elif entries and not start:
             learned.append(forcegp.robots.LinkInertia(name, entries))
         else:
@@ -104,34 +91,19 @@ def with_learned_forces(
     system: forcegp.MechanicalSystem, learn: Sequence[forcegp.models.Learned]
 ) -> tuple[forcegp.MechanicalSystem, list[str]]:
     """The system with every learned force in its list, from the URDF's coefficients, and the names that were added."""
-    make = {
-        "viscous-joint-friction": (
-            forcegp.ViscousJointFriction,
-            lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
-        ),
-        "coulomb-joint-friction": (
-            forcegp.CoulombJointFriction,
-            lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
-        ),
-        "load-joint-friction": (forcegp.LoadJointFriction, lambda: forcegp.LoadJointFriction(0.0, 0.0, 0.1)),
-        "armature": (forcegp.Armature, lambda: forcegp.Armature(0.0)),
-        "rotor-inertia": (forcegp.RotorInertia, lambda: forcegp.RotorInertia(0.0)),
-    }
     added: dict[str, None] = {}
-    for entry in learn:
-        if isinstance(entry, forcegp.Coefficients) and not any(
-            type(f) is make[entry.force][0] for f in system.known_forces
-        ):
-            system = replace(system, known_forces=(*system.known_forces, make[entry.force][1]()))
-            added[entry.force] = None
+    for name in (entry.force for entry in learn if isinstance(entry, forcegp.Coefficients)):
+        if not any(type(force) is forcegp.mechanics.KNOWN_FORCES[name] for force in system.known_forces):
+            system = replace(system, known_forces=(*system.known_forces, _known_force(name, system)))
+            added[name] = None
     return system, list(added)
 
 
-def _number(word: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InvalidInput(f"--learn {word}: {text!r} is not a number; give a start value such as =0.1.") from None
+def _known_force(name: str, system: forcegp.MechanicalSystem) -> forcegp.mechanics.KnownForce:
+    """The force of that name, with the coefficients of the URDF, or else values from which an estimate begins."""
+    kind: Any = forcegp.mechanics.KNOWN_FORCES[name]
+    begin = {"load-joint-friction": (0.0, 0.0, 0.1), "armature": (0.0,), "rotor-inertia": (0.0,)}
+    return kind.from_robot(system.robot) if hasattr(kind, "from_robot") else kind(*begin.get(name, ()))
 
 
 def friction_laws(words: str) -> tuple[str, ...]:
@@ -145,34 +117,6 @@ NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
 HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
-
-
-def rows_to_learn(
-    dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, choice: RowsChoice
-) -> tuple[forcegp.Dataset, str | None]:
-    """The rows in which all contacts of `system` act (`forcegp.data.rows_in_contact`), or all; and a note on it.
-
-    "auto" leaves rows out where a plausible share of them is not in contact, and else takes all, with a note.
-    The note is printed after the fit, so that an error before it stands alone. Raises ContactError with "in-contact" if
-    there are none.
-    """
-    if choice == "all" or not system.contacts:
-        return dataset, None
-    try:
-        touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
-    except ContactError:
-        if choice == "in-contact":
-            raise
-        return dataset, None  # the fit raises a clearer error
-    share = len(touching) / len(dataset)
-    if choice == "auto" and share >= NEARLY_ALL:
-        return dataset, None
-    text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
-    if choice == "auto" and share < HARDLY_ANY:
-        return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
-    return replace(
-        touching, system=dataset.system
-    ), f"{text}; these alone were learned from (--rows all takes every row)"
 
 
 MOST = 3
@@ -269,12 +213,32 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.contact:
             system = system.with_contacts(contacts)
         if self.known_force:
-            system = _with_known_forces(system, self.known_force)
+            names = dict.fromkeys(self.known_force)
+            system = replace(system, known_forces=tuple(_known_force(name, system) for name in names))
         return system
 
     def _rows(self, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[forcegp.Dataset, str | None]:
-        """The rows to learn from, and a note to print after the fit."""
-        return rows_to_learn(dataset, system, self.rows)
+        """The rows in which all contacts act (`forcegp.data.rows_in_contact`), or all, as --rows asks.
+
+        And a note to print after the fit, so that an error before it stands alone. Raises ContactError with in-contact
+        if there are none.
+        """
+        if self.rows == "all" or not system.contacts:
+            return dataset, None
+        try:
+            touching = forcegp.data.rows_in_contact(replace(dataset, system=system))
+        except ContactError:
+            if self.rows == "in-contact":
+                raise
+            return dataset, None  # the fit raises a clearer error
+        share = len(touching) / len(dataset)
+        if self.rows == "auto" and share >= NEARLY_ALL:
+            return dataset, None
+        text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+        if self.rows == "auto" and share < HARDLY_ANY:
+            return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
+        note = f"{text}; these alone were learned from (--rows all takes every row)"
+        return replace(touching, system=dataset.system), note
 
     def _given(self) -> dict[str, Any]:
         """Options and data, as a folder remembers them."""
@@ -285,13 +249,3 @@ class LearningOptions(BackendOptions, RobotOptions):
         }
         data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
         return {"options": options, "data": data}
-
-
-def _with_known_forces(system: forcegp.MechanicalSystem, names: tuple[str, ...]) -> forcegp.MechanicalSystem:
-    made = {
-        "actuation": lambda: forcegp.Actuation(),
-        "rigid-body-bias": lambda: forcegp.RigidBodyBias(),
-        "viscous-joint-friction": lambda: forcegp.ViscousJointFriction.from_robot(system.robot),
-        "coulomb-joint-friction": lambda: forcegp.CoulombJointFriction.from_robot(system.robot),
-    }
-    return replace(system, known_forces=tuple(made[name]() for name in dict.fromkeys(names)))

@@ -9,8 +9,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
-from types import FrameType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
@@ -136,7 +135,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug, command = "--debug" in given, None
     showwarning, terminate = warnings.showwarning, None
     with contextlib.suppress(ValueError):  # not in the main thread
-        terminate = signal.signal(signal.SIGTERM, _terminate)  # so that temporary files are removed then, too
+        # so that temporary files are removed then, too
+        terminate = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
@@ -196,7 +196,3 @@ def _fail(message: str, code: int, debug: bool) -> int:
         traceback.print_exc()
     print(f"forcegp: {' '.join(message.split())}", file=sys.stderr)
     return code
-
-
-def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise SystemExit(128 + number)

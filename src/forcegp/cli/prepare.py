@@ -16,7 +16,7 @@ import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import DATASET, Debug, Json, require_free_file, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
-from forcegp.cli.terminal import NONE, Terminal, columns, facts
+from forcegp.cli.terminal import Terminal, columns, facts, shown
 from forcegp.errors import InvalidInput
 
 
@@ -87,17 +87,11 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
     if cutoff is None:
         return tables
 
-    def shown(value: float | None) -> str:
-        return NONE if value is None else f"{value:.3g}"
-
-    def share(value: float | None) -> str:
-        return NONE if value is None else f"{100.0 * value:.2g} %"
-
     noise, removed = report["acceleration_noise"], report["power_removed"]
     header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
     rows = [
         [name, shown(noise["before"][joint]), shown(noise["after"][joint])]
-        + [share(removed[signal][joint]) for signal in ("q", "v", "a", "u")]
+        + [shown(removed[signal][joint], "{:.2g} %", 100.0) for signal in ("q", "v", "a", "u")]
         for joint, name in enumerate(dataset.joint_names)
     ]
     unit = dataset.units["a"]

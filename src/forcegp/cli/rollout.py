@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,9 +14,9 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, numbers_of, unless_given
 from forcegp.cli.input_options import SystemChoice, carried_over
-from forcegp.cli.terminal import NONE, Terminal, columns, facts, number, percent
+from forcegp.cli.terminal import Terminal, columns, facts, number, percent, shown
 from forcegp.errors import InvalidInput
 
 DEFAULT_STARTS = 10
@@ -79,24 +79,21 @@ class Rollout(Command):
         recorded = forcegp.data.recorded_motions(dataset, rows, self.seconds)
         begun = time.process_time()
         with terminal.progress(f"rolling out: {len(recorded.rows)} motions of {recorded.time[-1]:.3g} s") as report:
-            rollout = posterior.rollout(
-                recorded.q[:, 0],
-                recorded.v[:, 0],
-                recorded.u,
-                recorded.dt,
-                integrator=self.integrator,
-                baumgarte=baumgarte,
-                samples=self.samples,
-                seed=self.seed,
-                progress=report,
-            )
+            how = {name: getattr(self, name) for name in ("integrator", "samples", "seed")}
+            begin = recorded.q[:, 0], recorded.v[:, 0]
+            rollout = posterior.rollout(*begin, recorded.u, recorded.dt, **how, baumgarte=baumgarte, progress=report)
         cpu_seconds = time.process_time() - begun
         errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.system)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
         options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
         content = {"options": {name: summary[name] for name in options}}
         with self.folder(self.out, content) as folder:
-            self._write(folder, rollout, recorded, errors, dataset, summary)
+            write_json(folder / "rollout.json", summary)
+            _write_arrays(folder / "rollout.h5", rollout, recorded, dataset.joint_names)
+            stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
+            title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
+            figure = forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title)
+            forcegp.evaluation.save_figure(figure, folder / "rollout.png")
         terminal.note(f"figure: {self.out / 'rollout.png'}")
         terminal.show(*_report(summary))
         return summary
@@ -129,11 +126,8 @@ class Rollout(Command):
             "seconds": float(errors.time[-1]),
             "steps": steps,
             "unit": dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m",
-            "system": self.system,
-            "integrator": self.integrator,
+            **{name: getattr(self, name) for name in ("system", "integrator", "samples", "seed")},
             "baumgarte": None if baumgarte is None else {"omega": baumgarte.omega, "zeta": baumgarte.zeta},
-            "samples": self.samples,
-            "seed": self.seed,
             "diverged_at": errors.diverged_at.tolist(),
             "initial_correction": rollout.initial_correction.amax(0).tolist(),
             "cpu_seconds": cpu_seconds,
@@ -142,47 +136,30 @@ class Rollout(Command):
             "moments": [_moment(errors, row) for row in at],
         }
 
-    def _write(
-        self,
-        folder: Path,
-        rollout: forcegp.models.Rollout,
-        recorded: forcegp.data.RecordedMotions,
-        errors: forcegp.evaluation.RolloutErrors,
-        dataset: forcegp.Dataset,
-        summary: Mapping[str, Any],
-    ) -> None:
-        from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
 
-        write_json(folder / "rollout.json", summary)
-        arrays = {"time": rollout.time, "q": rollout.q, "v": rollout.v, "a": rollout.a}
-        arrays |= {"constraint": rollout.constraint, "diverged_at": rollout.diverged_at}
-        if rollout.samples is not None:
-            arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
-        with NewFile(folder / "rollout.h5") as file:
-            for name, values in arrays.items():
-                file[name] = values.cpu().numpy()
-            for name in ("q", "v", "u"):
-                file[f"recorded/{name}"] = getattr(recorded, name)
-            file["recorded/row"] = list(recorded.rows)
-            file.attrs["joint_names"] = list(dataset.joint_names)
-        stabilised = "" if self.baumgarte == "none" else f", Baumgarte {self.baumgarte}"
-        title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
-        forcegp.evaluation.save_figure(
-            forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title), folder / "rollout.png"
-        )
+def _write_arrays(path: Path, rollout: Any, recorded: forcegp.data.RecordedMotions, joint_names: Sequence[str]) -> None:
+    from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
+
+    arrays = {name: getattr(rollout, name) for name in ("time", "q", "v", "a", "constraint", "diverged_at")}
+    if rollout.samples is not None:
+        arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
+    with NewFile(path) as file:
+        for name, values in arrays.items():
+            file[name] = values.cpu().numpy()
+        for name in ("q", "v", "u"):
+            file[f"recorded/{name}"] = getattr(recorded, name)
+        file["recorded/row"] = list(recorded.rows)
+        file.attrs["joint_names"] = list(joint_names)
 
 
 def parse_baumgarte(given: str) -> forcegp.Baumgarte | None:
     """`none`, `OMEGA` or `OMEGA,ZETA`. Raises InvalidInput for anything else."""
     if given == "none":
         return None
-    try:
-        numbers = [float(part) for part in given.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 2):
-        raise InvalidInput(f"--baumgarte is {given!r}; give none, OMEGA or OMEGA,ZETA, for example 10,1.")
-
+    complaint = f"--baumgarte is {given!r}; give none, OMEGA or OMEGA,ZETA, for example 10,1."
+    numbers = numbers_of(given, complaint)
+    if len(numbers) > 2:
+        raise InvalidInput(complaint)
     return forcegp.Baumgarte(*numbers)
 
 
@@ -221,7 +198,7 @@ def _report(summary: Mapping[str, Any]) -> list[Any]:
         cells = [f"{moment['time']:.3g} s", str(moment["lasting"])]
         cells += [number(moment["joint_error_median"]), number(moment["joint_error_max"])]
         if contacts:
-            cells += [_millimetres(moment["tool_error_median"]), _millimetres(moment["constraint_max"])]
+            cells += [shown(moment[name], "{:.3g} mm", 1e3) for name in ("tool_error_median", "constraint_max")]
         rows.append([*cells, percent(moment["inside_95"])] if intervals else cells)
     count = len(summary["rows"])
     title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
@@ -232,7 +209,3 @@ def _report(summary: Mapping[str, Any]) -> list[Any]:
         values["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
     values["time"] = f"{summary['cpu_seconds']:.1f} s CPU"
     return [columns(title, header, rows), facts("", values)]
-
-
-def _millimetres(metres: float | None) -> str:
-    return NONE if metres is None else f"{1e3 * metres:.3g} mm"

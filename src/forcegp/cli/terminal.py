@@ -11,7 +11,6 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from types import TracebackType
 from typing import Any, Protocol
 
 from rich import box
@@ -46,9 +45,7 @@ ELSEWHERE = {
 def with_option_names(message: str, options: Collection[str]) -> str:
     """The message with --points for `points` and --points 5 for `points=5`, where the command has such an option.
 
-    The library marks arguments in its messages by backquotes, and options have the same names.
-
-    Arguments that the command does not have stay as they are.
+    The library marks arguments by backquotes, and options have the same names; those of other commands stay.
     """
 
     def option(found: re.Match[str]) -> str:
@@ -115,9 +112,7 @@ class Terminal:
             os.dup2(2, 1)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._stdout is not None:
             try:
                 sys.stdout.flush()
@@ -221,9 +216,12 @@ NORMAL_FORCES_KNOWN = "it follows from the known forces alone"
 NORMAL_FORCES_SEEN = "this prior leaves no force along the contact normal free, so accelerations decide it"
 
 
+PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
+
+
 def facts(title: str, values: Mapping[str, str]) -> Table:
     """Names and values, one per line."""
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, show_header=False, pad_edge=False)
+    table = Table(title=title, box=None, show_header=False, **PLAIN)
     table.add_column(style="dim")
     table.add_column()
     for name, value in values.items():
@@ -243,14 +241,7 @@ def columns(
 
     Texts of the first column are folded where they are `long_names`, all other cells never.
     """
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-    )
+    table = Table(title=title, box=box.SIMPLE_HEAD, collapse_padding=True, **PLAIN)
     for place, name in enumerate(header):
         folded = long_names and not place
         table.add_column(name, justify="right" if place else "left", no_wrap=not folded, overflow="fold")
@@ -318,11 +309,16 @@ def number(value: float | None) -> str:
     return f"{value:.4f}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.0e}"
 
 
+def shown(value: float | None, pattern: str = "{:.3g}", factor: float = 1.0) -> str:
+    """The number times a factor in this pattern, a dash for none."""
+    return NONE if value is None else pattern.format(factor * value)
+
+
 def nats(value: float | None) -> str:
     """Two decimals: differences below a hundredth of a nat are not significant."""
-    return NONE if value is None else f"{value:.2f}"
+    return shown(value, "{:.2f}")
 
 
 def percent(value: float | None) -> str:
     """`94.6 %`."""
-    return NONE if value is None else f"{100.0 * value:.1f} %"
+    return shown(value, "{:.1f} %", 100.0)

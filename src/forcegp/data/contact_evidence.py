@@ -8,7 +8,7 @@ same under other contacts: with the point moved, without any, or with one that t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,8 +21,9 @@ from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
 LEAST_DISTANCE = 1e-3  # m
-ALONG_NORMAL = 0.02
-CREEP = 2e-3  # m/s
+ALONG_NORMAL, CREEP = 0.02, 2e-3
+"""Velocity along the normal relative to that along the surface, and in m/s, that is none."""
+
 LEAST_ACCELERATION = 0.05  # m/s^2
 DEVIATIONS = 4.5
 DISTANCE_DEVIATIONS = 20.0
@@ -51,26 +52,18 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
             f"the dataset has {'no system' if system is None else 'a system without contacts'}; rows in contact can "
             "only be found for a system that lists its contacts: dataclasses.replace(dataset, system=...)."
         )
-    q, v, u, a = (torch.tensor(getattr(dataset, name)) for name in ("q", "v", "u", "a"))
+    recovery = _recovery(system)
     with torch.no_grad():
-        state = forcegp.mechanics.State.of(system.robot, q, v, u)
-        columns = []
-        for index, contact in enumerate(system.contacts):
-            A, b, gradient = contact.constraint(state, system.baumgarte)
-            jacobian = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3, :]
-            scale = torch.linalg.vector_norm(gradient, dim=-1)
-            velocity = torch.linalg.vector_norm((jacobian @ v[..., None])[..., 0], dim=-1)
-            acts = _acting(
-                distance=(contact.distance(state.kinematics) / scale).numpy(),
-                rate=((A * v).sum(-1) / scale).numpy(),
-                speed=velocity.numpy(),
-                residual=(((A * a).sum(-1) - b) / scale).numpy(),
-                recovery=0.0 if system.baumgarte is None else system.baumgarte.omega,
-                noise=_noise_along(dataset, (A / scale[:, None]).numpy()),
+        motions = _point_motions(dataset, system)
+    columns = []
+    for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
+        columns.append(_acting(motion, recovery))
+        if not columns[-1].any():
+            raise ContactError(
+                f"contact {index} (frame {contact.frame!r}) acts in none of the {len(dataset)} rows: the median "
+                f"distance of its point from the surface is {np.median(np.abs(motion.distance)):.3g} m. Check the "
+                "surface, the contact's point and the units (m, rad), or leave this contact out."
             )
-            if not acts.any():
-                raise _never_in_contact(index, contact, contact.distance(state.kinematics).numpy())
-            columns.append(acts)
     return np.stack(columns, axis=1)
 
 
@@ -90,21 +83,50 @@ def rows_in_contact(dataset: Dataset) -> Dataset:
     return dataset.rows(together)
 
 
-def _acting(
-    distance: Float[np.ndarray, " rows"],
-    rate: Float[np.ndarray, " rows"],
-    speed: Float[np.ndarray, " rows"],
-    residual: Float[np.ndarray, " rows"],
-    recovery: float,
-    noise: Float[np.ndarray, " rows"],
-) -> Bool[np.ndarray, " rows"]:
-    """The three conditions of `contact_rows`, in m, m/s and m/s^2; `recovery` is Baumgarte's omega [1/s]."""
-    along = np.sqrt(np.maximum(speed**2 - rate**2, 0.0))
-    slow = np.abs(rate) <= CREEP + ALONG_NORMAL * along + recovery * np.abs(distance)
+class _PointMotion(NamedTuple):
+    """The point of a contact in every row, in m, m/s and m/s^2; `rate` and `residual` A a - b are along the normal.
+
+    `noise` is the standard deviation of A a that the noise on the acceleration makes; 0 where it is not known.
+    """
+
+    distance: Float[np.ndarray, " rows"]
+    rate: Float[np.ndarray, " rows"]
+    speed: Float[np.ndarray, " rows"]
+    acceleration: Float[np.ndarray, " rows"]
+    residual: Float[np.ndarray, " rows"]
+    noise: Float[np.ndarray, " rows"]
+
+
+def _point_motions(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[_PointMotion]:
+    q, v, u, a = tensors(dataset)
+    state = forcegp.mechanics.State.of(system.robot, q, v, u)
+    sigma = torch.zeros(dataset.nv) if dataset.noise_std is None else torch.tensor(dataset.noise_std)
+    motions = []
+    for contact in system.contacts:
+        A, b, gradient = contact.constraint(state, system.baumgarte)
+        size = torch.linalg.vector_norm(gradient, dim=-1)
+        J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
+        speed, acceleration = (torch.linalg.vector_norm((J @ x[..., None])[..., 0], dim=-1) for x in (v, a))
+        distance, rate = contact.distance(state.kinematics) / size, (A * v).sum(-1) / size
+        residual, noise = ((A * a).sum(-1) - b) / size, (A * sigma).norm(dim=-1) / size
+        motions.append(_PointMotion(*(x.numpy() for x in (distance, rate, speed, acceleration, residual, noise))))
+    return motions
+
+
+def _recovery(system: forcegp.mechanics.MechanicalSystem) -> float:
+    """Baumgarte's omega [1/s]."""
+    return 0.0 if system.baumgarte is None else system.baumgarte.omega
+
+
+def _acting(motion: _PointMotion, recovery: float) -> Bool[np.ndarray, " rows"]:
+    """The three conditions of `contact_rows`."""
+    distance, residual = motion.distance, motion.residual
+    along = np.sqrt(np.maximum(motion.speed**2 - motion.rate**2, 0.0))
+    slow = np.abs(motion.rate) <= CREEP + ALONG_NORMAL * along + recovery * np.abs(distance)
     sliding = (np.abs(distance) <= FARTHEST) & slow
     if not sliding.any():
         return sliding
-    spread = np.maximum(noise, 1.4826 * np.median(np.abs(residual[sliding])))
+    spread = np.maximum(motion.noise, 1.4826 * np.median(np.abs(residual[sliding])))
     constrained = sliding & (np.abs(residual) <= np.maximum(DEVIATIONS * spread, LEAST_ACCELERATION))
     if not constrained.any():
         return constrained
@@ -113,31 +135,10 @@ def _acting(
     return constrained & (np.abs(distance - middle) <= max(LEAST_DISTANCE, DISTANCE_DEVIATIONS * width))
 
 
-def _noise_along(dataset: Dataset, rows: Float[np.ndarray, "rows nv"]) -> Float[np.ndarray, " rows"]:
-    """Standard deviation of `A a` that the noise on the acceleration makes; 0 where it is not known."""
-    if dataset.noise_std is None:
-        return np.zeros(len(rows))
-    return np.sqrt(((rows * dataset.noise_std) ** 2).sum(axis=1))
-
-
-def _never_in_contact(
-    index: int, contact: forcegp.mechanics.Contact, distance: Float[np.ndarray, " rows"]
-) -> ContactError:
-    return ContactError(
-        f"contact {index} (frame {contact.frame!r}) acts in none of the {len(distance)} rows: the median distance of "
-        f"its point from the surface is {np.median(np.abs(distance)):.3g} m. Check the surface, the contact's point "
-        "and the units (m, rad), or leave this contact out."
-    )
-
-
 MOST_ROWS = 240
 FEWEST_ROWS = 10
 
 FAR = 0.01  # m
-NEAR = 5e-3  # m
-SLOPE, LEAST_SPEED = 0.02, 2e-3
-"""Velocity along the normal relative to that along the surface, and in m/s, that is none (as for `contact_rows`)."""
-
 HARDLY_ANY = 0.2
 """Share of rows that move along a surface, below which it is another one."""
 
@@ -185,54 +186,36 @@ def contact_doubts(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem 
 
 
 def _stated(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[ContactDoubt]:
-    q, v, u, a = tensors(rows)
-    state = forcegp.mechanics.State.of(system.robot, q, v, u)
     touching = np.ones(len(rows), dtype=bool)
-    for index, contact in enumerate(system.contacts):
-        A, b, gradient = contact.constraint(state, system.baumgarte)
-        size = torch.linalg.vector_norm(gradient, dim=-1)
-        J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
-        speed = torch.linalg.vector_norm((J @ v[..., None])[..., 0], dim=-1).numpy()
-        rate = ((A * v).sum(-1) / size).abs().numpy()
-        residual = float((((A * a).sum(-1) - b) / size).abs().median())  # |A a - b| in m/s^2
-        acceleration = float(torch.linalg.vector_norm((J @ a[..., None])[..., 0], dim=-1).median())
-        noise = (
-            0.0
-            if rows.noise_std is None
-            else float((A / size[:, None] * torch.tensor(rows.noise_std)).norm(dim=-1).median())
+    for index, (contact, motion) in enumerate(zip(system.contacts, _point_motions(rows, system), strict=True)):
+        distance, rate = motion.distance, np.abs(motion.rate)
+        residual, acceleration, noise = (
+            float(np.median(np.abs(values))) for values in (motion.residual, motion.acceleration, motion.noise)
         )
         broken = residual > max(BROKEN * acceleration, NOISE * noise)
-        distance = (contact.distance(state.kinematics) / size).numpy()
-        recovery = 0.0 if system.baumgarte is None else system.baumgarte.omega
-        slow = rate <= SLOPE * speed + LEAST_SPEED + recovery * np.minimum(np.abs(distance), NEAR)
-        moves = speed > 2.0 * LEAST_SPEED
-        along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= NEAR)
+        recovered = _recovery(system) * np.minimum(np.abs(distance), FARTHEST)
+        slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered
+        moves = motion.speed > 2.0 * CREEP
+        along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= FARTHEST)
         what = f"contact {index} (frame {contact.frame!r}): "
         remedy = "Check its point, its surface and their units (m), or leave the contact out (`contacts=none`)."
         share = float(along[moves].mean()) if moves.any() else 1.0
         far = float(np.median(np.abs(distance[along]))) if along.any() else float(np.median(np.abs(distance)))
+        if share < HARDLY_ANY and not broken:
+            return []  # states that no contact holds, but accelerations that obey it: drawn, not recorded
         if share < HARDLY_ANY:
-            if not broken:
-                return []  # states that no contact holds, but accelerations that obey it: drawn, not recorded
-            return [
-                ContactDoubt(
-                    kind="off",
-                    seen=f"{what}only {100.0 * share:.0f} % of the rows move along its surface; the others move "
-                    f"through it with {np.median(rate):.2g} m/s, and |A a - b| is {residual:.2g} m/s² (medians).",
-                    remedy=remedy,
-                    numbers={"contact": index, "share": share, "distance": float(np.median(np.abs(distance)))},
-                )
-            ]
-        if far > FAR:
-            return [
-                ContactDoubt(
-                    kind="off",
-                    seen=f"{what}its point moves along the surface, but {far:.3g} m away from it.",
-                    remedy=remedy,
-                    numbers={"contact": index, "share": share, "distance": far},
-                )
-            ]
-        touching &= along
+            far = float(np.median(np.abs(distance)))
+            seen = (
+                f"only {100.0 * share:.0f} % of the rows move along its surface; the others move through it with "
+                f"{np.median(rate):.2g} m/s, and |A a - b| is {residual:.2g} m/s² (medians)."
+            )
+        elif far > FAR:
+            seen = f"its point moves along the surface, but {far:.3g} m away from it."
+        else:
+            touching &= along
+            continue
+        numbers = {"contact": index, "share": share, "distance": far}
+        return [ContactDoubt(kind="off", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]
     if touching.sum() < FEWEST_ROWS:
         return []
     return _forces(rows.rows(touching), system)

@@ -23,10 +23,8 @@ class FrozenDict(dict[str, Any]):
     __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
     clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]  # refuses whatever the arguments are
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[FrozenDict], tuple[dict[str, Any]]]:  # the default would fill through __setitem__
-        return FrozenDict, (dict(self),)
+    def __reduce__(self) -> tuple[type[FrozenDict], tuple[dict[str, Any]]]:
+        return FrozenDict, (dict(self),)  # the default would fill through __setitem__
 
     def copy(self) -> dict[str, Any]:
         """An ordinary dictionary with the same items."""
@@ -34,10 +32,7 @@ class FrozenDict(dict[str, Any]):
 
 
 def frozen_json(metadata: Mapping[str, Any]) -> FrozenDict:
-    """Copy of a JSON-able mapping, frozen at every level (lists become tuples).
-
-    Raises DatasetError where JSON has no such value: arrays, NaN, keys that are not text.
-    """
+    """A mapping frozen at every level (lists become tuples). Raises DatasetError for what JSON does not have."""
     try:
         _require_text_keys(metadata)
         plain = json.loads(json.dumps(metadata, allow_nan=False))

@@ -142,10 +142,7 @@ class DatasetWriter:
 
 
 def _compressed(chunk: np.ndarray) -> bytes:
-    """A chunk as HDF5's filters shuffle and deflate store it; one that is not full is filled with zeros.
-
-    HDF5 itself would compress one after the other, which takes longer than everything else.
-    """
+    """A chunk as HDF5's filters shuffle and deflate store it; one that is not full is filled with zeros."""
     full = np.zeros((ROWS_PER_CHUNK, *chunk.shape[1:]), chunk.dtype)
     full[: len(chunk)] = chunk
     shuffled = np.ascontiguousarray(full.reshape(-1, 1).view(np.uint8).T)

@@ -180,7 +180,8 @@ def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.
 
 def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
-    angular = [column for column, unit in enumerate(_position_units(rows)) if unit == "rad"]
+    units = rows.units["q"]
+    angular = [k for k in range(rows.nv) if (units if isinstance(units, str) else units[k]) == "rad"]
     jumps = np.abs(np.diff(rows.q[:, angular], axis=0)) > np.pi
     if jumps.any():
         row, column = np.argwhere(jumps)[0]
@@ -189,8 +190,3 @@ def require_no_turns(rows: Dataset, label: str) -> None:
             f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
             "Unwrap it first (np.unwrap(q, axis=0))."
         )
-
-
-def _position_units(rows: Dataset) -> Sequence[str]:
-    unit = rows.units["q"]
-    return (unit,) * rows.nv if isinstance(unit, str) else unit

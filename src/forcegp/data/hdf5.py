@@ -3,10 +3,9 @@
 Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
 """
 
-import contextlib
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from forcegp.errors import FileFormatError, ForceGPError
 
 FORMAT = "forcegp-dataset"
 VERSION = 1
+COLUMNS = ("q", "v", "u", "a", "time", "episode")
 
 COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _TEXT = h5py.string_dtype("utf-8")
@@ -27,12 +27,13 @@ _LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that cla
 
 
 def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
-    """Write the fields of a Dataset to a temporary file in the same folder and rename it.
-
-    Raises InvalidInput if the folder does not exist or `path` is a folder.
-    """
+    """Write the fields of a Dataset, as `atomic_file` writes and raises."""
+    arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
+    arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
     with atomic_file(path) as temporary, NewFile(temporary) as file:
-        _write(fields, file)
+        for name, values in arrays.items():
+            file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
+        describe(fields, file)
 
 
 def is_dataset(path: Path) -> bool:
@@ -123,30 +124,15 @@ def read_fields(path: Path) -> dict[str, Any]:
     """The fields of the Dataset in a file. Raises FileFormatError with the path and what is wrong."""
     if not path.is_file():
         raise FileFormatError(f"{path} is not a file; give the path of a dataset written by forcegp (.h5).")
-    with _reading(path), h5py.File(path, "r") as file:
-        _check_header(path, file)
-        return _read(path, file)
-
-
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
     try:
-        yield
+        with h5py.File(path, "r") as file:
+            _check_header(path, file)
+            return _read(path, file)
     except FileFormatError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
         kind = "is damaged" if h5py.is_hdf5(path) else "is not an HDF5 file"
         raise FileFormatError(f"{path} {kind}: {error}. Write it again, or convert the log to a Dataset.") from error
-
-
-def _write(fields: Mapping[str, Any], file: h5py.File) -> None:
-    for name in ("q", "v", "u", "a", "time", "episode"):
-        _put(file, name, fields[name])
-    if fields["noise_std"] is not None:
-        _put(file, "noise_std", fields["noise_std"])
-    for name, values in fields["truth"].items():
-        _put(file, f"truth/{name}", values)
-    describe(fields, file)
 
 
 def describe(fields: Mapping[str, Any], file: h5py.File) -> None:
@@ -161,10 +147,6 @@ def describe(fields: Mapping[str, Any], file: h5py.File) -> None:
     file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
     if fields["system"] is not None:
         file.create_dataset("system", data=fields["system"].to_json(), dtype=_TEXT)
-
-
-def _put(file: h5py.File, name: str, values: np.ndarray) -> None:
-    file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
 
 
 def _check_header(path: Path, file: h5py.File) -> None:
@@ -183,14 +165,17 @@ def _check_header(path: Path, file: h5py.File) -> None:
 
 
 def _read(path: Path, file: h5py.File) -> dict[str, Any]:
-    required = ("q", "v", "u", "a", "time", "episode", "joint_names", "metadata")
+    required = (*COLUMNS, "joint_names", "metadata")
     missing = [name for name in required if name not in file]
     if missing:
         raise FileFormatError(f"{path} has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
-    values: dict[str, Any] = {name: _array(path, file, name) for name in required[:6]}
+    values: dict[str, Any] = {name: _array(path, file, name) for name in COLUMNS}
     values["units"] = {name: _units(path, file, name) for name in ("q", "v", "u", "a", "time")}
     values["joint_names"] = tuple(_texts(path, file, "joint_names"))
-    values["metadata"] = _json(path, "metadata", _text(path, file, "metadata"))
+    metadata = json.loads(_text(path, file, "metadata"))
+    if not isinstance(metadata, dict):
+        raise FileFormatError(f"{path}: 'metadata' must be a JSON object; it is {type(metadata).__name__}.")
+    values["metadata"] = metadata
     values["noise_std"] = _array(path, file, "noise_std") if "noise_std" in file else None
     values["truth"] = {name: _array(path, file, f"truth/{name}") for name in _truth_names(path, file)}
     values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
@@ -248,13 +233,6 @@ def _units(path: Path, file: h5py.File, name: str) -> str | tuple[str, ...]:
     if units is None:
         raise FileFormatError(f"{path}: {name!r} has no attribute 'units'.")
     return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))
-
-
-def _json(path: Path, name: str, text: str) -> dict[str, Any]:
-    value = json.loads(text)
-    if not isinstance(value, dict):
-        raise FileFormatError(f"{path}: {name!r} must be a JSON object; it is {type(value).__name__}.")
-    return value
 
 
 def _system(path: Path, text: str) -> Any:

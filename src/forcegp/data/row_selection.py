@@ -94,9 +94,7 @@ def require_disjoint(train: Dataset, test: Dataset) -> None:
 
 def _common_rows(train: Dataset, test: Dataset) -> np.ndarray:
     def keys(data: Dataset) -> np.ndarray:
-        inputs = (
-            np.hstack([data.q, data.v, data.u]) + 0.0
-        )  # + 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes
+        inputs = np.hstack([data.q, data.v, data.u]) + 0.0  # -0.0 becomes 0.0: equal numbers have equal bytes
         return np.ascontiguousarray(inputs).view(np.dtype((np.void, inputs.itemsize * inputs.shape[1]))).ravel()
 
     return np.flatnonzero(np.isin(keys(test), keys(train)))

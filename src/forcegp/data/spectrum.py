@@ -4,9 +4,7 @@ Spectra are Welch's (1967, "The use of fast Fourier transform for the estimation
 all episodes. Positions are differenced first and the spectrum divided by the gain of the differences, so that the
 slow, strong motion does not leak into the band of the noise (prewhitening; Percival & Walden 1993, section 6.5).
 
-Twice differentiated, motion falls off with the frequency f and noise rises as f^4: their sum has a lowest point, the
-knee. Just above it lies the noise floor. The cut-off is where the power is twice the floor, so that motion and noise
-are equal: the best linear filter has the gain 1/2 there (Wiener 1949), and so has `zero_phase_low_pass` at its cut-off.
+Why the knee of the differentiated spectrum, the floor above it and the cut-off belong together: docs/checking.md.
 """
 
 from collections.abc import Callable

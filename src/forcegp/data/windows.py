@@ -1,14 +1,8 @@
 """Windows: what a log shows of accelerations over short stretches of time, without differentiating it.
 
-For a test function phi on a window of length T, int phi dt = 1, integration by parts moves the derivatives from the
-signal to phi:
-
-    y = int phi a dt = - int phi' v dt = int phi'' q dt,
-
-for phi that vanishes at both ends (from q with its slope): the weak form (Messenger & Bortz 2021, "Weak SINDy"). Or phi
-is 1/T, and y the increment (v(t1) - v(t0)) / T. Either is a linear functional of the acceleration, and so of the
-unknown forces, that holds exactly; no filter comes before. White noise of the signal makes independent noise of y, with
-the norm of the weights as its standard deviation in units of the signal's.
+With a test function phi of integral 1, y = int phi a dt comes from q or v alone (docs/without-accelerations.md): the
+weak form (Messenger & Bortz 2021, "Weak SINDy"), or with phi = 1/T the increment (v(t1) - v(t0)) / T. Both are linear
+in the unknown forces, and exactly so; no filter comes before. White noise of the signal makes independent noise of y.
 """
 
 import warnings

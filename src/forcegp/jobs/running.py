@@ -188,11 +188,12 @@ def run_jobs(
         return 0
     with store.locked():
         store.remove_leftovers()
-        missing = {job.name: job for job in jobs if not store.has(job.name, wanted[job.name])}
+        by_name = {job.name: job for job in jobs}
+        missing = {name: job for name, job in by_name.items() if not store.has(name, wanted[name])}
         if missing:
             require_writable(store.place("trial"))
             _warn_of_outdated(store, missing)
-            _Run(store, jobs, missing, wanted, progress).on(backend or Joblib(1))
+            _Run(store, by_name, dict(missing), wanted, progress).on(backend or Joblib(1))
     return len(missing)
 
 
@@ -210,28 +211,22 @@ def _warn_of_outdated(store: JobStore, missing: Mapping[str, Job]) -> None:
         )
 
 
+@dataclass
 class _Run:
     """The jobs that wait, those that run, and those that are done."""
 
-    def __init__(
-        self,
-        store: JobStore,
-        jobs: Sequence[Job],
-        missing: Mapping[str, Job],
-        digests: Mapping[str, str],
-        progress: Progress | None,
-    ) -> None:
-        self.store = store
-        self.jobs = {job.name: job for job in jobs}
-        self.digests = digests
-        self.waiting = dict(missing)
-        self.finished = set(self.jobs) - set(missing)
-        self.total = sum(job.cost for job in missing.values())
-        self.count = len(missing)
+    store: JobStore
+    jobs: Mapping[str, Job]
+    waiting: dict[str, Job]
+    digests: Mapping[str, str]
+    progress: Progress | None
+
+    def __post_init__(self) -> None:
+        self.finished = self.jobs.keys() - self.waiting.keys()
+        self.total, self.count = sum(job.cost for job in self.waiting.values()), len(self.waiting)
         self.done: list[str] = []
         self.done_cost = 0.0
         self.failed: dict[str, str] = {}
-        self.progress = progress
         self.sent: dict[str, Shared] = {}
         self.stopped = False
 

@@ -28,7 +28,7 @@ DEVIATIONS = 1.959963984540054
 
 @dataclass(frozen=True, eq=False)
 class MotionIntervals:
-    """Widths by horizon [s] of q and v: `rms` (H, 2, nv) in their units, `factors` with and without samples (2, ...)."""
+    """Widths by horizon [s], of q and v: `rms` in their units, `factors` with samples of functions and without."""
 
     horizons: Float[np.ndarray, " H"]
     rms: Float[np.ndarray, "H 2 nv"]

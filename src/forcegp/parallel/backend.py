@@ -13,7 +13,6 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, ClassVar, TypeVar
 
 from typing_extensions import override
@@ -34,16 +33,21 @@ class Shared:
 
 
 class Pool(ABC):
-    """Tasks at work. Use it as a context manager: leaving it by an error stops what is at work."""
+    """Up to `jobs` tasks at work. Use it as a context manager: leaving it by an error stops what is at work."""
+
+    def __init__(self, jobs: int | float) -> None:
+        self._jobs = jobs
+        self._at_work: dict[Any, Any] = {}
+        """What stands for each task, and what it is."""
 
     @property
-    @abstractmethod
     def free(self) -> int | float:
         """How many more tasks can be at work now; infinite where the backend keeps its own queue."""
+        return self._jobs - len(self._at_work)
 
-    @abstractmethod
     def __len__(self) -> int:
         """How many tasks are at work."""
+        return len(self._at_work)
 
     @abstractmethod
     def submit(self, key: Hashable, function: Callable[..., Any], *arguments: Any) -> None:
@@ -63,28 +67,9 @@ class Pool(ABC):
     def __enter__(self) -> "Pool":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             self.stop()
-
-
-class Workers(Pool):
-    """A pool of up to `jobs` tasks at once in other processes; `_at_work` maps what stands for each to what it is."""
-
-    def __init__(self, jobs: int | float) -> None:
-        self._jobs = jobs
-        self._at_work: dict[Any, Any] = {}
-
-    @property
-    @override
-    def free(self) -> int | float:
-        return self._jobs - len(self._at_work)
-
-    @override
-    def __len__(self) -> int:
-        return len(self._at_work)
 
 
 class Backend(ABC):
@@ -110,11 +95,11 @@ class Backend(ABC):
 
         Raises what a task raised, in its place; BackendError where workers cannot be had or die again and again.
         """
-        waiting = enumerate(arguments)
+        waiting, more = enumerate(arguments), True
         ended: dict[int, Future[Outcome]] = {}
-        following, more = 0, True
+        following = 0
         with self.pool() as pool:
-            while True:
+            while more or len(pool):
                 while more and pool.free > 0:
                     index, argument = next(waiting, (None, None))
                     more = index is not None
@@ -123,10 +108,10 @@ class Backend(ABC):
                 while following in ended:
                     yield ended.pop(following).result()
                     following += 1
-                if not len(pool) and not more:
-                    return
                 if len(pool):
                     ended.update(pool.finished())
+            for index in sorted(ended):
+                yield ended[index].result()
 
 
 @dataclass(frozen=True)
@@ -137,33 +122,19 @@ class Serial(Backend):
 
     @override
     def pool(self) -> Pool:
-        return _ThisProcess()
+        return _ThisProcess(1)
 
 
 class _ThisProcess(Pool):
     """A task begins when its outcome is asked for."""
 
-    def __init__(self) -> None:
-        self._task: tuple[Hashable, Callable[..., Any], tuple[Any, ...]] | None = None
-
-    @property
-    @override
-    def free(self) -> int | float:
-        return 0 if self._task else 1
-
-    @override
-    def __len__(self) -> int:
-        return 1 if self._task else 0
-
     @override
     def submit(self, key: Hashable, function: Callable[..., Any], *arguments: Any) -> None:
-        assert self._task is None, "one task at a time"
-        self._task = key, function, arguments
+        self._at_work[key] = function, arguments
 
     @override
     def finished(self) -> list[tuple[Any, Future[Any]]]:
-        assert self._task is not None, "no task was submitted"
-        (key, function, arguments), self._task = self._task, None
+        key, (function, arguments) = self._at_work.popitem()
         future: Future[Any] = Future()
         try:
             future.set_result(function(*unshared(arguments)))
@@ -173,7 +144,7 @@ class _ThisProcess(Pool):
 
     @override
     def stop(self) -> None:
-        self._task = None
+        self._at_work.clear()
 
 
 def unshared(arguments: Iterable[Any]) -> tuple[Any, ...]:
@@ -277,7 +248,7 @@ class _Task:
     deaths: int = 0
 
 
-class _Processes(Workers):
+class _Processes(Pool):
     # As many tasks as there are processes: one that dies takes all tasks with it that were handed over.
 
     @override

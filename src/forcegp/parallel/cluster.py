@@ -8,9 +8,8 @@ import socket
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Generator, Hashable
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any, ClassVar
@@ -18,7 +17,7 @@ from typing import Any, ClassVar
 from typing_extensions import override
 
 from forcegp.errors import BackendError, InvalidInput, MissingExtra
-from forcegp.parallel.backend import MOST_DEATHS, Backend, Joblib, Pool, Serial, Shared, Workers, check_jobs, replayed
+from forcegp.parallel.backend import MOST_DEATHS, Backend, Joblib, Pool, Serial, Shared, check_jobs, replayed
 
 ANSWER_SECONDS = 10
 """So long a machine is given to answer."""
@@ -66,27 +65,20 @@ def connected(address: str | None, jobs: int | None) -> Any:
     address = address or os.environ.get("RAY_ADDRESS") or None
     if address is not None:
         _require_alive(address)
+    logger = logging.getLogger("ray")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # without the note that Ray prints at every start of a cluster
     try:
-        with warnings.catch_warnings(), _without_notices():
+        with warnings.catch_warnings():
             warnings.filterwarnings("ignore", TIP, FutureWarning)
             _join(ray, address, jobs)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
         where = "a cluster of this machine alone" if address is None else f"the Ray cluster at {address}"
         first = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
         raise BackendError(f"{where} cannot be used ({first}); {SAME}") from None
-    return ray
-
-
-@contextmanager
-def _without_notices() -> Generator[None, None, None]:
-    """Without the note that Ray prints at every start of a cluster; errors are printed as ever."""
-    logger = logging.getLogger("ray")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
     finally:
-        logger.setLevel(before)
+        logger.setLevel(level)
+    return ray
 
 
 def host_and_port(address: str) -> tuple[str, int]:
@@ -184,10 +176,10 @@ class Ray(Backend):
         return _Cluster(connected(self.address, self.jobs), self.jobs)
 
 
-class _Cluster(Workers):
+class _Cluster(Pool):
     def __init__(self, ray: Any, jobs: int | None) -> None:
-        self._ray = ray
         super().__init__(float("inf") if jobs is None else jobs)
+        self._ray = ray
         if not any(node["Alive"] and node["Resources"].get("CPU", 0) >= 1 for node in ray.nodes()):
             raise BackendError("no machine of the Ray cluster has a processor to offer; start one with --num-cpus")
         self._work = ray.remote(num_cpus=1, max_retries=MOST_DEATHS, scheduling_strategy="SPREAD")(_portable_work())
@@ -315,9 +307,7 @@ def backend_for(given: Backend | str | None, jobs: int | None = None) -> Backend
     Raises InvalidInput as `backend_of`, and for a backend with jobs of its own together with others.
     """
     if given is None:
-        if jobs is not None:
-            check_jobs(jobs)
-        return Serial() if jobs in (None, 1) else Joblib(jobs)
+        given = Serial.name if jobs in (None, 1) else Joblib.name
     if isinstance(given, str):
         return backend_of(given, jobs)
     if not isinstance(given, Backend):

@@ -18,7 +18,7 @@ from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
     Source,
-    as_column,
+    columns_of,
     element_names,
     reading,
     require_plausible_size,
@@ -48,10 +48,7 @@ class ArrayFile(Source):
         """The array of that full name in pieces of exactly `rows` rows, but for the last."""
 
     def episodes(self, pattern: str) -> list[str]:
-        """Names of arrays or groups that a pattern such as `piece*` or `data/demo_*` matches, in the order of numbers.
-
-        Raises InvalidInput if there is none.
-        """
+        """Names that a pattern such as `data/demo_*` matches, in the order of numbers. Raises InvalidInput for none."""
         depth = pattern.count(SEPARATOR) + 1
         names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.shapes())
         found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
@@ -103,11 +100,7 @@ class ArrayFile(Source):
             )
         for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
             tables = dict(zip(arrays, pieces, strict=True))
-            columns: Columns = {}
-            for name in names:
-                array, index = self._places[name]
-                columns[name] = as_column(tables[array] if index is None else tables[array][:, index])
-            yield columns
+            yield columns_of(tables, {name: self._places[name] for name in names})
 
 
 def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
@@ -118,6 +111,11 @@ def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
             "save it as an array of numbers."
         )
     return dtype.kind in "fiu"
+
+
+def pieces_of(values: np.ndarray, rows: int) -> Iterator[np.ndarray]:
+    """An array that is in memory, as `ArrayFile.blocks` gives it."""
+    return (values[start : start + rows] for start in range(0, len(values), rows))
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
@@ -170,14 +168,14 @@ class NumpyArchive(ArrayFile):
     @override
     def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
         member, shape, column_major, dtype = self._arrays[name]
-        length = self.shapes()[name][0]
         with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive, archive.open(member) as stream:
             _header(stream)
             if column_major and len(shape) > 1:  # its first row ends where the array ends: there are no pieces
                 table = np.frombuffer(stream.read(), dtype, count=math.prod(shape)).reshape(shape, order="F")
-                yield from (table[start : start + rows] for start in range(0, length, rows))
+                yield from pieces_of(table, rows)
                 return
             row_bytes = dtype.itemsize * math.prod(shape[1:])
+            length = self.shapes()[name][0]
             for start in range(0, length, rows):
                 count = min(rows, length - start)
                 data = stream.read(count * row_bytes)

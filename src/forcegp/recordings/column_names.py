@@ -93,10 +93,7 @@ WORDS = {
 
 
 def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple[str, ...] | None:
-    """One column per joint whose names are the joint's name in a text that means `signal`; None if there is none.
-
-    Raises InvalidInput if several sets of columns could be meant.
-    """
+    """One column per joint, its name in a text that means `signal`; None for none. Raises InvalidInput for several."""
     templates: dict[tuple[str, str], dict[str, str]] = {}
     for column in source.columns():
         for joint in joints:
@@ -133,20 +130,15 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     return bool(words & WORDS[signal])
 
 
-WORD_ENDS = r"(?!\w)"
 FACTOR = (
     r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?))(?!\w)|(?P<pi>pi)(?!\w)"
     r"|(?P<word>[^\s+*/`]+)"
 )
-NAME_LETTER = re.compile(r"\w")
 
 
 @dataclass(frozen=True)
 class LinearExpression:
-    """`constant + sum of weight * column`.
-
-    `weights` maps column names to their weights, none of them twice.
-    """
+    """`constant + sum of weight * column`; `weights` maps names of columns to their weights."""
 
     weights: Mapping[str, float]
     constant: float = 0.0
@@ -185,7 +177,7 @@ class _Parser:
         self.text, self.columns, self.owner = text, columns, owner
         self.rest = text.lstrip()
         longest_first = sorted(columns, key=len, reverse=True)
-        names = "|".join(re.escape(name) + (WORD_ENDS if NAME_LETTER.match(name[-1]) else "") for name in longest_first)
+        names = "|".join(re.escape(name) + (r"(?!\w)" if re.match(r"\w", name[-1]) else "") for name in longest_first)
         self.factor = re.compile(FACTOR % names)
 
     def expression(self) -> LinearExpression:

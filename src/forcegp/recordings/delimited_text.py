@@ -13,7 +13,7 @@ from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.recordings.source import Columns, Source, Wrapper, gzip_stream, reading, require_distinct
+from forcegp.recordings.source import Columns, Source, Wrapper, arrow_numbers, gzip_stream, reading, require_distinct
 
 FIRST_BYTES = 2**16
 """What is looked at to detect the header, the delimiter and whether there are comments."""
@@ -216,7 +216,7 @@ class DelimitedText(Source):
                     parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
                     convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
                 )
-                columns = ({name: _numbers(batch.column(name)) for name in wanted} for batch in batches)
+                columns = ({name: arrow_numbers(batch.column(name)) for name in wanted} for batch in batches)
                 yield from _pieces(self._stacked(columns, names) if stacked else columns, rows)
             except pa.ArrowInvalid as error:
                 raise self._told_by_pyarrow(error) from error
@@ -239,26 +239,25 @@ class DelimitedText(Source):
     def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
         text = str(error)
         converted, ragged = _CONVERSION.search(text), _RAGGED.search(text)
+
+        def line(number: str) -> str:
+            return self.place((int(number) - 1) // self._lines_per_row)  # pyarrow counts from 1
+
         if converted:
             column, row, value = converted.groups()
             name = "c1" if self._lines_per_row > 1 else self._columns[int(column)]
-            where = f" at {self._line(int(row))}" if row else ""
+            where = f" at {line(row)}" if row else ""
             return FileFormatError(
                 f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. {_remedy(value)}"
             )
         if ragged:
             row, expected, found = ragged.groups()
-            where = f"{self._line(int(row))} has" if row else "one row has"
+            where = f"{line(row)} has" if row else "one row has"
             return FileFormatError(
                 f"{self.path}: {where} {found} fields instead of {expected}. Repair or remove it "
                 "(the end of a log is often cut)."
             )
         return FileFormatError(f"{self.path} cannot be read as text: {text}")
-
-    def _line(self, number: int) -> str:
-        """Where a line stands that pyarrow counts from 1."""
-        row = (number - 1) // self._lines_per_row
-        return self.place(row)
 
 
 def _remedy(value: str) -> str:
@@ -267,12 +266,6 @@ def _remedy(value: str) -> str:
     if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", value):
         return "Write the time as a number of seconds, or give `step`."
     return "Repair or remove that row."
-
-
-def _numbers(column) -> np.ndarray:
-    if column.null_count:  # an empty field is a missing value; the caller reports where
-        return column.to_numpy(zero_copy_only=False).astype(np.float64)
-    return column.to_numpy(zero_copy_only=True)
 
 
 def _pieces(batches: Iterator[Columns], rows: int) -> Iterator[Columns]:

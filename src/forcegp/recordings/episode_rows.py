@@ -191,52 +191,30 @@ class EpisodeRows:
 
     def pieces(self, spool: Spool, rows: int = ROWS_AT_A_TIME) -> Iterator[dict[str, np.ndarray]]:
         """Time and the signals q, v, u, a, `rows` at a time."""
-        log = self._LogRows(self, spool)
-        time = self._times(log.time)
+        recording, first = self.stretch.recording, self.stretch.start
+        numbers = first + np.flatnonzero(self.kept[first : self.stretch.end])  # rows of the recording that are used
+        time = stamps = recording.time[numbers]
+        if self.step is not None:
+            count = int(np.floor((stamps[-1] - stamps[0]) / self.step * (1 + 1e-12))) + 1
+            time = np.minimum(stamps[0] + self.step * np.arange(count), stamps[-1])
+
+        def logged(start: int, end: int) -> np.ndarray:
+            used = numbers[start:end]
+            table = spool.read(recording.first + int(used[0]), recording.first + int(used[-1]) + 1)
+            return table if len(table) == len(used) else table[used - used[0]]
+
+        def interpolated(at: np.ndarray) -> np.ndarray:
+            low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
+            high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
+            return make_interp_spline(stamps[low:high], logged(low, high), k=3)(at)
+
         for start in range(0, len(time), rows):
             end = min(start + rows, len(time))
             low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
-            table = log.rows(low, high) if self.step is None else log.interpolated(time[low:high])
+            table = logged(low, high) if self.step is None else interpolated(time[low:high])
             signals = {name: table[:, self.nv * i : self.nv * (i + 1)] for i, name in enumerate(self.logged)}
-            if "v" not in signals:
-                signals["v"] = differentiate(signals["q"], time[low:high])
-            if "a" not in signals:
-                signals["a"] = differentiate(signals["v"], time[low:high])
+            for name, source in (("v", "q"), ("a", "v")):
+                if name not in signals:
+                    signals[name] = differentiate(signals[source], time[low:high])
             own = slice(start - low, end - low)
             yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}
-
-    @property
-    def count(self) -> int:
-        """Number of rows."""
-        return len(self._times(self.stretch.recording.time[self._numbers]))
-
-    @property
-    def _numbers(self) -> np.ndarray:
-        """Rows of the recording that are used."""
-        stretch = self.stretch
-        return stretch.start + np.flatnonzero(self.kept[stretch.start : stretch.end])
-
-    def _times(self, stamps: np.ndarray) -> np.ndarray:
-        if self.step is None:
-            return stamps
-        count = int(np.floor((stamps[-1] - stamps[0]) / self.step * (1 + 1e-12))) + 1
-        return np.minimum(stamps[0] + self.step * np.arange(count), stamps[-1])
-
-    class _LogRows:
-        """The rows of the log that are used, by number."""
-
-        def __init__(self, owner: "EpisodeRows", spool: Spool) -> None:
-            self.spool = spool
-            self.first = owner.stretch.recording.first
-            self.numbers = owner._numbers
-            self.time = owner.stretch.recording.time[self.numbers]
-
-        def rows(self, start: int, end: int) -> np.ndarray:
-            numbers = self.numbers[start:end]
-            table = self.spool.read(self.first + int(numbers[0]), self.first + int(numbers[-1]) + 1)
-            return table if len(table) == len(numbers) else table[numbers - numbers[0]]
-
-        def interpolated(self, time: np.ndarray) -> np.ndarray:
-            low = max(int(np.searchsorted(self.time, time[0])) - SPLINE_HALO, 0)
-            high = min(int(np.searchsorted(self.time, time[-1])) + SPLINE_HALO, len(self.time))
-            return make_interp_spline(self.time[low:high], self.rows(low, high), k=3)(time)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 
 import h5py
@@ -25,7 +26,7 @@ class SideBySide(Source):
 
     def __init__(self, sources: Sequence[Source]) -> None:
         super().__init__(Path(", ".join(str(source.path) for source in sources)))
-        self.sources = {stem(source.path): source for source in sources}
+        self.sources = {source.path.name.split(".")[0]: source for source in sources}
         if len(self.sources) < len(sources):
             raise InvalidInput(f"{self.path}: two files have the same name up to the first dot; rename one.")
 
@@ -65,8 +66,7 @@ class SideBySide(Source):
         own = {source: [self._owners[name][1] for name in names if self._owners[name][0] is source] for source in used}
         streams = [_exact(source.chunks(list(dict.fromkeys(own[source])), rows), rows) for source in used]
         counts = dict.fromkeys(used, 0)
-        while True:
-            pieces = [next(stream, None) for stream in streams]
+        for pieces in zip_longest(*streams):
             lengths = [len(next(iter(piece.values()))) if piece else 0 for piece in pieces]
             for source, length in zip(used, lengths, strict=True):
                 counts[source] += length
@@ -76,14 +76,7 @@ class SideBySide(Source):
                 listed = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
                 raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
             found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
-            if not found:
-                return
             yield {name: found[self._owners[name][0]][self._owners[name][1]] for name in names}
-
-
-def stem(path: Path) -> str:
-    """The name of a file up to its first dot."""
-    return path.name.split(".")[0]
 
 
 def _exact(pieces: Iterator[Columns], rows: int) -> Iterator[Columns]:
@@ -138,7 +131,9 @@ def open_source(
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:
         if kind != ".npz" and h5py.is_hdf5(path):
-            _require_foreign(path)
+            with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
+                if file.attrs.get("format") == "forcegp-dataset":
+                    raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
         return ARRAYS[kind](path, within=within)
     return LeRobotFolder(path) if kind == "lerobot" else RosBag(path) if kind == "ros2" else TABLES[kind](path)
 
@@ -167,9 +162,3 @@ def _kind(path: Path) -> str:
     if path.stat().st_size == 0:
         raise FileFormatError(f"{path} is empty; give a log with rows.")
     return kind
-
-
-def _require_foreign(path: Path) -> None:
-    with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
-        if file.attrs.get("format") == "forcegp-dataset":
-            raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")

@@ -4,14 +4,14 @@ import math
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError
-from forcegp.recordings.array_file import ArrayFile
+from forcegp.recordings.array_file import ArrayFile, pieces_of
 from forcegp.recordings.source import reading, require_plausible_size
 
 HDF5 = "an HDF5 file"
@@ -98,16 +98,10 @@ class MatlabHDF5(HDF5Arrays):
 
     @override
     def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        yield from self._row_blocks(name, rows) if self._is_row(name) else super().blocks(name, rows)
-
-    def _is_row(self, name: str) -> bool:
         with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
-            return _is_row(tuple(reversed(file[name].shape)))  # type: ignore[union-attr]  # one of the arrays
-
-    def _row_blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
-            values = file[name][()].reshape(-1, 1)  # type: ignore[index]  # one of the arrays
-        yield from (values[start : start + rows] for start in range(0, len(values), rows))
+            stored: Any = file[name]
+            row = stored[()].reshape(-1, 1) if _is_row(stored.shape[::-1]) else None
+        return super().blocks(name, rows) if row is None else pieces_of(row, rows)
 
 
 class MatlabFile(ArrayFile):
@@ -150,8 +144,7 @@ class MatlabFile(ArrayFile):
 
     @override
     def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        values = self._arrays[name]
-        yield from (values[start : start + rows] for start in range(0, len(values), rows))
+        return pieces_of(self._arrays[name], rows)
 
 
 def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:

@@ -13,7 +13,7 @@ import forcegp.mechanics
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import EpisodeRows, Stamps, read_stamps
+from forcegp.recordings.episode_rows import EpisodeRows, Stamps, Stretch, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.reading import (
@@ -111,10 +111,20 @@ def import_recordings(
         recordings = []
         for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
             report(index, steps, f"reading {label}")
-            recordings.append(_read(source, own, spool, label, mapping, system, options))
+            found = read_recording(source, own, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
+            if not options.beyond_limits:
+                require_plausible_positions(found, own, robot, stated="q" in mapping.unit)
+            warn_of_implausible_forces(found, own, robot)
+            recordings.append(found)
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
         step = _even_step(stamps, options)
-        episodes = _without_jumps([rows for own in stamps for rows in _rows_of(own, plan, step, options)])
+        episodes = [
+            EpisodeRows(stretch, own.kept, plan.logged, len(plan.joints), step)
+            for own in stamps
+            for stretch in own.stretches
+        ]
+        for stretch in (rows.stretch for rows in episodes):
+            _require_no_jumps(stretch)
         done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
         with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
             for number, rows in enumerate(episodes):
@@ -122,7 +132,10 @@ def import_recordings(
                 before = writer.rows
                 for piece in rows.pieces(spool):
                     writer.append(**piece, episode=number)
-                done["episodes"].append(_episode(rows, writer.rows - before))
+                recording, begin = rows.stretch.recording, rows.stretch.start
+                stamp = recording.begin + float(recording.time[begin])
+                own = {"recording": recording.label, "number": rows.stretch.number, "row": begin, "begin": stamp}
+                done["episodes"].append({**own, "rows": writer.rows - before})
             done["rows"] = writer.rows
             writer.finish({"import": done})
     return done
@@ -154,23 +167,6 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
     return found
 
 
-def _read(
-    source: Source,
-    plan: SignalPlan,
-    spool: Spool,
-    label: str,
-    mapping: ColumnMapping,
-    system: forcegp.mechanics.MechanicalSystem | None,
-    options: ImportOptions,
-) -> RawRecording:
-    robot = None if system is None else system.robot
-    recording = read_recording(source, plan, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
-    if not options.beyond_limits:
-        require_plausible_positions(recording, plan, robot, stated="q" in mapping.unit)
-    warn_of_implausible_forces(recording, plan, robot)
-    return recording
-
-
 def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
     """The step of even times that all episodes get, or None if every stamp stays."""
     median = float(np.median([own.step for own in stamps]))
@@ -190,36 +186,16 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
 
 
-def _rows_of(stamps: Stamps, plan: SignalPlan, step: float | None, options: ImportOptions) -> list[EpisodeRows]:
-    nv = len(plan.joints)
-    return [EpisodeRows(stretch, stamps.kept, plan.logged, nv, step) for stretch in stamps.stretches]
-
-
-def _without_jumps(episodes: list[EpisodeRows]) -> list[EpisodeRows]:
+def _require_no_jumps(stretch: Stretch) -> None:
     """Refuse positions that jump by a turn inside an episode: derivatives would take it for motion."""
-    for rows in episodes:
-        stretch = rows.stretch
-        recording = stretch.recording
-        for row, item in recording.jumps:
-            if stretch.start < row < stretch.end:
-                raise DatasetError(
-                    f"{recording.label}: q of joint {item.joint!r} jumps by more than half a turn at "
-                    f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
-                    "is in degrees. Add `unwrap`, or `unit` q=deg."
-                )
-    return episodes
-
-
-def _episode(rows: EpisodeRows, count: int) -> dict[str, Any]:
-    recording = rows.stretch.recording
-    begin = recording.time[rows.stretch.start]
-    return {
-        "recording": recording.label,
-        "number": rows.stretch.number,
-        "row": rows.stretch.start,
-        "begin": recording.begin + float(begin),
-        "rows": count,
-    }
+    recording = stretch.recording
+    for row, item in recording.jumps:
+        if stretch.start < row < stretch.end:
+            raise DatasetError(
+                f"{recording.label}: q of joint {item.joint!r} jumps by more than half a turn at "
+                f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
+                "is in degrees. Add `unwrap`, or `unit` q=deg."
+            )
 
 
 def _what_was_done(

@@ -234,22 +234,24 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
         if key in SIGNALS or key == "joints":
             values[key] = _texts(key, value)
         elif key == "unit":
-            values[key] = {str(name): _texts(f"unit of {name}", entry) for name, entry in _dict(key, value).items()}
+            quantities = f"name the quantity, for example {_EXAMPLES[key]} ({', '.join(UNITS)})"
+            _require(isinstance(value, dict), key, value, quantities)
+            values[key] = {str(name): _texts(f"unit of {name}", entry) for name, entry in value.items()}
         elif key in ("sign", "scale", "offset"):
-            values[key] = {
-                signal: _numbers(f"{key} of {signal}", entry) for signal, entry in _by_signal(key, value).items()
-            }
+            entries = {signal: _listed(entry) for signal, entry in _by_signal(key, value).items()}
+            values[key] = {name: tuple(_number(f"{key} of {name}", x) for x in own) for name, own in entries.items()}
         elif key == "headerless":
-            values[key] = tuple(_whole(number) for number in (value if isinstance(value, list) else [value]))
+            values[key] = tuple(_listed(value))
+            for entry in values[key]:
+                whole = isinstance(entry, int) and not isinstance(entry, bool)
+                _require(whole, key, entry, "give the number of columns")
         elif key == "step":
             values[key] = _number(key, value)
         elif key == "side_by_side":
-            if not isinstance(value, bool):
-                raise InvalidInput(f"side_by_side is {value!r}; give true or false.")
+            _require(isinstance(value, bool), key, value, "give true or false")
             values[key] = value
         else:
-            if not isinstance(value, str):
-                raise InvalidInput(f"{key} is {value!r}; give a text.")
+            _require(isinstance(value, str), key, value, "give a text")
             values[key] = value
     return ColumnMapping(**values)
 
@@ -293,8 +295,8 @@ def factors_of(flag: str, text: str) -> Any:
 
 def _texts(key: str, value: Any) -> tuple[str, ...]:
     entries = value if isinstance(value, list) else listed(value) if isinstance(value, str) else [value]
-    if not entries or any(isinstance(entry, bool) or not isinstance(entry, str | int | float) for entry in entries):
-        raise InvalidInput(f"{key} is {value!r}; give a text or a list of texts.")
+    plain = all(isinstance(entry, str | int | float) and not isinstance(entry, bool) for entry in entries)
+    _require(bool(entries) and plain, key, value, "give a text or a list of texts")
     return tuple(str(entry) for entry in entries)
 
 
@@ -302,19 +304,17 @@ def _by_signal(key: str, value: Any) -> Mapping[str, Any]:
     """A list without signals is for all of them, which only a sign can be: it turns the axis of a joint around."""
     if isinstance(value, dict):
         return {str(name): entry for name, entry in value.items()}
-    if key != "sign":
-        raise InvalidInput(f"{key} is {value!r}; name its signal, for example {_EXAMPLES[key]}.")
+    _require(key == "sign", key, value, f"name its signal, for example {_EXAMPLES[key]}")
     return dict.fromkeys(SIGNALS, value)
 
 
-def _dict(key: str, value: Any) -> Mapping[Any, Any]:
-    if not isinstance(value, dict):
-        raise InvalidInput(f"{key} is {value!r}; name the quantity, for example {_EXAMPLES[key]} ({', '.join(UNITS)}).")
-    return value
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
-def _numbers(key: str, value: Any) -> tuple[float, ...]:
-    return tuple(_number(key, entry) for entry in (value if isinstance(value, list) else [value]))
+def _require(fits: bool, key: str, value: Any, remedy: str) -> None:
+    if not fits:
+        raise InvalidInput(f"{key} is {value!r}; {remedy}.")
 
 
 def _number(key: str, value: Any) -> float:
@@ -324,9 +324,3 @@ def _number(key: str, value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise InvalidInput(f"{key} is {value!r}; give a number.") from None
-
-
-def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise InvalidInput(f"headerless is {value!r}; give the number of columns.")
-    return value

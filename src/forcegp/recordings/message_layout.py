@@ -6,7 +6,7 @@ after that header); ROS 1 messages are the same without header, alignment and ze
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,8 +33,8 @@ class MessageLayout:
     """
 
     template: bytes
-    places: dict[str, tuple[int, str]] = field(default_factory=dict)
-    fixed: np.ndarray = field(default_factory=lambda: np.empty(0, np.intp))
+    places: dict[str, tuple[int, str]]
+    fixed: np.ndarray
 
     def fits(self, messages: np.ndarray) -> np.ndarray:
         """Which of these messages (rows, length), all as long as the template, have this layout."""
@@ -62,18 +62,13 @@ def _values(messages: np.ndarray, offset: int, kind: str) -> np.ndarray:
 
 
 def message_layout(raw: bytes, kind: str, types: Mapping[str, Any], *, ros1: bool) -> MessageLayout:
-    """The layout of one message of that type. `types` are the field definitions of `rosbags`.
-
-    Raises FileFormatError for a message that ends early, and for texts of wide letters.
-    """
+    """By the field definitions of `rosbags`. Raises FileFormatError for an early end and texts of wide letters."""
     walk = _Walk(raw, types, ros1)
     try:
         walk.structure(kind, "", 0)
     except struct.error as error:
         raise FileFormatError(f"a message of type {kind} ends before its last field.") from error
-    layout = MessageLayout(raw, walk.places)
-    layout.fixed = np.asarray(walk.fixed, dtype=np.intp)
-    return layout
+    return MessageLayout(raw, walk.places, np.asarray(walk.fixed, dtype=np.intp))
 
 
 class _Walk:

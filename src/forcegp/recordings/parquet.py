@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow
 import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import parquet, types
@@ -18,7 +17,8 @@ from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
     Source,
-    as_column,
+    arrow_numbers,
+    columns_of,
     element_names,
     reading,
     require_distinct,
@@ -34,50 +34,46 @@ class ParquetFile(Source):
 
     def __init__(self, path: Path, *, names: Mapping[str, Sequence[str]] | None = None) -> None:
         super().__init__(path)
-
-        self._scalars: dict[str, str] = {}
-        self._elements: dict[str, tuple[str, int]] = {}
+        self._places: dict[str, tuple[str, int | None]] = {}  # column -> its name in the file, its place in a list
         self._widths: dict[str, int] = {}
+        lists = {}
         with reading(path, "a Parquet file", pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
             self.rows = file.metadata.num_rows
             require_distinct(path, file.schema_arrow.names)
             if not self.rows:
                 raise FileFormatError(f"{path} has columns but no rows.")
-            lists = []
             for field in file.schema_arrow:
                 if _is_number(field.type):
-                    self._scalars[field.name] = field.name
+                    self._places[field.name] = field.name, None
                 elif any(is_list(field.type) for is_list in LISTS) and _is_number(field.type.value_type):
-                    lists.append(field.name)
-            for name in lists:
-                first = next(file.iter_batches(1, columns=[name])).column(0)[0]
-                width = len(first) if first.is_valid else 0
-                if 0 < width <= LONGEST_VECTOR:
-                    self._widths[name] = width
-                    own = (names or {}).get(name)
-                    elements = [f"{name}.{part}" for part in own] if own and len(own) == width else []
-                    for index, element in enumerate(elements or element_names(name, width)):
-                        self._elements[element] = (name, index)
-        require_distinct(path, list(self.columns()))
-        if not self.columns():
+                    first = next(file.iter_batches(1, columns=[field.name])).column(0)[0]
+                    lists[field.name] = len(first) if first.is_valid else 0
+        elements = []
+        for name, width in lists.items():
+            if 0 < width <= LONGEST_VECTOR:
+                self._widths[name] = width
+                own = (names or {}).get(name, ())
+                named = [f"{name}.{part}" for part in own] if len(own) == width else element_names(name, width)
+                elements += [(element, (name, index)) for index, element in enumerate(named)]
+        require_distinct(path, [*self._places, *(element for element, _ in elements)])
+        self._places |= dict(elements)
+        if not self._places:
             raise FileFormatError(f"{path} has no column of numbers.")
 
     @override
     def columns(self) -> tuple[str, ...]:
-        return (*self._scalars, *self._elements)
+        return tuple(self._places)
 
     @property
     @override
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
-        found: dict[str, list[str]] = {}
-        for element, (name, _) in self._elements.items():
-            found.setdefault(name, []).append(element)
-        return {name: tuple(elements) for name, elements in found.items()}
+        elements = [(column, stored) for column, (stored, index) in self._places.items() if index is not None]
+        return {name: tuple(column for column, stored in elements if stored == name) for name in self._widths}
 
     @override
     def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
-        stored = list(dict.fromkeys(self._elements[name][0] if name in self._elements else name for name in names))
+        stored = list(dict.fromkeys(self._places[name][0] for name in names))
         row = 0
         with (
             reading(self.path, "a Parquet file", pa.ArrowException),
@@ -86,18 +82,13 @@ class ParquetFile(Source):
             for batch in file.iter_batches(rows, columns=stored):
                 if not len(batch):
                     continue
-                tables = {name: self._table(batch.column(name), name, row) for name in stored if name in self._widths}
-                columns: Columns = {}
-                for name in names:
-                    if name in self._elements:
-                        vector, index = self._elements[name]
-                        columns[name] = as_column(tables[vector][:, index])
-                    else:
-                        columns[name] = as_column(_plain(batch.column(name)))
+                tables = {name: self._table(batch.column(name), name, row) for name in stored}
                 row += len(batch)
-                yield columns
+                yield columns_of(tables, {name: self._places[name] for name in names})
 
-    def _table(self, column: pyarrow.Array, name: str, row: int) -> np.ndarray:
+    def _table(self, column: pa.Array, name: str, row: int) -> np.ndarray:
+        if name not in self._widths:
+            return arrow_numbers(column)
         width = self._widths[name]
         lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
         wrong = np.flatnonzero(lengths != width)
@@ -106,15 +97,10 @@ class ParquetFile(Source):
                 f"{self.path}: column {name!r} has {lengths[wrong[0]]} elements at {self.place(row + int(wrong[0]))}, "
                 f"{width} before. Lists must be of one length."
             )
-        return _plain(column.flatten()).reshape(len(column), width)
+        return arrow_numbers(column.flatten()).reshape(len(column), width)
 
 
-def _plain(column: pyarrow.Array) -> np.ndarray:
-    values = column.to_numpy(zero_copy_only=False)
-    return values.astype(np.float64) if values.dtype == object or column.null_count else values
-
-
-def _is_number(kind: pyarrow.DataType) -> bool:
+def _is_number(kind: pa.DataType) -> bool:
     return types.is_floating(kind) or types.is_integer(kind)
 
 

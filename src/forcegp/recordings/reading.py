@@ -82,10 +82,7 @@ class RawRecording:
 def read_recording(
     source: Source, plan: SignalPlan, spool: Spool, label: str, *, unwrap: bool, most_rows: int
 ) -> RawRecording:
-    """Read a table once.
-
-    Raises FileFormatError and DatasetError naming the file, the row, the time and the column.
-    """
+    """Read a table once. Raises FileFormatError and DatasetError naming the file, the row, the time and the column."""
     first = spool.rows
     clock = _Clock(plan, source)
     turns = _Turns(plan, unwrap)

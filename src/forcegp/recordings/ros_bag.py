@@ -207,13 +207,9 @@ class RosBag(Source):
             )
         # Exception: rosbags meets damaged files with whatever its parsers, sqlite, zstd and lz4 raise
         with reading(self.path, "a bag", Exception), AnyReader([self.path], default_typestore=known) as reader:
-            self._check_chunks(reader)
+            for chunk in mcap_chunks(reader) or ():
+                require_plausible_size(self.path, "a chunk", chunk.expanded, chunk.stored)
             yield reader
-
-    def _check_chunks(self, reader: Any) -> None:
-        """Compare what compressed chunks of .mcap files claim to hold with their size."""
-        for chunk in mcap_chunks(reader) or ():
-            require_plausible_size(self.path, "a chunk", chunk.expanded, chunk.stored)
 
     @cached_property
     def _topics(self) -> Mapping[str, tuple[str, ...]]:
@@ -249,9 +245,9 @@ class RosBag(Source):
         topics = {self._topic_of(name) for name in names}
         if len(topics) != 1:
             return None
-        columns, topic = self._topics[next(iter(topics))], next(iter(topics))
+        [topic] = topics
         stamp = f"{topic}:{STAMP}"
-        return stamp if stamp in columns else f"{topic}:{LOG_TIME}"
+        return stamp if stamp in self._topics[topic] else f"{topic}:{LOG_TIME}"
 
     @override
     def files(self) -> tuple[Path, ...]:

@@ -1,6 +1,6 @@
 """A mapping applied to a table: which combination of its columns each joint's signals are."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,15 +55,9 @@ class SignalPlan:
     @property
     def columns(self) -> tuple[str, ...]:
         """Every column that is needed, each once."""
-        return tuple(dict.fromkeys(self._needed()))
-
-    def _needed(self) -> Iterator[str]:
-        if self.time is not None:
-            yield from self.time.weights
-        for item in self.signals:
-            yield from item.expression.weights
-        if self.episode is not None:
-            yield self.episode
+        expressions = [item.expression for item in self.signals]
+        needed = [name for each in (self.time, *expressions) if each is not None for name in each.weights]
+        return tuple(dict.fromkeys([*needed, *([] if self.episode is None else [self.episode])]))
 
 
 def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Robot | None) -> SignalPlan:

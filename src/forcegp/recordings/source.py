@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -110,6 +110,20 @@ def as_column(values: np.ndarray) -> np.ndarray:
     if values.dtype.kind in "iu" and values.dtype != np.uint64:
         return np.ascontiguousarray(values, dtype=np.int64)
     return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def columns_of(tables: Mapping[str, np.ndarray], places: Mapping[str, tuple[str, int | None]]) -> Columns:
+    """Columns out of tables (rows,) or (rows, k): name of a column -> its table, and where it is in that."""
+    return {
+        name: as_column(tables[own] if index is None else tables[own][:, index])
+        for name, (own, index) in places.items()
+    }
+
+
+def arrow_numbers(column: Any) -> np.ndarray:
+    """A column of pyarrow; a missing value is NaN."""
+    values = column.to_numpy(zero_copy_only=False)
+    return values.astype(np.float64) if values.dtype == object or column.null_count else values
 
 
 @contextmanager
