@@ -3,7 +3,7 @@
 Fits to more points begin where the fit to fewer ended, because the training sets are nested.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -120,7 +120,7 @@ def all_name(model: str, seed: int) -> str:
     return f"fits/{model}/seed{seed}/all"
 
 
-def fit_series(model: str, data: str, seed: int, points: list[int], settings: FitSettings) -> list[Job]:
+def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings: FitSettings) -> list[Job]:
     """One job per number of points, each beginning from the hyper-parameters of the one before."""
     jobs: list[Job] = []
     for count in sorted(points):
