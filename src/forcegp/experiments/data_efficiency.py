@@ -11,7 +11,17 @@ from typing_extensions import override
 from forcegp.evaluation.metrics import formatted
 from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
 from forcegp.experiments import published
-from forcegp.experiments.force_experiment import LABELS, ForceExperiment, Trial, only_test, plain_ticks, score_table
+from forcegp.experiments.experiment import heading
+from forcegp.experiments.figures import draw_range
+from forcegp.experiments.force_experiment import (
+    LABELS,
+    ForceExperiment,
+    Trial,
+    only_test,
+    plain_ticks,
+    score_table,
+    trials_on,
+)
 from forcegp.jobs import JobStore
 
 PRIORS = {
@@ -40,19 +50,13 @@ class DataEfficiency(ForceExperiment):
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         figure = new_figure(8.6, 3.8)
         panels = figure.subplots(1, 2)
-        for axes, score, heading in zip(
-            panels, ("mae", "mae_noise_free"), ("against noisy accelerations", "against noise-free ones"), strict=True
-        ):
+        scores = {"mae": "against noisy accelerations", "mae_noise_free": "against noise-free ones"}
+        for axes, (score, title) in zip(panels, scores.items(), strict=True):
             for color, label in zip((SERIES[1], SERIES[0], SERIES[2]), PRIORS, strict=True):
                 trials = [trial for trial in summary["trials"] if trial["label"] == label and not trial["region"]]
-                counts = [trial["points"] for trial in trials]
-                values = [only_test(trial)[score] for trial in trials]
-                axes.fill_between(
-                    counts, [v["min"] for v in values], [v["max"] for v in values], color=color, alpha=0.15, linewidth=0
-                )
-                axes.plot(counts, [v["median"] for v in values], color=color, marker="o", markersize=3.5, label=label)
+                draw_range(axes, {trial["points"]: only_test(trial)[score] for trial in trials}, color, label)
             axes.set(xscale="log", yscale="log")
-            quiet(axes, title=f"MAE {heading} [rad/s²]", x="training points N", y="")
+            quiet(axes, title=f"MAE {title} [rad/s²]", x="training points N", y="")
         paper = published.FIG2B_MAE["s-gp-mean"]
         label = "S-GP + mean, published (2021)"
         panels[0].plot(list(paper), list(paper.values()), color=QUIET, linestyle="--", linewidth=1.0, label=label)
@@ -67,8 +71,7 @@ class DataEfficiency(ForceExperiment):
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
         columns = ("mae", "mae_noise_free", "nlpd", "coverage_95", "normal_force_error", "normal_force_coverage")
-        inside = [trial for trial in summary["trials"] if not trial["region"]]
-        outside = [trial for trial in summary["trials"] if trial["region"]]
+        outside, inside = ([t for t in summary["trials"] if t["region"] == region] for region in (True, False))
         best = published.FIG2B_MAE["s-gp-mean"][1000]
         return "\n\n".join(
             [
@@ -115,8 +118,8 @@ class DeepKernel(ForceExperiment):
         ]
         columns = ("mae_noise_free", "nlpd", "coverage_95")
         for scenario in SCENARIOS:
-            trials = [trial for trial in summary["trials"] if trial["scenario"] == scenario]
+            trials = trials_on(scenario, summary)
             densities = [f"{t['label']}, N={t['points']}: {formatted(t['leave_one_out'], 3)}" for t in trials]
-            heading = LABELS[scenario][0].upper() + LABELS[scenario][1:]
-            parts += [f"**{heading}**", score_table(trials, columns), f"Leave-one-out: {'; '.join(densities)}."]
+            texts = (heading(LABELS[scenario]), score_table(trials, columns))
+            parts += [*texts, f"Leave-one-out: {'; '.join(densities)}."]
         return "\n\n".join(parts)

@@ -88,6 +88,11 @@ class Experiment(ABC):
         return dataclasses.asdict(self)
 
 
+def heading(label: str) -> str:
+    """In bold, with a capital letter."""
+    return f"**{label[0].upper()}{label[1:]}**"
+
+
 def model_rows(cells: Mapping[str, Sequence[str]], suffix: str = "") -> list[list[str]]:
     """Model -> cells as rows of a table that begin with the model's label."""
     return [[f"{MODELS[model].label}{suffix}", *each] for model, each in cells.items()]

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, medians
-from forcegp.experiments.experiment import Experiment, Row, model_table
+from forcegp.experiments.experiment import Experiment, Row, heading, model_table
 from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.figures import extrapolation_figure
 from forcegp.experiments.fits import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS, FitSettings, fit_cost
@@ -100,12 +100,13 @@ class Extrapolation(Experiment):
                 ]
                 for model, scores in summary["regions"][region].items()
             }
-            parts += [f"**{label[0].upper()}{label[1:]}**", model_table(header, cells)]
+            parts += [heading(label), model_table(header, cells)]
         scale = summary["scale"]
         parts += [
             "What each model was left to learn, root mean square over training rows. A Gaussian process falls back to "
             "zero away from its data, so this is the size that its errors can reach there; a force error reaches the "
-            f"acceleration through H, whose largest entry on these data is {formatted(scale['largest_H'], 0)} /(kg m²).",
+            "acceleration through H, whose largest entry on these data is "
+            f"{formatted(scale['largest_H'], 0)} /(kg m²).",
             markdown_table(["what", "size"], [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()]),
         ]
         return "\n\n".join(parts)

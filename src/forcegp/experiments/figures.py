@@ -43,9 +43,14 @@ def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
     panels = figure.subplots(1, len(PANELS))
     counts = sorted({int(count) for curve in summary["curves"].values() for count in curve})
     for axes, (score, heading) in zip(panels, PANELS, strict=True):
+        paper = {"mae": published.FIG2B_MAE, "constraint_error": published.FIG2B_CONSTRAINT_ERROR}.get(score, {})
         for model, curve in summary["curves"].items():
-            _draw_ours(axes, curve, score, model)
-        _draw_published(axes, summary, score)
+            values = {int(count): scores[score] for count, scores in curve.items()}
+            draw_range(axes, values, COLORS[model], MODELS[model].label)
+        for model, values in paper.items():
+            if model in summary["curves"]:
+                line = {"color": COLORS[model], "linestyle": "--", "linewidth": 1.0, "alpha": 0.8}
+                axes.plot(list(values), list(values.values()), **line)
         axes.set(xscale="log", yscale="log")
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -63,21 +68,11 @@ def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _draw_ours(axes: Axes, curve: Mapping[str, Any], score: str, model: str) -> None:
-    counts = [int(count) for count in curve]
-    values = {part: [scores[score][part] for scores in curve.values()] for part in ("median", "min", "max")}
-    color = COLORS[model]
-    axes.fill_between(counts, values["min"], values["max"], color=color, alpha=0.15, linewidth=0)
-    axes.plot(counts, values["median"], color=color, marker="o", markersize=3.5, label=MODELS[model].label)
-
-
-def _draw_published(axes: Axes, summary: Mapping[str, Any], score: str) -> None:
-    curves = {"mae": published.FIG2B_MAE, "constraint_error": published.FIG2B_CONSTRAINT_ERROR}.get(score, {})
-    for model, values in curves.items():
-        if model in summary["curves"]:
-            axes.plot(
-                list(values), list(values.values()), color=COLORS[model], linestyle="--", linewidth=1.0, alpha=0.8
-            )
+def draw_range(axes: Axes, values: Mapping[int, Mapping[str, float]], color: str, label: str) -> None:
+    """Count -> median and range over seeds: a line, and a band."""
+    least, middle, largest = ([each[part] for each in values.values()] for part in ("min", "median", "max"))
+    axes.fill_between(list(values), least, largest, color=color, alpha=0.15, linewidth=0)
+    axes.plot(list(values), middle, color=color, marker="o", markersize=3.5, label=label)
 
 
 ESTIMATES = (

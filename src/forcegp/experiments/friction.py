@@ -9,6 +9,7 @@ from typing_extensions import override
 
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
 from forcegp.evaluation.metrics import formatted, markdown_table, medians
+from forcegp.experiments.experiment import heading
 from forcegp.experiments.force_experiment import (
     LABELS,
     ForceExperiment,
@@ -17,31 +18,28 @@ from forcegp.experiments.force_experiment import (
     only_test,
     score_table,
     trial_name,
+    trials_on,
 )
 from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS, MODEL, load
 from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 
+JOINT_FORCES = "joint forces (the paper's)"
 TOOL = {
-    "joint forces (the paper's)": "joint",
+    JOINT_FORCES: "joint",
     "tool friction": "tool-friction",
     "tool forces on velocity and place": "tool-forces",
     "contact friction": "contact-friction",
     "load friction": "load-friction",
 }
 WITH_JOINTS = {
-    "joint forces (the paper's)": "joint",
+    JOINT_FORCES: "joint",
     "joint + tool friction": "joint-friction+tool-friction",
     "joint + contact friction": "joint-friction+contact-friction",
     "joint + load friction": "joint-friction+load-friction",
 }
-PRIORS = {
-    "viscous": TOOL,
-    "coulomb": TOOL,
-    "stribeck": TOOL,
-    "viscous-joints": WITH_JOINTS,
-    "stribeck-joints": WITH_JOINTS,
-}
+PRIORS = dict.fromkeys(("viscous", "coulomb", "stribeck"), TOOL)
+PRIORS |= dict.fromkeys(("viscous-joints", "stribeck-joints"), WITH_JOINTS)
 PICTURED = ("stribeck-joints", "joint + load friction")
 
 
@@ -64,9 +62,7 @@ class Friction(ForceExperiment):
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
         groups = {
-            LABELS[scenario]: {
-                trial["label"]: only_test(trial) for trial in summary["trials"] if trial["scenario"] == scenario
-            }
+            LABELS[scenario]: {trial["label"]: only_test(trial) for trial in trials_on(scenario, summary)}
             for scenario in ("stribeck", "stribeck-joints")
         }
         (pictured,) = [t for t in self.trials()[:: len(self.points)] if (t.scenario, t.label) == PICTURED]
@@ -91,8 +87,8 @@ class Friction(ForceExperiment):
             "of the last table."
         ]
         for scenario in PRIORS:
-            trials = [trial for trial in summary["trials"] if trial["scenario"] == scenario]
-            parts += [f"**{LABELS[scenario][0].upper()}{LABELS[scenario][1:]}**", score_table(trials, columns)]
+            trials = trials_on(scenario, summary)
+            parts += [heading(LABELS[scenario]), score_table(trials, columns)]
             curves = [
                 f"{trial['label']} {formatted(trial['curve_coverage_of_seeds'], 3)}"
                 for trial in trials
@@ -122,21 +118,13 @@ class Transfer(ForceExperiment):
     @override
     def trials(self) -> list[Trial]:
         return [
-            trial
+            Trial(label, scenario, priors[label], points, tests)
             for points in self.points
-            for trial in (
-                Trial("tool friction", "viscous", "tool-friction", points, SURFACES),
-                Trial("contact friction", "viscous", "contact-friction", points, SURFACES),
-                Trial("joint forces (the paper's)", "viscous", "joint", points, SURFACES),
-                Trial(
-                    "joint + tool friction",
-                    "viscous-joints",
-                    "joint-friction+tool-friction",
-                    points,
-                    SURFACES_AND_JOINTS,
-                ),
-                Trial("joint forces (the paper's)", "viscous-joints", "joint", points, SURFACES_AND_JOINTS),
+            for scenario, priors, tests, labels in (
+                ("viscous", TOOL, SURFACES, ("tool friction", "contact friction", JOINT_FORCES)),
+                ("viscous-joints", WITH_JOINTS, SURFACES_AND_JOINTS, ("joint + tool friction", JOINT_FORCES)),
             )
+            for label in labels
         ]
 
     @override
@@ -146,28 +134,24 @@ class Transfer(ForceExperiment):
             "against noise-free accelerations [rad/s²], and in brackets how many times as large as on the plane "
             "(ratio of medians)."
         ]
-        for scenario, tests, heading in (
+        for scenario, tests, title in (
             ("viscous", SURFACES, "Viscous friction at the tool"),
             ("viscous-joints", SURFACES_AND_JOINTS, "Viscous friction at the tool, Stribeck friction in the joints"),
         ):
             rows = []
-            for trial in summary["trials"]:
-                if trial["scenario"] == scenario:
-                    home = trial["tests"]["plane"]["mae_noise_free"]
-                    errors = [trial["tests"][label]["mae_noise_free"] for label in tests]
-                    cells = [f"{formatted(error)} [{error['median'] / home['median']:.2f}]" for error in errors]
-                    rows.append([trial["label"], str(trial["points"]), *cells])
-            parts += [f"**{heading}**", markdown_table(["model", "points", *tests], rows)]
+            for trial in trials_on(scenario, summary):
+                home = trial["tests"]["plane"]["mae_noise_free"]
+                errors = [trial["tests"][label]["mae_noise_free"] for label in tests]
+                cells = [f"{formatted(error)} [{error['median'] / home['median']:.2f}]" for error in errors]
+                rows.append([trial["label"], str(trial["points"]), *cells])
+            parts += [f"**{title}**", markdown_table(["model", "points", *tests], rows)]
         return "\n\n".join(parts)
 
 
 MODELS = {
     "known physics alone": KNOWN_PHYSICS,
     "independent GP": BLACK_BOX,
-    "joint forces (the paper's)": "joint",
-    "tool friction": "tool-friction",
-    "contact friction": "contact-friction",
-    "load friction": "load-friction",
+    **{label: TOOL[label] for label in (JOINT_FORCES, "tool friction", "contact friction", "load friction")},
 }
 
 
@@ -190,14 +174,11 @@ class UnilateralContact(ForceExperiment):
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
         columns = ("mae", "mae_noise_free", "mae_touching", "mae_in_the_air", "coverage_95", "normal_force_error")
-        return "\n\n".join(
-            [
-                "PyBullet's unilateral contact with Coulomb friction, from which the tool lifts now and then: "
-                f"{formatted(summary['in_contact_truth'], 3)} of the rows are in contact, "
-                f"{formatted(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
-                f"accelerations alone (`forcegp.data.rows_in_contact`); models are trained on these. "
-                f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
-                "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.",
-                score_table(summary["trials"], columns),
-            ]
-        )
+        return (
+            "PyBullet's unilateral contact with Coulomb friction, from which the tool lifts now and then: "
+            f"{formatted(summary['in_contact_truth'], 3)} of the rows are in contact, "
+            f"{formatted(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
+            f"accelerations alone (`forcegp.data.rows_in_contact`); models are trained on these. "
+            f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
+            "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.\n\n"
+        ) + score_table(summary["trials"], columns)
