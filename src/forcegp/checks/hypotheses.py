@@ -181,7 +181,7 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
                 seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
                 "for radians.",
                 remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
-                joints=tuple(inputs.names[joint] for joint in _places(turned)),
+                joints=inputs.named(_places(turned)),
             )
             correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from forcegp.data import Dataset
 
@@ -49,6 +49,11 @@ def move_on(dataset: Dataset) -> bool:
     return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
+def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
+    """First rows of all runs of True, and the rows after them."""
+    return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)
+
+
 def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
     """Where a signal is exactly 0 between values far from 0: it was not measured, or lost on its way."""
     values = getattr(dataset, name)
@@ -60,13 +65,11 @@ def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         usual = max(
             JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max())
         )
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], x == 0.0, [False]]).astype(int)))
-        runs = edges.reshape(-1, 2)
-        into, out = runs[:, 0] - 1, runs[:, 1] - 1  # the steps that lead into a run of zeros, and out of it
-        inner = (into >= 0) & (out < len(steps))
-        runs, into, out = runs[inner], into[inner], out[inner]
+        zeros = runs(x == 0.0)
+        zeros = zeros[(zeros[:, 0] > 0) & (zeros[:, 1] <= len(steps))]
+        into, out = zeros.T - 1  # the steps that lead into a run of zeros, and out of it
         sudden = (steps[into] > usual) & (steps[out] > usual) & follows[into] & follows[out]
-        for start, stop in runs[sudden] if sudden.sum() >= FEWEST_DROPS else []:
+        for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
 

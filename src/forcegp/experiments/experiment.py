@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
@@ -86,6 +87,12 @@ class Experiment(ABC):
     def config(self) -> dict[str, Any]:
         """The configuration as plain JSON values."""
         return dataclasses.asdict(self)
+
+
+def stored_arrays(results: JobStore, job: str, file: str) -> dict[str, np.ndarray]:
+    """The arrays that a job kept in an npz file."""
+    with np.load(results.place(job) / file) as stored:
+        return dict(stored)
 
 
 def heading(label: str) -> str:

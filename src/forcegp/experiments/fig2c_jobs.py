@@ -55,8 +55,7 @@ def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
     train = training_rows(results, spec["data"], spec["points"])
     true = _values(train.system)
     posterior = _fitted(train, {**spec, "model": "s-gp", "mean": "analytical"})
-    values = {NAMES[name]: value for name, value in _identification(posterior).values.items()}
-    error = {name: values[name] - true[name] for name in values}
+    error = {NAMES[name]: value - true[NAMES[name]] for name, value in _identification(posterior).values.items()}
     search = {"iterations": len(posterior.result.history) - 1, "converged": posterior.result.converged}
     return {"error": error, **search, **_uncertainty(posterior)}
 
@@ -92,8 +91,8 @@ def _mae(posterior: StructuredPosterior, test: Dataset) -> float:
 def _uncertainty(posterior: StructuredPosterior) -> dict[str, Any]:
     """Standard errors by parameter (None where infinite), and a sentence about what cannot be identified."""
     identification = _identification(posterior)
-    errors = {NAMES[name]: value for name, value in identification.standard_errors.items()}
-    std = {name: value if math.isfinite(value) else None for name, value in errors.items()}
+    errors = identification.standard_errors
+    std = {NAMES[name]: value if math.isfinite(value) else None for name, value in errors.items()}
     return {"std": std, "verdict": identification.verdict.replace(f"{TOOL_LINK}.", "")}
 
 

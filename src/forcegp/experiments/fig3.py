@@ -12,7 +12,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.metrics import interval_coverage, number
 from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import Experiment, Row, model_table
+from forcegp.experiments.experiment import Experiment, Row, model_table, stored_arrays
 from forcegp.experiments.figures import prediction_window_figure
 from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
@@ -62,10 +62,7 @@ class Fig3(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        arrays = {}
-        for model in self.models:
-            with np.load(results.place(self._name(model)) / ARRAYS) as stored:
-                arrays[model] = dict(stored)
+        arrays = {model: stored_arrays(results, self._name(model), ARRAYS) for model in self.models}
         return {"fig3": prediction_window_figure(arrays)}
 
     @override

@@ -90,15 +90,13 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
     for axes, (name, title, bound) in zip(panels, ESTIMATES, strict=True):
         for model, means in summary["traces"].items():
             for mean, trace in means.items():
-                values = [abs(value) for value in trace[name]]
-                label = f"{ESTIMATING_MODELS[model]} {MEANS[mean]}"
-                axes.plot(values, color=COLORS[model], linestyle=LINES[mean], linewidth=1.4, label=label)
+                style = {"color": COLORS[model], "linestyle": LINES[mean], "linewidth": 1.4}
+                axes.plot(np.abs(trace[name]), label=f"{ESTIMATING_MODELS[model]} {MEANS[mean]}", **style)
         if bound is not None:
             axes.axhline(bound, color=QUIET, linewidth=0.8)
         for model, values in published.FIG2C.items():
             points = values.get(name, {})
-            errors = [abs(value) for value in points.values()]
-            axes.plot(list(points), errors, "x", color=COLORS[model], markersize=6)
+            axes.plot(list(points), np.abs(list(points.values())), "x", color=COLORS[model], markersize=6)
         axes.set_yscale("log")
         axes.set_xscale("symlog", linthresh=10)
         axes.set_xlim(0, 450)
@@ -169,19 +167,16 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
     return figure
 
 
-Arrays = Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]
 TITLES = {
     "baumgarte": "with Baumgarte (black boxes: none)",
     "none": "not stabilised",
     "projected": "projecting integrator",
 }
-
-
 MOST_DRAWN = 300
 """Points of a curve, about: more than the eye sees would make megabytes of vector graphics."""
 
 
-def rollouts_figure(arrays: Arrays, title: str) -> Figure:
+def rollouts_figure(arrays: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]], title: str) -> Figure:
     """Joint error above (diverged: infinite), distance from the surface below (of those that have not diverged)."""
     figure = new_figure(11.0, 6.0)
     figure.suptitle(title, fontsize=LARGE, x=0.01, ha="left")
