@@ -72,21 +72,11 @@ def listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-GAP = 5.0
-"""Median steps without a row at which a motion is taken for two."""
-
-COMPARED = 0.5
-"""Of the cut-off: where torques are compared."""
-
-LONGEST_TRIM = 0.1
-"""Most that is trimmed from either end, as a share of the shortest stretch."""
-
-MOST_ROWS = 1000
-"""Rows on which torques are compared: neighbouring rows hold the same information."""
-
-QUICK_ROWS = 300
-"""The same before a fit."""
-
+GAP = 5.0  # median steps without a row at which a motion is taken for two
+COMPARED = 0.5  # of the cut-off: where torques are compared
+LONGEST_TRIM = 0.1  # most that is trimmed from either end, as a share of the shortest stretch
+MOST_ROWS = 1000  # rows on which torques are compared: neighbouring rows hold the same information
+QUICK_ROWS = 300  # the same before a fit
 HALF_CUTOFF = COMPARED**2.5
 """Noise of an acceleration that is differenced twice, after a filter at half the cut-off, relative to that before."""
 

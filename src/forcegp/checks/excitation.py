@@ -10,17 +10,12 @@ from forcegp.checks.check_input import CheckInput, Finding, listed, look, ok, pl
 from forcegp.checks.successive_rows import white_noise
 from forcegp.errors import InvalidInput
 
-MUCH = 0.2
-"""Noise relative to the spread of the signal from which a filter is worth its name."""
+MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
 
 
-STATED_OFF = 3.0
-"""Factor either way between stated and seen noise of the acceleration that is reported."""
-
+STATED_OFF = 3.0  # factor either way between stated and seen noise of the acceleration that is reported
 FAR_OFF = 10.0
-
-LARGE_TORQUE = 0.5
-"""Noise times M, relative to the spread of the torque."""
+LARGE_TORQUE = 0.5  # noise times M, relative to the spread of the torque
 
 
 def stated_noise_findings(inputs: CheckInput) -> Iterator[Finding]:
@@ -140,19 +135,12 @@ def numbers_of(values: Sequence[float | None]) -> np.ndarray:
     return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
-WELL = 100.0
-"""Condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)."""
-
+WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)
 BADLY = 1000.0
-HYSTERESIS = 0.1
-"""Of the root mean square velocity, beyond which a sign counts."""
-
+HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
 FEWEST_CHANGES = 2
-HELD = 0.02
-"""Range of a joint in one stretch, relative to its largest, below which it was held there."""
-
-STILL = {True: 0.02, False: 0.002}
-"""Range in rad or m below which a joint does not move."""
+HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
+STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
 
 
 def excitation_findings(inputs: CheckInput) -> Iterator[Finding]:

@@ -26,30 +26,19 @@ from forcegp.checks.torques import (
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
-SMALLEST = 1e-3
-"""Unexplained shares below this are all the same: a log fits."""
-
+SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
 GAIN = np.log(4.0)
 """What a correction must explain: the product over all joints of what remains falls by this factor at least."""
 
-STILL_UNEXPLAINED = 0.6
-"""A joint of which more remains even then has not been explained."""
-
-EXPLAINED = 0.1
-"""Where no more than this remains in any joint there is nothing to explain."""
-
+STILL_UNEXPLAINED = 0.6  # a joint of which more remains even then has not been explained
+EXPLAINED = 0.1  # where no more than this remains in any joint there is nothing to explain
 MAX_CORRECTIONS = 4
-ALL_TRIED = 3
-"""Joints up to which the motion of every one is tried in other directions and places."""
-
+ALL_TRIED = 3  # joints up to which the motion of every one is tried in other directions and places
 GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
 """Gear ratios that are tried."""
 
-NEARLY = 3.0
-"""Factor either way that wrong masses explain."""
-
-TILTED = np.deg2rad(15.0)
-"""Angle from which a direction of gravity is reported."""
+NEARLY = 3.0  # factor either way that wrong masses explain
+TILTED = np.deg2rad(15.0)  # angle from which a direction of gravity is reported
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

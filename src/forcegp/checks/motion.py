@@ -15,18 +15,10 @@ from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.filtering import JITTER
 
-LOST = 1.8
-"""Median steps at which at least one sample is missing."""
-
-MUCH_LOST = 0.01
-"""Share of the time in gaps that is a reason to look at the logger."""
-
-LITTLE_LOST = 1e-4
-"""Share that every logger loses."""
-
-VERY_UNEVEN = 2.0
-"""Deviation of a step from the median, relative to it: samples were lost."""
-
+LOST = 1.8  # median steps at which at least one sample is missing
+MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
+LITTLE_LOST = 1e-4  # share that every logger loses
+VERY_UNEVEN = 2.0  # deviation of a step from the median, relative to it: samples were lost
 OFTEN_REPEATED = 0.02
 """Share of rows that repeat the one before while the robot moves, which a logger without new values leaves."""
 
@@ -143,21 +135,12 @@ FACTORS = {
 }
 """Ratios of v to dq/dt, and the unit of v that explains each."""
 
-CLOSE = 0.05
-"""Deviation from one of them, or from 1, that noise and filters explain."""
-
-UNEXPLAINED = 0.3
-"""Share of the power of v that dq/dt may leave unexplained, at the best factor and shift."""
-
-FEW = 0.05
-"""Share below which a factor is meant seriously."""
-
-ROUNDING = 1e-20
-"""Of the mean square velocity of all joints."""
-
+CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
+UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
+FEW = 0.05  # share below which a factor is meant seriously
+ROUNDING = 1e-20  # of the mean square velocity of all joints
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
-LEAST_SHIFT = 1.2
-"""Time steps by which v must be late or early to be reported."""
+LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
 
 
 def motion_findings(inputs: CheckInput) -> list[Finding]:

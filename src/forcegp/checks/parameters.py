@@ -18,21 +18,13 @@ from forcegp.checks.torques import inverse_dynamics, turning_speed, with_gravity
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
-GAIN = np.log(2.5)
-"""By which the product over the joints of what remains unexplained must fall."""
-
-FLOOR = 1e-5
-"""Share of a torque's power below which everything is explained."""
-
-NOISE = 3.0
-"""How much of the power of the noise is left to every explanation."""
-
+GAIN = np.log(2.5)  # by which the product over the joints of what remains unexplained must fall
+FLOOR = 1e-5  # share of a torque's power below which everything is explained
+NOISE = 3.0  # how much of the power of the noise is left to every explanation
 FEWEST_ROWS = 30
 STANDARD_GRAVITY = 9.81  # m/s^2
 NO_GRAVITY = 0.05
-FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))
-"""Values that are tried for a factor."""
-
+FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))  # values that are tried for a factor
 REMEDY = "Correct the URDF, or the unit of the signal; or let forcegp identify estimate it from this log."
 
 

@@ -11,23 +11,14 @@ from forcegp.data import Dataset
 JUMP = 10.0
 """A signal that is not measured jumps to 0 by more than so many of the steps that nine of ten rows stay below."""
 
-LEAST_JUMP = 0.02
-"""And by more than this share of its range."""
-
+LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
-
-LEAP = 0.3
-"""Median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)."""
-
-FEW_JOINTS = 3
-"""Of more joints, half as many rows."""
-
+LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
+FEW_JOINTS = 3  # of more joints, half as many rows
 STRETCHES, STRETCH_ROWS = 3, 400
 """How many stretches of how many rows are looked at before a fit, where a log is longer."""
 
-MOTION = 1.5
-"""Ratio of noise as seen by third and by fourth differences above which they see motion instead."""
-
+MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
 FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
 
 SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15

@@ -10,25 +10,16 @@ from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH
 from forcegp.errors import DatasetError
 
-NO_WORSE = 2.0
-"""Factor by which more may remain without a rotor inertia."""
-
-ROUGHLY = 1.5
-"""Factor either way that wrong inertias explain."""
-
-FAR = 3.0
-MUCH_MORE = 30.0
-"""Factors that they do not: less torque than bodies need cannot be; more may be the inertia of a rotor."""
-
-SAME = 0.1
-"""Spread of factors of joints that share a unit."""
-
+NO_WORSE = 2.0  # factor by which more may remain without a rotor inertia
+ROUGHLY = 1.5  # factor either way that wrong inertias explain
+FAR, MUCH_MORE = (
+    3.0,
+    30.0,
+)  # factors that they do not: less torque than bodies need cannot be; more may be the inertia of a rotor
+SAME = 0.1  # spread of factors of joints that share a unit
 UNEXPLAINED = 0.5
-LEAST_DELAY = 0.75
-"""Time steps below which a delay is not reported."""
-
-MUCH = 0.5
-"""A delay that leaves less of what was unexplained is wrong to leave in."""
+LEAST_DELAY = 0.75  # time steps below which a delay is not reported
+MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 
 
 def torque_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:

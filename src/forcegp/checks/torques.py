@@ -15,13 +15,10 @@ from scipy.optimize import nnls
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
-CONSTANT = 1e-24
-"""Variance relative to the square below which a torque is constant: rounding."""
-
+CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding
 RESTS_ON_ROBOT = 0.5
 POOR = 0.2
-SLOW = 0.1
-"""Of the root mean square velocity: where dry friction turns over."""
+SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -157,8 +154,7 @@ class _JointFit:
         return self.columns @ solution[:4] + solution[4]
 
 
-UNSEEN = 1e-3
-"""Singular values below this fraction of the largest belong to directions that no torque shows."""
+UNSEEN = 1e-3  # singular values below this fraction of the largest belong to directions that no torque shows
 
 
 def estimated_gravity(

@@ -10,11 +10,8 @@ from forcegp.jobs import Job, JobStore
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
-SIMULATION_COST = 0.1
-"""CPU seconds per simulated second, about."""
-
-TEST_SEED = 1000
-"""The test trajectory of seed k has seed k + 1000: other way-points, another noise."""
+SIMULATION_COST = 0.1  # CPU seconds per simulated second, about
+TEST_SEED = 1000  # the test trajectory of seed k has seed k + 1000: other way-points, another noise
 
 
 def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float, every: int) -> Job:

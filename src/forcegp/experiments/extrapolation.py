@@ -18,8 +18,7 @@ TASKS = "forcegp.experiments.extrapolation_jobs"
 _fit_name = "extrapolation/{}/{}/seed{}".format  # region, model, seed
 _scale_name = "extrapolation/scale/seed{}".format
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
-OUTSIDE = {"nlpd": 1, "coverage_95": 3, "constraint_error": 4}
-"""Further scores of the page, and their decimals."""
+OUTSIDE = {"nlpd": 1, "coverage_95": 3, "constraint_error": 4}  # further scores of the page, and their decimals
 
 TARGETS = {
     "acceleration": "the acceleration a, which the GP learns [rad/s²]",

@@ -16,9 +16,7 @@ from forcegp.experiments.fits import MODEL, fitted, search_report
 from forcegp.jobs import JobStore
 from forcegp.models import save_posterior
 
-TRAIN_X, TEST_X = 0.0, 0.1
-"""Training rows have their tool at x below the first, test rows above the second [m]."""
-
+TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first, test rows above the second [m]
 REGIONS = {"place": "other half of the table", "place-and-speed": "other half and faster"}
 SIDES = ("inside", "outside")
 

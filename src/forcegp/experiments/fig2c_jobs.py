@@ -20,13 +20,8 @@ from forcegp.simulation.kuka_motion import TOOL_LINK
 
 MODELS = {"s-gp": "S-GP", "analytical": "analytical model"}
 MEANS = {"analytical": "with Q_K", "zero": "without Q_K"}
-MASS_BOUND, CENTER_BOUND = 0.02, 1e-3
-"""Errors that count as found [kg, m]."""
-
-MASS_OFFSET = 0.5
-CENTER_OFFSET = (0.05, 0.05, -0.03)
-"""How wrong the start is [kg, m]."""
-
+MASS_BOUND, CENTER_BOUND = 0.02, 1e-3  # errors that count as found [kg, m]
+MASS_OFFSET, CENTER_OFFSET = 0.5, (0.05, 0.05, -0.03)  # how wrong the start is [kg, m]
 PRIORS = {"s-gp": JointForces(), "analytical": NoForces()}
 NAMES = {f"{TOOL_LINK}.{name}": name for name in ("mass", "com.x", "com.y", "com.z")}
 

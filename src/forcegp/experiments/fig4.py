@@ -21,8 +21,7 @@ TASKS = "forcegp.experiments.fig4_jobs"
 _name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed
 _truth_name = "fig4/truth/seed{}".format
 BLACK_BOXES = ("gp", "neural-network")
-WITHOUT_CONSTRAINT = ("none", "projected")
-"""Variants of models without a constraint, and so cannot be stabilised by it."""
+WITHOUT_CONSTRAINT = ("none", "projected")  # variants of models without a constraint, and so cannot be stabilised by it
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,9 @@ from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models import load_posterior
 
-BAUMGARTE = Baumgarte(10.0, 1.0)
-"""As in the paper, K = 100 and D = 20, and as in the simulation itself."""
-
-OFFSET = 1e-3
-"""How far off the surface the displaced motions begin [m]."""
-
-FREQUENCY = 20.0
-"""Natural frequency of the feedback [rad/s], critically damped; the simulated controller has 100."""
-
+BAUMGARTE = Baumgarte(10.0, 1.0)  # as in the paper, K = 100 and D = 20, and as in the simulation itself
+OFFSET = 1e-3  # how far off the surface the displaced motions begin [m]
+FREQUENCY = 20.0  # natural frequency of the feedback [rad/s], critically damped; the simulated controller has 100
 PERTURBATIONS = (1e-8, 1e-6, 1e-4)
 """Standard deviation of what is added to the initial positions of the true dynamics [rad]."""
 

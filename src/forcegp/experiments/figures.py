@@ -172,8 +172,7 @@ TITLES = {
     "none": "not stabilised",
     "projected": "projecting integrator",
 }
-MOST_DRAWN = 300
-"""Points of a curve, about: more than the eye sees would make megabytes of vector graphics."""
+MOST_DRAWN = 300  # points of a curve, about: more than the eye sees would make megabytes of vector graphics
 
 
 def rollouts_figure(arrays: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]], title: str) -> Figure:

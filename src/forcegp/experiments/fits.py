@@ -29,8 +29,7 @@ from forcegp.models import (
 from forcegp.priors import JointAccelerations, NoForces
 from forcegp.simulation.kuka_motion import TOOL_LINK
 
-START_FRICTION = 0.1
-"""Where the estimation of the joints' viscous friction begins [Nms/rad]."""
+START_FRICTION = 0.1  # where the estimation of the joints' viscous friction begins [Nms/rad]
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,7 @@ NETWORKS = ("neural-network", "ensemble")
 ANALYTICAL = ("analytical", "analytical-fitted")
 
 
-MODEL = "model"
-"""The folder of the fitted model inside its job."""
+MODEL = "model"  # the folder of the fitted model inside its job
 
 
 @dataclass(frozen=True)

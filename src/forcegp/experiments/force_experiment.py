@@ -39,9 +39,7 @@ _SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 SCENARIOS = {name: fields for name, (_, fields) in _SCENARIOS.items()}
 """Name -> fields of `KukaSurfaceConfig`."""
 
-LABELS = {name: label for name, (label, _) in _SCENARIOS.items()}
-"""What pages call them."""
-
+LABELS = {name: label for name, (label, _) in _SCENARIOS.items()}  # what pages call them
 TASKS = "forcegp.experiments.force_jobs"
 
 

@@ -125,9 +125,7 @@ class Page:
 
 PAPER_PAGE = Page("reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
 FORCES_PAGE = Page("force-priors", "Force priors: results", FORCES_INTRODUCTION)
-
-TRIAL_PRESETS = ("smoke", "forces-smoke")
-"""Presets that test the machinery; their numbers mean nothing for the models."""
+TRIAL_PRESETS = ("smoke", "forces-smoke")  # presets that test the machinery; their numbers mean nothing for the models
 
 
 def page_of(preset: str) -> Page:
