@@ -77,9 +77,7 @@ COMPARED = 0.5  # of the cut-off: where torques are compared
 LONGEST_TRIM = 0.1  # most that is trimmed from either end, as a share of the shortest stretch
 MOST_ROWS = 1000  # rows on which torques are compared: neighbouring rows hold the same information
 QUICK_ROWS = 300  # the same before a fit
-HALF_CUTOFF = COMPARED**2.5
-"""Noise of an acceleration that is differenced twice, after a filter at half the cut-off, relative to that before."""
-
+HALF_CUTOFF = COMPARED**2.5  # noise of an acceleration that is differenced twice, relative to that at the whole cut-off
 DEGREE = np.pi / 180.0
 
 

@@ -27,16 +27,13 @@ from forcegp.data import Dataset
 from forcegp.robots import Robot
 
 SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
-GAIN = np.log(4.0)
-"""What a correction must explain: the product over all joints of what remains falls by this factor at least."""
-
+GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 STILL_UNEXPLAINED = 0.6  # a joint of which more remains even then has not been explained
 EXPLAINED = 0.1  # where no more than this remains in any joint there is nothing to explain
 MAX_CORRECTIONS = 4
 ALL_TRIED = 3  # joints up to which the motion of every one is tried in other directions and places
+# Gear ratios that are tried
 GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
-"""Gear ratios that are tried."""
-
 NEARLY = 3.0  # factor either way that wrong masses explain
 TILTED = np.deg2rad(15.0)  # angle from which a direction of gravity is reported
 

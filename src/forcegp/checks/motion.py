@@ -19,8 +19,7 @@ LOST = 1.8  # median steps at which at least one sample is missing
 MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
 LITTLE_LOST = 1e-4  # share that every logger loses
 VERY_UNEVEN = 2.0  # deviation of a step from the median, relative to it: samples were lost
-OFTEN_REPEATED = 0.02
-"""Share of rows that repeat the one before while the robot moves, which a logger without new values leaves."""
+OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
 
 
 def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:

@@ -11,17 +11,18 @@ from forcegp.data import Dataset
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
 ROUNDING = 1e-12  # of the largest value of any joint
-HELD_STEPS = 0.5
-"""Share of equal successive values from which on a signal is one that moves in steps, such as a held command."""
-
+HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
 CLIPPED_ROWS = 10
 TOLERANCE = 0.01  # of the range between limits, by which a position may exceed them: calibration
-COARSE = {"q": 1e-3, "v": 1e-2, "u": 1e-2}
-"""Resolution relative to the range that shows: in positions early, since they are differentiated twice."""
+COARSE = {
+    "q": 1e-3,
+    "v": 1e-2,
+    "u": 1e-2,
+}  # of the range, below which steps are no finding; positions are differentiated twice
 
 
 def signal_findings(inputs: CheckInput) -> list[Finding]:

@@ -8,21 +8,16 @@ from jaxtyping import Bool, Float, Int
 
 from forcegp.data import Dataset
 
-JUMP = 10.0
-"""A signal that is not measured jumps to 0 by more than so many of the steps that nine of ten rows stay below."""
-
+JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
 LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
 FEW_JOINTS = 3  # of more joints, half as many rows
-STRETCHES, STRETCH_ROWS = 3, 400
-"""How many stretches of how many rows are looked at before a fit, where a log is longer."""
-
+STRETCHES, STRETCH_ROWS = 3, 400  # of a log that are looked at before a fit, where it is longer
 MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
 FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
 
-SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15
-"""Length of the running mean that stands for a filter before a fit: SciPy's filters take half a second to import."""
+SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciPy's filters take half a second to import
 
 
 def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:

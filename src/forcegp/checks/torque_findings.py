@@ -12,10 +12,7 @@ from forcegp.errors import DatasetError
 
 NO_WORSE = 2.0  # factor by which more may remain without a rotor inertia
 ROUGHLY = 1.5  # factor either way that wrong inertias explain
-FAR, MUCH_MORE = (
-    3.0,
-    30.0,
-)  # factors that they do not: less torque than bodies need cannot be; more may be the inertia of a rotor
+FAR, MUCH_MORE = 3.0, 30.0  # that they do not: less torque than bodies need cannot be; more may be a rotor's inertia
 SAME = 0.1  # spread of factors of joints that share a unit
 UNEXPLAINED = 0.5
 LEAST_DELAY = 0.75  # time steps below which a delay is not reported

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import override
 
@@ -29,8 +29,7 @@ _overlap_name = "ablation/overlap/{}/seed{}".format
 class Ablation(Experiment):
     """Schedules of the search at `points[-1]` points, a low-pass filter, and test rows among the training rows."""
 
-    name: ClassVar[str] = "ablation"
-    title: ClassVar[str] = "What the paper leaves unclear, measured"
+    name, title = "ablation", "What the paper leaves unclear, measured"
 
     points: tuple[int, ...]
     seeds: tuple[int, ...]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
@@ -32,8 +32,7 @@ TARGETS = {
 class Extrapolation(Experiment):
     """Gaussian processes and analytical models on `points` rows, networks on all training rows of the region."""
 
-    name: ClassVar[str] = "extrapolation"
-    title: ClassVar[str] = "Extrapolation: the other half of the table, and faster"
+    name, title = "extrapolation", "Extrapolation: the other half of the table, and faster"
 
     points: int
     seeds: tuple[int, ...]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
@@ -40,8 +40,7 @@ DIGITS = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}
 class Fig2b(Experiment):
     """Every model on the first N farthest points of `seeds` trajectories; beyond `few_points`, on fewer seeds."""
 
-    name: ClassVar[str] = "fig2b"
-    title: ClassVar[str] = "Figure 2b: error against training points"
+    name, title = "fig2b", "Figure 2b: error against training points"
 
     points: tuple[int, ...]
     seeds: tuple[int, ...]

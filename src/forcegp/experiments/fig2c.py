@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
@@ -25,8 +25,7 @@ _estimate_name = "fig2c/estimate/seed{}".format
 class Fig2c(Experiment):
     """Traces at `points` points from one seed; estimates with standard errors at `points_interval` points."""
 
-    name: ClassVar[str] = "fig2c"
-    title: ClassVar[str] = "Figure 2c: the tool's mass and centre of mass"
+    name, title = "fig2c", "Figure 2c: the tool's mass and centre of mass"
 
     points: int
     seed: int

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,8 +25,7 @@ ARRAYS = "prediction.npz"
 class Fig3(Experiment):
     """The first `points` rows of one seed, and `seconds` of its test trajectory from `start` on."""
 
-    name: ClassVar[str] = "fig3"
-    title: ClassVar[str] = "Figure 3: four models on the same three seconds"
+    name, title = "fig3", "Figure 3: four models on the same three seconds"
 
     points: tuple[int, ...]
     seed: int

@@ -4,7 +4,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -28,8 +28,7 @@ WITHOUT_CONSTRAINT = ("none", "projected")  # variants of models without a const
 class Fig4(Experiment):
     """`starts` initial states from the test trajectory of each seed, with its recorded torques, for `seconds`."""
 
-    name: ClassVar[str] = "fig4"
-    title: ClassVar[str] = "Figure 4: roll-outs"
+    name, title = "fig4", "Figure 4: roll-outs"
 
     points: tuple[int, ...]
     seeds: tuple[int, ...]

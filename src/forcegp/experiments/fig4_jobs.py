@@ -22,9 +22,7 @@ from forcegp.models import load_posterior
 BAUMGARTE = Baumgarte(10.0, 1.0)  # as in the paper, K = 100 and D = 20, and as in the simulation itself
 OFFSET = 1e-3  # how far off the surface the displaced motions begin [m]
 FREQUENCY = 20.0  # natural frequency of the feedback [rad/s], critically damped; the simulated controller has 100
-PERTURBATIONS = (1e-8, 1e-6, 1e-4)
-"""Standard deviation of what is added to the initial positions of the true dynamics [rad]."""
-
+PERTURBATIONS = (1e-8, 1e-6, 1e-4)  # of the true dynamics' initial positions: standard deviations [rad]
 ARRAYS = "rollout.npz"
 CONTROLS = {"open-loop": "recorded torques", "closed-loop": "recorded torques and feedback"}
 VARIANTS = {

@@ -112,10 +112,12 @@ def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
     figure = new_figure(10.0, 3.8)
     panels = figure.subplots(1, len(REGIONS), sharey=True, sharex=True)
     for axes, (region, label) in zip(panels, REGIONS.items(), strict=True):
-        models = summary["regions"][region]
-        for place, (model, scores) in enumerate(models.items()):
+        labels = {}
+        for place, (model, scores) in enumerate(summary["regions"][region].items()):
             _draw_model(axes, -place, scores, COLORS[model])
-        axes.set_yticks([-place for place in range(len(models))], [_label(model, models[model]) for model in models])
+            points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
+            labels[-place] = f"{MODELS[model].label} ({points})"
+        axes.set_yticks(list(labels), list(labels.values()))
         axes.set_xscale("log")
         quiet(axes, title=f"tested in the {label}", x="MAE against noise-free accelerations [rad/s²]")
         axes.tick_params(axis="y", length=0)
@@ -123,11 +125,6 @@ def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
     panels[0].plot([], [], "o", color=QUIET, label="outside")
     legend_below(figure, panels[0])
     return figure
-
-
-def _label(model: str, scores: Mapping[str, Any]) -> str:
-    points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
-    return f"{MODELS[model].label} ({points})"
 
 
 def _draw_model(axes: Axes, place: int, scores: Mapping[str, Any], color: str) -> None:

@@ -71,8 +71,6 @@ every joint are estimated by maximum likelihood. The level of the noise is learn
 GAUSSIAN_PROCESSES = ("gp", "s-gp-38", "s-gp", "s-gp-mean")
 NETWORKS = ("neural-network", "ensemble")
 ANALYTICAL = ("analytical", "analytical-fitted")
-
-
 MODEL = "model"  # the folder of the fitted model inside its job
 
 
@@ -108,14 +106,8 @@ def _at(steps: Mapping[str, Any], points: int) -> Any:
     return steps[str(max(int(key) for key in steps if int(key) <= points))]
 
 
-def fit_name(model: str, points: int, seed: int) -> str:
-    """Where the fit of this model to the first `points` rows of this seed's trajectory lies."""
-    return f"fits/{model}/seed{seed}/n{points}"
-
-
-def all_name(model: str, seed: int) -> str:
-    """Where the fit of this model to all training rows of this seed lies."""
-    return f"fits/{model}/seed{seed}/all"
+# Model, points and seed -> where the fit to the first rows of a trajectory lies; model and seed: that to all rows.
+fit_name, all_name = "fits/{0}/seed{2}/n{1}".format, "fits/{}/seed{}/all".format
 
 
 def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings: FitSettings) -> list[Job]:
@@ -176,11 +168,5 @@ def search_report(posterior: Any) -> dict[str, Any] | None:
     search = posterior.result
     if search is None:
         return None
-    return {
-        "objective": search.value,
-        "iterations": len(search.history) - 1,
-        "evaluations": search.evaluations,
-        "converged": search.converged,
-        "status": search.status,
-        "cpu_seconds": search.cpu_seconds,
-    }
+    same = {name: getattr(search, name) for name in ("evaluations", "converged", "status", "cpu_seconds")}
+    return {"objective": search.value, "iterations": len(search.history) - 1, **same}

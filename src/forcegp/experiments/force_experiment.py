@@ -148,9 +148,7 @@ class ForceExperiment(Experiment):
         return Job(f"force-data/{scenario}/{kind}/seed{seed}", f"{TASKS}:simulate", spec, cost=0.15 * spec["seconds"])
 
 
-def trial_name(trial: Trial, seed: int) -> str:
-    """Where the job of a trial lies."""
-    return f"force-fits/{trial.name}/seed{seed}"
+trial_name = "force-fits/{0.name}/seed{1}".format  # where the job of a trial and a seed lies
 
 
 COLUMNS = {

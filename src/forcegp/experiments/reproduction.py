@@ -14,7 +14,6 @@ from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
 from forcegp.experiments.ablation import Ablation
-from forcegp.experiments.data_efficiency import DataEfficiency, DeepKernel
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.extrapolation import Extrapolation
 from forcegp.experiments.fig2b import Fig2b
@@ -22,7 +21,7 @@ from forcegp.experiments.fig2c import Fig2c
 from forcegp.experiments.fig3 import Fig3
 from forcegp.experiments.fig4 import Fig4
 from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.friction import Friction, Transfer, UnilateralContact
+from forcegp.experiments.force_priors import DataEfficiency, DeepKernel, Friction, Transfer, UnilateralContact
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
 

@@ -98,9 +98,7 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])
-"""Euler angles (0, -pi, 0) as a quaternion (x, y, z, w): the tool points straight down."""
-
+TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])  # quaternion (x, y, z, w): the tool points straight down
 STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
