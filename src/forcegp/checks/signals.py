@@ -1,6 +1,7 @@
 """Does each channel carry a signal: constant and frozen channels, saturation, limits, resolution."""
 
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -27,10 +28,10 @@ COARSE = {
 
 def signal_findings(inputs: CheckInput) -> list[Finding]:
     """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
-    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs)]
-    for name in QUANTITY:
-        found += [finding for joint in range(inputs.log.nv) for finding in _frozen(inputs, name, joint)]
-    found += [finding for joint in range(inputs.log.nv) for finding in _clipped(inputs, joint)]
+    joints = range(inputs.log.nv)
+    frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
+    clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
+    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
     return [*found, *_limits(inputs), *_resolution(inputs)]
 
 
@@ -81,18 +82,13 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
         if not dead:
             continue
         names = inputs.named(dead)
-        all_passive = name == "u" and len(dead) == log.nv and not values.any()
-        seen = (
-            "no torque was logged at all (every u is 0)."
-            if all_passive
-            else f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
-        )
-        remedy = (
-            "Right for a passive mechanism; else the torque columns are missing."
-            if name == "u"
-            else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
-        )
+        seen = f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
+        remedy = "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         passive = name == "u" and not values[:, dead].any()
+        if name == "u":
+            remedy = "Right for a passive mechanism; else the torque columns are missing."
+        if passive and len(dead) == log.nv:
+            seen = "no torque was logged at all (every u is 0)."
         yield Finding(
             severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
             subject="constant channel",
@@ -188,7 +184,7 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
     upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
     bounds = {"q": (lower, upper)}
     for name, limit in (("v", "velocity_limit"), ("u", "effort_limit")):
-        size = np.array([getattr(joint, limit) for joint in joints])
+        size = np.array([getattr(joint, limit) for joint in joints], dtype=float)
         size[~(size > 0.0)] = np.inf  # a limit of 0 is a placeholder
         bounds[name] = (-size, size)
     for name, (low, high) in bounds.items():

@@ -166,15 +166,10 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
             u = commanded - config.joint_damping * v
             joint_torques = np.zeros(7) if joint_law is None else joint_law.force(v)
             forces = contact.step(arm, state, u + joint_torques)
-            row = {
-                "q": state.q,
-                "v": v,
-                "u": u,
-                "joint_torques": joint_torques,
-                "saturated": (commanded != asked).any(),
-            }
+            row = {"q": state.q, "v": v, "u": u, "joint_torques": joint_torques}
             row |= {"tool_force": forces.friction, "tool_torques": forces.joint_friction_torques}
             row |= {"multiplier": forces.normal_force, "in_contact": forces.acts, "gap": table.distance(state.position)}
+            row["saturated"] = (commanded != asked).any()
             if step == 0:
                 columns = {name: np.zeros((steps, *np.shape(x)), np.asarray(x).dtype) for name, x in row.items()}
             for name, value in row.items():
