@@ -17,7 +17,7 @@ from forcegp.experiments.force_experiment import (
     score_table,
     trial_name,
 )
-from forcegp.experiments.friction import Transfer, UnilateralContact
+from forcegp.experiments.force_priors import Transfer, UnilateralContact
 from forcegp.jobs import JobStore
 
 DATA = DataSettings(train_seconds=3.0, rows=50, test_seconds=2.0, every=5)

@@ -1,7 +1,7 @@
 """The log as every check sees it, and what a check found."""
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -72,24 +72,12 @@ def listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-GAP = 5.0
-"""Median steps without a row at which a motion is taken for two."""
-
-COMPARED = 0.5
-"""Of the cut-off: where torques are compared."""
-
-LONGEST_TRIM = 0.1
-"""Most that is trimmed from either end, as a share of the shortest stretch."""
-
-MOST_ROWS = 1000
-"""Rows on which torques are compared: neighbouring rows hold the same information."""
-
-QUICK_ROWS = 300
-"""The same before a fit."""
-
-HALF_CUTOFF = COMPARED**2.5
-"""Noise of an acceleration that is differenced twice, after a filter at half the cut-off, relative to that before."""
-
+GAP = 5.0  # median steps without a row at which a motion is taken for two
+COMPARED = 0.5  # of the cut-off: where torques are compared
+LONGEST_TRIM = 0.1  # most that is trimmed from either end, as a share of the shortest stretch
+MOST_ROWS = 1000  # rows on which torques are compared: neighbouring rows hold the same information
+QUICK_ROWS = 300  # the same before a fit
+HALF_CUTOFF = COMPARED**2.5  # noise of an acceleration that is differenced twice, relative to that at the whole cut-off
 DEGREE = np.pi / 180.0
 
 
@@ -128,8 +116,11 @@ class CheckInput:
     @property
     def rotates(self) -> Bool[np.ndarray, " nv"]:
         """Whether a joint turns; others slide."""
-        units = self.log.units["q"]
-        return np.array([unit == "rad" for unit in ([units] * self.log.nv if isinstance(units, str) else units)])
+        return _angular(self.log)
+
+    def named(self, joints: Iterable[int]) -> tuple[str, ...]:
+        """The names of the joints with these numbers."""
+        return tuple(self.names[joint] for joint in joints)
 
     def rows(self) -> Dataset:
         """Up to `most_rows` rows of `compared`, evenly over the log."""
@@ -149,11 +140,9 @@ class CheckInput:
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
-        system = dataset.system if system is None else system
-        dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
-        mended = mended_rows(dataset, dropped)
-        wraps, jumps = _leaps(mended)
-        even = _even(_unwrapped(mended, wraps), jumps)
+        mended, found = _mended(dataset)
+        jumps = found["jumps"]
+        even = _even(_unwrapped(mended, found["wraps"]), jumps)
         prepared = compared = None
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
@@ -165,62 +154,51 @@ class CheckInput:
             if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(_first(even)):
                 lower = COMPARED * float(applied)
                 compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
-        return cls(
-            log=dataset,
-            **_known(system),
-            even=even,
-            prepared=prepared,
-            compared=compared,
-            automatic=preparation.cutoff == "auto",
-            wraps=wraps,
-            jumps=jumps,
-            dropped=dropped,
-            mended=mended,
-            compared_noise=None if compared is None else np.nan_to_num(_filtered_noise(mended, prepared, compared)),
-        )
+        noise = None if compared is None else np.nan_to_num(_filtered_noise(mended, prepared, compared))
+        results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
+        return cls(**_known(dataset, system), **found, **results, mended=mended, automatic=preparation.cutoff == "auto")
 
     @classmethod
     def quick(cls, dataset: Dataset, system: MechanicalSystem | None) -> "CheckInput":
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
-        system = dataset.system if system is None else system
         if dataset.time_ordered and not move_on(dataset):
             dataset = replace(dataset, time_ordered=False)
-        dropped, mended = {}, dataset
-        even, prepared = dataset, None
-        wraps = jumps = np.zeros(dataset.q.shape, dtype=bool)
+        even, prepared, mended = dataset, None, dataset
+        nowhere = np.zeros(dataset.q.shape, dtype=bool)
+        found: dict[str, Any] = {"dropped": {}, "wraps": nowhere, "jumps": nowhere}
         compared: Dataset | None = dataset
         noise = dataset.noise_level
         if dataset.time_ordered:
-            dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
-            mended = mended_rows(dataset, dropped)
-            wraps, jumps = _leaps(mended)
-            compared = None if jumps.any() else smoothed(_unwrapped(mended, wraps))
+            mended, found = _mended(dataset)
+            jumps = found["jumps"]
+            compared = None if jumps.any() else smoothed(_unwrapped(mended, found["wraps"]))
             with contextlib.suppress(InvalidInput):
                 even = _even(few_stretches(mended if compared is None else compared), jumps)
                 prepared = None if compared is None else Preparation().apply(even)
             seen = None if compared is None else white_noise(mended, running_width(mended))
             noise = noise if seen is None else np.nan_to_num(seen)
-        return cls(
-            log=dataset,
-            **_known(system),
-            even=even,
-            prepared=prepared,
-            compared=compared,
-            automatic=False,
-            wraps=wraps,
-            jumps=jumps,
-            dropped=dropped,
-            mended=mended,
-            compared_noise=noise,
-            most_rows=QUICK_ROWS,
-        )
+        results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
+        how = {"automatic": False, "most_rows": QUICK_ROWS}
+        return cls(**_known(dataset, system), **found, **results, **how, mended=mended)
 
 
-def _known(system: MechanicalSystem | None) -> dict[str, Any]:
-    return {
-        "robot": None if system is None else system.robot,
-        "contacts": 0 if system is None else len(system.contacts),
-    }
+def _known(dataset: Dataset, system: MechanicalSystem | None) -> dict[str, Any]:
+    system = dataset.system if system is None else system
+    robot, contacts = (None, 0) if system is None else (system.robot, len(system.contacts))
+    return {"log": dataset, "robot": robot, "contacts": contacts}
+
+
+def _mended(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
+    """The log with its drop-outs interpolated, and where they, wraps and jumps are."""
+    dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
+    mended = mended_rows(dataset, dropped)
+    wraps, jumps = _leaps(mended)
+    return mended, {"dropped": dropped, "wraps": wraps, "jumps": jumps}
+
+
+def _angular(dataset: Dataset) -> np.ndarray:
+    units = dataset.units["q"]
+    return np.array([unit == "rad" for unit in ([units] * dataset.nv if isinstance(units, str) else units)])
 
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:
@@ -240,9 +218,7 @@ def _leaps(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     change = np.zeros_like(dataset.q)
     change[:-1] = np.diff(dataset.q, axis=0)
     change[~consecutive(dataset)] = 0.0
-    units = dataset.units["q"]
-    angular = np.array([unit == "rad" for unit in ([units] * dataset.nv if isinstance(units, str) else units)])
-    size = np.abs(change)
+    angular, size = _angular(dataset), np.abs(change)
     turn = (np.abs(size - 2.0 * np.pi) < 0.5) & angular
     return turn, (size > np.pi) & angular & ~turn
 

@@ -10,125 +10,108 @@ from forcegp.checks.check_input import CheckInput, Finding, listed, look, ok, pl
 from forcegp.checks.successive_rows import white_noise
 from forcegp.errors import InvalidInput
 
-MUCH = 0.2
-"""Noise relative to the spread of the signal from which a filter is worth its name."""
+MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
 
 
-STATED_OFF = 3.0
-"""Factor either way between stated and seen noise of the acceleration that is reported."""
-
+STATED_OFF = 3.0  # factor either way between stated and seen noise of the acceleration that is reported
 FAR_OFF = 10.0
-
-LARGE_TORQUE = 0.5
-"""Noise times M, relative to the spread of the torque."""
+LARGE_TORQUE = 0.5  # noise times M, relative to the spread of the torque
 
 
-def stated_noise_findings(inputs: CheckInput) -> list[Finding]:
+def stated_noise_findings(inputs: CheckInput) -> Iterator[Finding]:
     """`noise_std` against the noise that the acceleration of successive rows shows."""
     log = inputs.log
     stated, seen = log.noise_level, white_noise(log)
     if stated is None or seen is None:
-        return []
+        return
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = seen / stated
     off = np.flatnonzero((ratio > STATED_OFF) | (ratio < 1.0 / STATED_OFF))
     if not len(off):
-        return []
+        return
     joint = int(off[np.argmax(np.abs(np.log(ratio[off])))])
     small = ratio[joint] > 1.0
-    return [
-        Finding(
-            severity="wrong" if ratio[joint] > FAR_OFF else "look",
-            subject="noise_std",
-            seen=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
-            f"show noise of {seen[joint]:.3g}: {ratio[joint] if small else 1.0 / ratio[joint]:.3g} times as "
-            f"{'much' if small else 'little'}.",
-            remedy="Learn it (forcegp fit --noise learned), or state what was measured."
-            + ("" if small else " Noise that a filter made smooth does not show between rows: then leave it."),
-            joints=tuple(inputs.names[k] for k in off),
-            numbers={"stated": plain(stated), "seen": plain(seen)},
-        )
-    ]
+    yield Finding(
+        severity="wrong" if ratio[joint] > FAR_OFF else "look",
+        subject="noise_std",
+        seen=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
+        f"show noise of {seen[joint]:.3g}: {ratio[joint] if small else 1.0 / ratio[joint]:.3g} times as "
+        f"{'much' if small else 'little'}.",
+        remedy="Learn it (forcegp fit --noise learned), or state what was measured."
+        + ("" if small else " Noise that a filter made smooth does not show between rows: then leave it."),
+        joints=inputs.named(off),
+        numbers={"stated": plain(stated), "seen": plain(seen)},
+    )
 
 
-def noise_findings(inputs: CheckInput) -> list[Finding]:
+def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
     """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
     if inputs.prepared is None:
-        return []
+        return
     report = inputs.price
     cutoff = report.get("cutoff")
     measured = report.get("acceleration_noise", {})
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
-        return [ok(subject="noise", seen="the positions show no noise worth a filter.")]
+        yield ok(subject="noise", seen="the positions show no noise worth a filter.")
+        return
     before, after = (numbers_of(measured[when]) for when in ("before", "after"))
     spread = np.std(inputs.prepared.dataset.a, axis=0)
     why = "where the spectrum shows the end of the motion" if inputs.automatic else "as asked for"
     if report is not inputs.prepared.report:
         why = "when this dataset was prepared"
-    found = []
     if np.isfinite(after).any():
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
         unit = "rad/s²" if inputs.rotates[worst] else "m/s²"
-        found.append(
-            ok(
-                subject="noise",
-                seen=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
-                f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
-                numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
-            )
+        yield ok(
+            subject="noise",
+            seen=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
+            f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
+            numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
         )
     raw = "preparation" not in inputs.log.metadata
     with np.errstate(invalid="ignore"):
         loud = np.flatnonzero(before > MUCH * spread)
         left = np.flatnonzero(after > MUCH * spread)
     if raw and len(loud) and _measured_noise(inputs, loud):
-        names = tuple(inputs.names[joint] for joint in loud)
-        found.append(
-            look(
-                subject="noise",
-                seen=f"the acceleration in this dataset is not filtered: its noise is up to "
-                f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
-                remedy=f"forcegp prepare DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
-                joints=names,
-            )
+        yield look(
+            subject="noise",
+            seen=f"the acceleration in this dataset is not filtered: its noise is up to "
+            f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
+            remedy=f"forcegp prepare DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
+            joints=inputs.named(loud),
         )
-    found += _in_torques(inputs, after)
+    yield from _in_torques(inputs, after)
     if len(left):
-        names = tuple(inputs.names[joint] for joint in left)
-        found.append(
-            look(
-                subject="noise",
-                seen=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
-                f"{', '.join(names)}.",
-                remedy="Move faster, filter lower, or learn from torques instead of accelerations.",
-                joints=names,
-            )
+        names = inputs.named(left)
+        yield look(
+            subject="noise",
+            seen=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
+            f"{', '.join(names)}.",
+            remedy="Move faster, filter lower, or learn from torques instead of accelerations.",
+            joints=names,
         )
-    return found
 
 
-def _in_torques(inputs: CheckInput, after: np.ndarray) -> list[Finding]:
+def _in_torques(inputs: CheckInput, after: np.ndarray) -> Iterator[Finding]:
     """Noise of the acceleration that is as large as the torques when multiplied by M."""
     assert inputs.prepared is not None
     noise = torque_noise(inputs, after)
     if noise is None or inputs.contacts:
-        return []
+        return
     spread = np.std(inputs.prepared.dataset.u, axis=0)
     with np.errstate(invalid="ignore"):
         loud = np.flatnonzero((noise > LARGE_TORQUE * spread) & (spread > 0.0))
     if not len(loud):
-        return []
+        return
     text = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
-    return [
-        look(
-            subject="noise",
-            seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
-            remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "
-            "accelerations bears it.",
-            joints=tuple(inputs.names[joint] for joint in loud),
-            numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
-        )
-    ]
+    yield look(
+        subject="noise",
+        seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
+        remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "
+        "accelerations bears it.",
+        joints=inputs.named(loud),
+        numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
+    )
 
 
 def _measured_noise(inputs: CheckInput, joints: np.ndarray) -> bool:
@@ -152,25 +135,18 @@ def numbers_of(values: Sequence[float | None]) -> np.ndarray:
     return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
-WELL = 100.0
-"""Condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)."""
-
+WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)
 BADLY = 1000.0
-HYSTERESIS = 0.1
-"""Of the root mean square velocity, beyond which a sign counts."""
-
+HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
 FEWEST_CHANGES = 2
-HELD = 0.02
-"""Range of a joint in one stretch, relative to its largest, below which it was held there."""
-
-STILL = {True: 0.02, False: 0.002}
-"""Range in rad or m below which a joint does not move."""
+HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
+STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
 
 
-def excitation_findings(inputs: CheckInput) -> list[Finding]:
+def excitation_findings(inputs: CheckInput) -> Iterator[Finding]:
     """Joints that hardly move or never turn back, and how well base parameters are determined."""
     if inputs.prepared is None:
-        return []
+        return
     rows = inputs.prepared.dataset
     still, one_way, motions = [], [], []
     for joint, name in enumerate(inputs.names):
@@ -187,21 +163,15 @@ def excitation_findings(inputs: CheckInput) -> list[Finding]:
     whose = "its" if len(still) == 1 else "their"
     idle = f"moved less than 0.02 rad (2 mm): {whose} friction and inertia do not show."
     turned = "changed direction less than twice: friction of both directions cannot be separated from gravity."
-    found = [
-        look(
-            subject="excitation",
-            seen=f"{listed(joints)} {what}",
-            remedy=remedy,
-            joints=tuple(joints),
-            numbers={"joints": motions},
-        )
-        for joints, what, remedy in (
-            (still, idle, "Move every joint that is to be learned, or lock it in the robot (`locked`)."),
-            (one_way, turned, "Record motion to and fro."),
-        )
-        if joints
-    ]
-    return [*found, *_held(inputs, still), *_base_parameters(inputs)]
+    for joints, what, remedy in (
+        (still, idle, "Move every joint that is to be learned, or lock it in the robot (`locked`)."),
+        (one_way, turned, "Record motion to and fro."),
+    ):
+        if joints:
+            about = {"joints": tuple(joints), "numbers": {"joints": motions}}
+            yield look(subject="excitation", seen=f"{listed(joints)} {what}", remedy=remedy, **about)
+    yield from _held(inputs, still)
+    yield from _base_parameters(inputs)
 
 
 def _held(inputs: CheckInput, still: list[str]) -> Iterator[Finding]:
@@ -232,37 +202,26 @@ def _held(inputs: CheckInput, still: list[str]) -> Iterator[Finding]:
         )
 
 
-def _base_parameters(inputs: CheckInput) -> list[Finding]:
+def _base_parameters(inputs: CheckInput) -> Iterator[Finding]:
     if inputs.robot is None:
-        return []
+        return
     rows = inputs.rows()
     try:
         seen = excitation(inputs.robot, rows.q, rows.v, rows.a)
     except InvalidInput:  # nothing moves and nothing weighs
-        return []
+        return
     every = base_parameters(inputs.robot)
     numbers = {"condition": seen.condition, "seen": seen.rank, "base_parameters": every.rank}
     size = f"condition number {seen.condition:.3g} of {seen.rank} base parameters"
+    quality = "well excited" if seen.condition <= WELL else "usable" if seen.condition <= BADLY else "poorly excited"
+    size_and_quality, remedy = f"{size}: {quality} (below {WELL:g} is good).", ""
     if seen.rank < every.rank:
-        return [
-            look(
-                subject="excitation",
-                seen=f"{size}; {every.rank - seen.rank} more of this robot never show in this motion.",
-                remedy="Identify few parameters, or record a motion of all joints at once.",
-                numbers=numbers,
-            )
-        ]
-    severity = "ok" if seen.condition <= BADLY else "look"
-    quality = "well excited" if seen.condition <= WELL else "usable" if severity == "ok" else "poorly excited"
-    return [
-        Finding(
-            severity=severity,
-            subject="excitation",
-            seen=f"{size}: {quality} (below {WELL:g} is good).",
-            remedy=""
-            if severity == "ok"
-            else "Inertias of single links will be uncertain; record faster motion of all "
-            "joints at once, and keep the URDF's values where the data are not informative.",
-            numbers=numbers,
+        size_and_quality = f"{size}; {every.rank - seen.rank} more of this robot never show in this motion."
+        remedy = "Identify few parameters, or record a motion of all joints at once."
+    elif seen.condition > BADLY:
+        remedy = (
+            "Inertias of single links will be uncertain; record faster motion of all joints at once, and keep the "
+            "URDF's values where the data are not informative."
         )
-    ]
+    kind = look if remedy else ok
+    yield kind(subject="excitation", seen=size_and_quality, remedy=remedy, numbers=numbers)

@@ -6,6 +6,7 @@ leaves far less unexplained than the log as it is; then the next is sought, on t
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -25,30 +26,16 @@ from forcegp.checks.torques import (
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
-SMALLEST = 1e-3
-"""Unexplained shares below this are all the same: a log fits."""
-
-GAIN = np.log(4.0)
-"""What a correction must explain: the product over all joints of what remains falls by this factor at least."""
-
-STILL_UNEXPLAINED = 0.6
-"""A joint of which more remains even then has not been explained."""
-
-EXPLAINED = 0.1
-"""Where no more than this remains in any joint there is nothing to explain."""
-
+SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
+GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
+STILL_UNEXPLAINED = 0.6  # a joint of which more remains even then has not been explained
+EXPLAINED = 0.1  # where no more than this remains in any joint there is nothing to explain
 MAX_CORRECTIONS = 4
-ALL_TRIED = 3
-"""Joints up to which the motion of every one is tried in other directions and places."""
-
+ALL_TRIED = 3  # joints up to which the motion of every one is tried in other directions and places
+# Gear ratios that are tried
 GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
-"""Gear ratios that are tried."""
-
-NEARLY = 3.0
-"""Factor either way that wrong masses explain."""
-
-TILTED = np.deg2rad(15.0)
-"""Angle from which a direction of gravity is reported."""
+NEARLY = 3.0  # factor either way that wrong masses explain
+TILTED = np.deg2rad(15.0)  # angle from which a direction of gravity is reported
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,7 +71,8 @@ def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Finding]]:
     for _ in range(MAX_CORRECTIONS):
         if not np.nanmax(now.fit.unexplained, initial=0.0) > EXPLAINED:
             break
-        candidates = [*_candidates(now, given, inputs)]
+        tried = (_torque_signs, _torque_places, _motion_units, _motion_signs, _motion_places, _gravity)
+        candidates = chain.from_iterable(candidates(now, given, inputs) for candidates in tried)
         best = max(candidates, key=lambda other: now.score - other.score - other.cost, default=None)
         if best is None or now.score - best.score - best.cost < GAIN or not _explains(now, best):
             break
@@ -103,22 +91,13 @@ def _explains(now: Hypothesis, best: Hypothesis) -> bool:
     return better and bool((after[known] < np.maximum(2.0 * before[known], 0.1)).all())
 
 
-def _candidates(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
-    yield from _torque_signs(now, given, inputs.names)
-    yield from _torque_places(now, given, inputs.names)
-    yield from _motion_units(now, given, inputs)
-    yield from _motion_signs(now, given, inputs.names)
-    yield from _motion_places(now, given, inputs.names)
-    yield from _gravity(now, given)
-
-
 def _hypothesis(robot: Robot, correction: Correction, given: Dataset, **more: Any) -> Hypothesis:
     rows = correction.applied(given)
     tau = inverse_dynamics(robot, rows)
     return Hypothesis(robot=robot, correction=correction, rows=rows, tau=tau, fit=fit_torques(tau, rows), **more)
 
 
-def _torque_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _torque_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """All joints whose torque fits with the other sign, together."""
     other = fit_torques(now.tau, now.rows, -now.rows.u)
     with np.errstate(invalid="ignore"):
@@ -126,7 +105,7 @@ def _torque_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> It
         turned &= now.fit.unexplained > SMALLEST
     if not turned.any():
         return
-    joints = tuple(names[joint] for joint in np.flatnonzero(turned))
+    joints = inputs.named(_places(turned))
     finding = wrong(
         subject="torque sign",
         seen=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
@@ -135,34 +114,33 @@ def _torque_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> It
         "points the other way.",
         joints=joints,
     )
-    correction = now.correction.torque(np.arange(len(names)), np.where(turned, -1.0, 1.0))
+    correction = now.correction.torque(np.arange(given.nv), np.where(turned, -1.0, 1.0))
     yield _hypothesis(now.robot, correction, given, finding=finding, concerns=_places(turned))
 
 
-def _torque_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _torque_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """Torques in the places of other joints: the assignment that leaves least unexplained."""
-    places = np.arange(len(names))
+    names, nv = inputs.names, given.nv
 
     def unexplained(joint: int, column: int) -> float:
         rows = now.rows
         left = unexplained_share(now.tau[:, joint], rows.v[:, joint], rows.a[:, joint], rows.u[:, column])
         return float(np.log(np.clip(left, SMALLEST, 1.0))) if np.isfinite(left) else 0.0
 
-    nv = len(names)
     table = np.array([[unexplained(joint, column) for column in range(nv)] for joint in range(nv)])
     _, order = linear_sum_assignment(table)
-    moved = order != places
+    moved = order != np.arange(nv)
     if not moved.any():
         return
-    correction = now.correction.torque(order, np.ones(len(names)))
+    correction = now.correction.torque(order, np.ones(nv))
     better = _hypothesis(now.robot, correction, given, cost=0.5, concerns=_places(moved))
     text = ", ".join(f"that of {names[joint]} stands under {names[int(order[joint])]}" for joint in _places(moved))
     finding = wrong(
         subject="joints exchanged",
         seen=f"torques stand under wrong joints: {text} ({_remains(now.fit, better.fit, moved)}).",
         remedy="Correct the order of the torque columns.",
-        joints=tuple(names[joint] for joint in _places(moved)),
-        numbers={"order": [names[int(column)] for column in order]},
+        joints=inputs.named(_places(moved)),
+        numbers={"order": list(inputs.named(order))},
     )
     yield replace(better, finding=finding)
 
@@ -181,7 +159,7 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
                 seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
                 "for radians.",
                 remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
-                joints=tuple(inputs.names[joint] for joint in _places(turned)),
+                joints=inputs.named(_places(turned)),
             )
             correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)
@@ -203,10 +181,10 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
                 yield slower
 
 
-def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _motion_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """The motion of one joint, or all of that joint, in the other direction."""
-    places = np.arange(len(names))
-    for joint, name in enumerate(names):
+    places = np.arange(given.nv)
+    for joint, name in enumerate(inputs.names):
         if not _worth(now, joint):
             continue
         turned = np.where(places == joint, -1.0, 1.0)
@@ -224,36 +202,33 @@ def _motion_signs(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> It
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
 
 
-def _motion_places(now: Hypothesis, given: Dataset, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _motion_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """Two joints in each other's place: their motion, or all of them."""
-    ones = np.ones(len(names))
-    for one in range(len(names)):
-        for other in range(one + 1, len(names)):
-            if not _worth(now, one) or not _worth(now, other):
-                continue
-            order = np.arange(len(names))
-            order[[one, other]] = order[[other, one]]
-            motion = now.correction.motion(order, ones)
-            for what, correction in (("positions and velocities", motion), ("all signals", motion.torque(order, ones))):
-                finding = wrong(
-                    subject="joints exchanged",
-                    seen=f"{what} of {names[one]} and {names[other]} stand in each other's place.",
-                    remedy="Correct the order of the columns, or the joint names of the log.",
-                    joints=(names[one], names[other]),
-                )
-                yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
+    ones = np.ones(given.nv)
+    for one, other in combinations([joint for joint in range(given.nv) if _worth(now, joint)], 2):
+        order = np.arange(given.nv)
+        order[[one, other]] = order[[other, one]]
+        motion = now.correction.motion(order, ones)
+        for what, correction in (("positions and velocities", motion), ("all signals", motion.torque(order, ones))):
+            finding = wrong(
+                subject="joints exchanged",
+                seen=f"{what} of {listed(inputs.named((one, other)))} stand in each other's place.",
+                remedy="Correct the order of the columns, or the joint names of the log.",
+                joints=inputs.named((one, other)),
+            )
+            yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
 
 
-def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
+def _gravity(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """The direction of gravity that the torques show: along an axis of the base, or as estimated."""
     nominal = now.robot.gravity.cpu().numpy()
     size = float(np.linalg.norm(nominal))
     estimated = estimated_gravity(now.robot, now.rows, now.tau, now.fit)
     if estimated is None or size == 0.0:
         return
-    directions = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
-    directions.append(estimated / np.linalg.norm(estimated))
-    for index, direction in enumerate(directions):
+    directions = [(sign * axis, 1.0) for axis in np.eye(3) for sign in (1.0, -1.0)]
+    directions.append((estimated / np.linalg.norm(estimated), 1.5))  # a base along its axes is the likelier one
+    for direction, cost in directions:
         angle = float(np.arccos(np.clip(direction @ nominal / size, -1.0, 1.0)))
         if angle < TILTED:
             continue
@@ -266,7 +241,6 @@ def _gravity(now: Hypothesis, given: Dataset) -> Iterator[Hypothesis]:
             remedy=f"Give `gravity`={text.replace(' ', '')}.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
-        cost = 1.5 if index == len(directions) - 1 else 1.0  # a base along its axes is the likelier one
         yield _hypothesis(with_gravity(now.robot, gravity), now.correction, given, finding=finding, cost=cost)
 
 

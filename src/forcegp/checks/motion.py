@@ -1,7 +1,7 @@
 """Are the rows even in time, and do q, v and a belong to each other."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,87 +15,70 @@ from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.filtering import JITTER
 
-LOST = 1.8
-"""Median steps at which at least one sample is missing."""
-
-MUCH_LOST = 0.01
-"""Share of the time in gaps that is a reason to look at the logger."""
-
-LITTLE_LOST = 1e-4
-"""Share that every logger loses."""
-
-VERY_UNEVEN = 2.0
-"""Deviation of a step from the median, relative to it: samples were lost."""
-
-OFTEN_REPEATED = 0.02
-"""Share of rows that repeat the one before while the robot moves, which a logger without new values leaves."""
+LOST = 1.8  # median steps at which at least one sample is missing
+MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
+LITTLE_LOST = 1e-4  # share that every logger loses
+VERY_UNEVEN = 2.0  # deviation of a step from the median, relative to it: samples were lost
+OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
 
 
-def sampling_findings(inputs: CheckInput) -> list[Finding]:
+def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:
     """Rate and duration; jitter; lost samples and gaps; repeated rows; what importing had to mend."""
     log = inputs.log
     steps = np.diff(log.time)[consecutive(log)[:-1]]
     if not len(steps):
-        return []
+        return
     median = float(np.median(steps))
     count = len(log.episodes)
     each = f"{count} episodes" if count > 1 else "one episode"
     seconds = float(steps.sum())
-    numbers = {"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)}
-    found = [
-        ok(
-            subject="sampling",
-            seen=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
-            numbers=numbers,
-        )
-    ]
-    found += _lost(inputs, steps, median)
+    yield ok(
+        subject="sampling",
+        seen=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
+        numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
+    )
+    yield from _lost(inputs, steps, median)
     regular = steps[steps < LOST * median]
     spread = float(np.abs(regular - median).max()) / median
     if spread > JITTER:
-        found.append(
-            look(
-                subject="jitter",
-                seen=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
-                f"median {1e3 * median:.3g} ms.",
-                remedy="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
-                "(forcegp import does).",
-                numbers={"relative_deviation": spread},
-            )
+        yield look(
+            subject="jitter",
+            seen=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
+            f"median {1e3 * median:.3g} ms.",
+            remedy="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
+            "(forcegp import does).",
+            numbers={"relative_deviation": spread},
         )
-    found += _repeated(inputs)
+    yield from _repeated(inputs)
     with contextlib.suppress(AttributeError, TypeError, ValueError):  # somebody else's metadata
-        found += _imported(log.metadata)
-    return found
+        yield from _imported(log.metadata)
 
 
-def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> list[Finding]:
+def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Finding]:
     log = inputs.log
     long = steps > LOST * median
     if not long.any():
-        return []
+        return
     first_rows = np.flatnonzero(consecutive(log))
     worst = int(first_rows[np.argmax(steps)])
     lost = float((steps[long] - median).sum())
     share = lost / float(steps.sum())
     gaps = int((steps > GAP * median).sum())
-    return [
-        Finding(
-            severity="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
-            subject="lost samples",
-            seen=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
-            f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
-            + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
-            remedy=""
-            if share <= LITTLE_LOST and not gaps
-            else "A derivative across a gap is no acceleration: split the log there (forcegp import does), and look "
-            "why the logger loses samples.",
-            numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
-        )
-    ]
+    yield Finding(
+        severity="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
+        subject="lost samples",
+        seen=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
+        f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
+        + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
+        remedy=""
+        if share <= LITTLE_LOST and not gaps
+        else "A derivative across a gap is no acceleration: split the log there (forcegp import does), and look "
+        "why the logger loses samples.",
+        numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
+    )
 
 
-def _repeated(inputs: CheckInput) -> list[Finding]:
+def _repeated(inputs: CheckInput) -> Iterator[Finding]:
     """Rows in which every position is that of the row before although velocities show that the robot moves."""
     log = inputs.log
     follows = consecutive(log)[:-1]
@@ -104,24 +87,22 @@ def _repeated(inputs: CheckInput) -> list[Finding]:
     moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
     share = float((same & moves).sum() / max(1, (moves & follows).sum()))
     if share < OFTEN_REPEATED:
-        return []
+        return
     row = int(np.flatnonzero(same & moves)[0]) + 1
-    return [
-        look(
-            subject="repeated rows",
-            seen=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
-            f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",
-            remedy="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
-            numbers={"share": share, "row": row},
-        )
-    ]
+    yield look(
+        subject="repeated rows",
+        seen=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
+        f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",
+        remedy="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
+        numbers={"share": share, "row": row},
+    )
 
 
-def _imported(metadata: Mapping[str, Any]) -> list[Finding]:
+def _imported(metadata: Mapping[str, Any]) -> Iterator[Finding]:
     """What `forcegp import` found in the log files and repaired, from `metadata["import"]`."""
     report = metadata.get("import")
     if not isinstance(report, Mapping) or not report.get("recordings"):
-        return []
+        return
     logs = report["recordings"]
     repeated = sum(item.get("repeated_stamps_dropped", 0) for item in logs)
     gaps = sum(len(item.get("gaps", ())) for item in logs)
@@ -131,17 +112,15 @@ def _imported(metadata: Mapping[str, Any]) -> list[Finding]:
     if report.get("resampled_to_step") is not None and uneven > JITTER:
         met.append(f"time steps up to {100.0 * uneven:.0f} % off their median (resampled)")
     if not met:
-        return []
+        return
     often = gaps > 0 or repeated > 0 or uneven > VERY_UNEVEN
-    return [
-        Finding(
-            severity="look" if often else "ok",
-            subject="import",
-            seen=f"importing {'the log' if len(logs) == 1 else f'{len(logs)} logs'} met {', '.join(met)}.",
-            remedy="Nothing is left to do in this dataset; look at the logger." if often else "",
-            numbers={"repeated_stamps": repeated, "gaps": gaps, "largest_deviation_of_a_step": uneven},
-        )
-    ]
+    yield Finding(
+        severity="look" if often else "ok",
+        subject="import",
+        seen=f"importing {'the log' if len(logs) == 1 else f'{len(logs)} logs'} met {', '.join(met)}.",
+        remedy="Nothing is left to do in this dataset; look at the logger." if often else "",
+        numbers={"repeated_stamps": repeated, "gaps": gaps, "largest_deviation_of_a_step": uneven},
+    )
 
 
 RPM = np.pi / 30.0
@@ -155,21 +134,12 @@ FACTORS = {
 }
 """Ratios of v to dq/dt, and the unit of v that explains each."""
 
-CLOSE = 0.05
-"""Deviation from one of them, or from 1, that noise and filters explain."""
-
-UNEXPLAINED = 0.3
-"""Share of the power of v that dq/dt may leave unexplained, at the best factor and shift."""
-
-FEW = 0.05
-"""Share below which a factor is meant seriously."""
-
-ROUNDING = 1e-20
-"""Of the mean square velocity of all joints."""
-
+CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
+UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
+FEW = 0.05  # share below which a factor is meant seriously
+ROUNDING = 1e-20  # of the mean square velocity of all joints
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
-LEAST_SHIFT = 1.2
-"""Time steps by which v must be late or early to be reported."""
+LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
 
 
 def motion_findings(inputs: CheckInput) -> list[Finding]:
@@ -185,20 +155,14 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
     for name, source, what, derivative in (("v", "q", "velocity", "dq/dt"), ("a", "v", "acceleration", "dv/dt")):
         if name == "a" and any(finding.severity != "ok" for finding in found):
             break  # of wrong velocities nothing better can come
-        fits = [_compared(pieces, name, source, joint) for joint in range(even.nv)]
-        findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in enumerate(fits)]
+        compared = ((joint, _compared(pieces, name, source, joint)) for joint in range(even.nv))
+        fits = {joint: fit for joint, fit in compared if fit is not None}
+        findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in fits.items()]
         found += _merged([item for item in findings if item is not None], even.nv)
-        if not found and name == "v":
-            found_ok = [fit for fit in fits if fit is not None]
-            if found_ok:
-                error = max(unexplained for _, _, unexplained in found_ok)
-                found.append(
-                    ok(
-                        subject="velocity",
-                        seen=f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not).",
-                        numbers={"unexplained": error},
-                    )
-                )
+        if not found and fits and name == "v":
+            error = max(unexplained for _, _, unexplained in fits.values())
+            seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
+            found.append(ok(subject="velocity", seen=seen, numbers={"unexplained": error}))
     return found
 
 
@@ -209,35 +173,27 @@ def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tupl
         inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
         if inner.sum() < 3:
             continue
-        slope = differentiate(getattr(rows, source)[:, [joint]], rows.time)[:, 0]
-        late = CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None])
-        left.append(late)
-        right.append(slope[inner])
+        left.append(CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None]))
+        right.append(differentiate(getattr(rows, source)[:, [joint]], rows.time)[inner, 0])
     if not left:
         return None
     values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
     power = np.square(values).sum(axis=1)
-    least = (
-        ROUNDING
-        * max(max(float(np.square(getattr(rows, name)).mean()) for rows in pieces), float(np.square(slopes).mean()))
-        * len(slopes)
-    )
+    sizes = [float(np.square(getattr(rows, name)).mean()) for rows in pieces]
+    least = ROUNDING * max(*sizes, float(np.square(slopes).mean())) * len(slopes)
     if not np.square(slopes).sum() > least or not power.min() > least:
         return None  # a joint that stands still
     factor = values @ slopes / np.square(slopes).sum()
     unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
     best = int(np.argmin(unexplained))
-    shift = lowest(unexplained, SHIFTS)
-    return float(factor[best]), shift, float(max(0.0, unexplained[best]))
+    return float(factor[best]), lowest(unexplained, SHIFTS), float(max(0.0, unexplained[best]))
 
 
 def _finding(
-    inputs: CheckInput, fit: tuple[float, float, float] | None, joint: int, name: str, what: str, derivative: str
+    inputs: CheckInput, fit: tuple[float, float, float], joint: int, name: str, what: str, derivative: str
 ) -> Finding | None:
-    if fit is None:
-        return None
     factor, shift, unexplained = fit
-    label = inputs.names[joint]
+    label, source = inputs.names[joint], "q" if name == "v" else "v"
     numbers = {"quantity": name, "factor": factor, "delay": shift if np.isfinite(shift) else None}
     about = partial(Finding, subject=what, joints=(label,), numbers={**numbers, "unexplained": unexplained})
     if unexplained > UNEXPLAINED:
@@ -245,14 +201,13 @@ def _finding(
             severity="wrong" if name == "v" else "look",
             seen=f"the {what} of {label} is not {derivative}: {100.0 * unexplained:.0f} % of its power is something "
             "else.",
-            remedy=f"Check which column {name} was read from; or leave it out, so that it is computed from "
-            f"{'q' if name == 'v' else 'v'}.",
+            remedy=f"Check which column {name} was read from; or leave it out, so that it is computed from {source}.",
         )
     if unexplained < FEW and factor < 0.0:
         return about(
             severity="wrong",
             seen=f"the {what} of {label} has the opposite sign of {derivative} (factor {factor:.3g}).",
-            remedy=f"Turn the sign of {name} or of {'q' if name == 'v' else 'v'} for this joint, whichever is wrong.",
+            remedy=f"Turn the sign of {name} or of {source} for this joint, whichever is wrong.",
         )
     if unexplained < FEW and abs(factor - 1.0) > CLOSE:
         unit = next((unit for known, unit in FACTORS.items() if abs(factor / known - 1.0) < CLOSE), None)
@@ -260,7 +215,7 @@ def _finding(
         return about(
             severity="wrong" if abs(factor - 1.0) > 4 * CLOSE else "look",
             seen=f"the {what} of {label} is {factor:.4g} times {derivative}{guess}.",
-            remedy=f"Convert {name} or {'q' if name == 'v' else 'v'} to SI units, or remove the gear ratio.",
+            remedy=f"Convert {name} or {source} to SI units, or remove the gear ratio.",
         )
     step = float(np.median(np.diff(inputs.even.time)))
     if unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
@@ -284,18 +239,12 @@ def _merged(findings: list[Finding], nv: int) -> list[Finding]:
     merged = []
     for group in kinds.values():
         first = group[0]
-        if len(group) == 1:
-            merged.append(first)
-            continue
         joints = tuple(name for item in group for name in item.joints)
         every = len(joints) == nv and nv > 2
         seen = first.seen.replace(first.joints[0], "all joints" if every else listed(joints))
         factors = [item.numbers["factor"] for item in group]
         alike = max(factors) - min(factors) < CLOSE * abs(factors[0])
         each = "" if alike else f" Factors: {', '.join(f'{factor:.3g}' for factor in factors)}."
-        merged.append(
-            replace(
-                first, joints=joints, seen=f"{seen}{each}", numbers={"each": [dict(item.numbers) for item in group]}
-            )
-        )
+        numbers = {"each": [dict(item.numbers) for item in group]}
+        merged.append(replace(first, joints=joints, seen=f"{seen}{each}", numbers=numbers) if group[1:] else first)
     return merged

@@ -14,25 +14,17 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import Finding, look
-from forcegp.checks.torques import SLOW, inverse_dynamics, with_gravity
+from forcegp.checks.torques import inverse_dynamics, turning_speed, with_gravity
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
-GAIN = np.log(2.5)
-"""By which the product over the joints of what remains unexplained must fall."""
-
-FLOOR = 1e-5
-"""Share of a torque's power below which everything is explained."""
-
-NOISE = 3.0
-"""How much of the power of the noise is left to every explanation."""
-
+GAIN = np.log(2.5)  # by which the product over the joints of what remains unexplained must fall
+FLOOR = 1e-5  # share of a torque's power below which everything is explained
+NOISE = 3.0  # how much of the power of the noise is left to every explanation
 FEWEST_ROWS = 30
 STANDARD_GRAVITY = 9.81  # m/s^2
 NO_GRAVITY = 0.05
-FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))
-"""Values that are tried for a factor."""
-
+FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))  # values that are tried for a factor
 REMEDY = "Correct the URDF, or the unit of the signal; or let forcegp identify estimate it from this log."
 
 
@@ -54,10 +46,6 @@ class Variation:
     cost: float = 0.0
     joints: tuple[str, ...] = ()
 
-    def at(self, place: int) -> Float[np.ndarray, "rows nv"]:
-        """The torques at one of the values."""
-        return np.tensordot(self.weights[place], self.taus, 1)
-
 
 class Unexplained:
     """Power of each joint's torque that friction, a rotor and a constant leave, for many torques tau(x) at once.
@@ -66,11 +54,11 @@ class Unexplained:
     """
 
     def __init__(self, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> None:
-        slow = SLOW * np.sqrt(np.square(rows.v).mean(axis=0)) + 1e-12
         self.u, self.bases, self.rotors = rows.u, [], []
         for joint in range(rows.nv):
             v = rows.v[:, joint]
-            columns = np.stack([np.ones_like(v), v, np.tanh(v / slow[joint]), np.tanh(v / (5.0 * slow[joint]))], axis=1)
+            slow = turning_speed(v)
+            columns = np.stack([np.ones_like(v), v, np.tanh(v / slow), np.tanh(v / (5.0 * slow))], axis=1)
             basis = np.linalg.qr(columns)[0]
             rotor = rows.a[:, joint] - basis @ (basis.T @ rows.a[:, joint])
             self.bases.append(basis)
@@ -113,12 +101,15 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
         gains = (now - left.logarithms(variation.taus, variation.weights)).sum(axis=1) - variation.cost
         place = int(np.argmax(gains))
         options.append((float(gains[place]), float(variation.values[place]), variation))
-    gain, value, best = max(options, key=lambda option: option[0], default=(0.0, 0.0, None))
-    if best is None or gain < GAIN or abs(value - best.stated) < best.least:
+    options.sort(key=lambda option: -option[0])
+    if not options:
+        return []
+    gain, value, best = options[0]
+    if gain < GAIN or abs(value - best.stated) < best.least:
         return []
     others = {
         other.seen(1.0): other.seen(x)
-        for g, x, other in sorted(options, key=lambda option: -option[0])[1:3]
+        for g, x, other in options[1:3]
         if g > gain - np.log(1.5) and abs(x - other.stated) >= other.least
     }
     others.pop(best.seen(1.0), None)  # a mass with and without its inertia reads the same
@@ -148,23 +139,15 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
 
     # torque constants and masses
     for joint, name in enumerate(names):
+        text = (
+            f"the torque of {name} is {{:.3g}} times what the motion needs, that of the others is not (its torque "
+            "constant, gear ratio or unit)"
+        )
         kept = np.where(np.arange(len(names)) == joint, 0.0, tau)
-        yield factor(
-            "torque constant",
-            lambda x, name=name: (
-                f"the torque of {name} is {x:.3g} times what the motion needs, that of the "
-                "others is not (its torque constant, gear ratio or unit)"
-            ),
-            kept,
-            joints=(name,),
-        )
+        yield factor("torque constant", text.format, kept, joints=(name,))
     if len(names) > 1:
-        yield factor(
-            "masses",
-            lambda x: f"all torques fit {x:.3g} times the masses of the URDF (or the torque unit is another)",
-            0.0 * tau,
-            cost=-0.1,
-        )
+        text = "all torques fit {:.3g} times the masses of the URDF (or the torque unit is another)"
+        yield factor("masses", text.format, 0.0 * tau, cost=-0.1)
     for body, name in enumerate(names):
         link = robot.joints[body].child
         J = tree.inertias[body, :, :, 0]
@@ -174,12 +157,8 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
         for part in (J, J[3, 3] * torch.outer(center, center)):  # with its inertia, and the mass alone
             inertias = tree.inertias.clone()
             inertias[body, :, :, 0] -= part
-            yield factor(
-                "masses",
-                lambda x, link=link: f"the torques fit a mass of {link} of {x:.3g} times that of the URDF",
-                with_tree(inertias=inertias),
-                joints=(name,),
-            )
+            text = f"the torques fit a mass of {link} of {{:.3g}} times that of the URDF"
+            yield factor("masses", text.format, with_tree(inertias=inertias), joints=(name,))
     # lengths: of the joint's own origin, or of the whole link
     powers = np.array([0.5, 1.0, 2.0])
     quadratic = np.stack([FACTORS**0, FACTORS, FACTORS**2], axis=1) @ np.linalg.inv(
@@ -202,21 +181,15 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
                 else:
                     rest[body, :3, 3] *= x
                 taus.append(with_tree(rest=rest, inertias=inertias))
-            what = (
-                f"the length of {robot.joints[body].child}" if whole else f"the length from {name} to the joint before"
-            )
-            yield Variation(
-                subject="lengths",
-                seen=lambda x, what=what, whole=whole, length=length: (
-                    f"the torques fit {x:.3g} times {what}"
-                    + ("" if whole else f" ({x * length:.3g} instead of {length:.3g} m)")
-                ),
-                values=FACTORS,
-                weights=quadratic,
-                taus=np.stack(taus),
-                cost=0.2,
-                joints=(name,),
-            )
+
+            def seen(x: float, name: str = name, body: int = body, whole: bool = whole, length: float = length) -> str:
+                if whole:
+                    return f"the torques fit {x:.3g} times the length of {robot.joints[body].child}"
+                what = f"the length from {name} to the joint before ({x * length:.3g} instead of {length:.3g} m)"
+                return f"the torques fit {x:.3g} times {what}"
+
+            lengths = {"values": FACTORS, "weights": quadratic, "taus": np.stack(taus)}
+            yield Variation(subject="lengths", seen=seen, **lengths, cost=0.2, joints=(name,))
     yield from _zeros(robot, rows)
     yield from _gravity(robot, rows, tau)
 

@@ -1,5 +1,6 @@
 """`check`: one log against itself and its robot, as a list of findings that a person acts on."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,46 +28,37 @@ from forcegp.summary import Summary
 from forcegp.summary import listed as shortened
 
 
-def robot_findings(robot: Robot) -> list[Finding]:
+def robot_findings(robot: Robot) -> Iterator[Finding]:
     """Moving links without inertia, equal inertias, centres of mass and radii of gyration beyond the robot's reach."""
     moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
     heavy = [link for link in moving if link.mass > 0.0]
     reach = _reach(robot)
-    found = []
-    light = [link.name for link in moving if link.mass == 0.0]
-    alone = [name for name in light if name in {joint.child for joint in robot.joints}]
+    children = {joint.child for joint in robot.joints}
+    alone = [link.name for link in moving if link.mass == 0.0 and link.name in children]
     if alone:
-        found.append(
-            look(
-                subject="URDF",
-                seen=f"{listed(alone)} move with a joint of their own but have no mass.",
-                remedy="Add their <inertial>, or expect their inertia to be missing.",
-            )
+        yield look(
+            subject="URDF",
+            seen=f"{listed(alone)} move with a joint of their own but have no mass.",
+            remedy="Add their <inertial>, or expect their inertia to be missing.",
         )
     shapes = {(link.mass, link.inertia) for link in heavy}
     if len(heavy) > 2 and len(shapes) == 1:
-        found.append(
-            look(
-                subject="URDF",
-                seen=f"all {len(heavy)} moving links have the same mass and inertia ({heavy[0].mass:g} kg): a "
-                "placeholder.",
-                remedy="Use the manufacturer's URDF, or identify the inertias (forcegp identify).",
-            )
+        yield look(
+            subject="URDF",
+            seen=f"all {len(heavy)} moving links have the same mass and inertia ({heavy[0].mass:g} kg): a placeholder.",
+            remedy="Use the manufacturer's URDF, or identify the inertias (forcegp identify).",
         )
     for link in heavy:
         gyration = float(np.sqrt(np.linalg.eigvalsh(np.array(link.inertia)).max() / link.mass))
         center = float(np.linalg.norm(link.center_of_mass))
         if reach > 0.0 and (gyration > reach or center > 2.0 * reach):
-            found.append(
-                look(
-                    subject="URDF",
-                    seen=f"link {link.name} has a radius of gyration of {gyration:.3g} m and its centre of mass "
-                    f"{center:.3g} m from its joint; the whole robot reaches about {reach:.3g} m.",
-                    remedy="Check the units of this link (kg, m, kg m²).",
-                    numbers={"gyration": gyration, "center": center, "reach": reach},
-                )
+            yield look(
+                subject="URDF",
+                seen=f"link {link.name} has a radius of gyration of {gyration:.3g} m and its centre of mass "
+                f"{center:.3g} m from its joint; the whole robot reaches about {reach:.3g} m.",
+                remedy="Check the units of this link (kg, m, kg m²).",
+                numbers={"gyration": gyration, "center": center, "reach": reach},
             )
-    return found
 
 
 def _reach(robot: Robot) -> float:
@@ -132,15 +124,13 @@ class CheckReport(Summary):
         (see `forcegp.checks.torques`), the factor only where the torque rests on it; "noise_before" and "noise_after"
         the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
         """
-        nothing = [None] * self.inputs.log.nv
-        columns: dict[str, list[Any]] = {"joint": list(self.inputs.names)}
-        fit = None if self.comparison is None else self.comparison.fit
-        rows = None if self.comparison is None else self.comparison.rows
-        columns["unexplained"] = nothing if fit is None else plain(fit.unexplained)
-        columns["residual"] = nothing
-        if fit is not None and rows is not None:
-            columns["residual"] = plain(np.std(rows.u - fit.predicted, axis=0))
-        columns["factor"] = nothing if fit is None else plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
+        nothing: list[Any] = [None] * self.inputs.log.nv
+        columns = {"joint": list(self.inputs.names), "unexplained": nothing, "residual": nothing, "factor": nothing}
+        if self.comparison is not None:
+            fit = self.comparison.fit
+            columns["unexplained"] = plain(fit.unexplained)
+            columns["residual"] = plain(np.std(self.comparison.rows.u - fit.predicted, axis=0))
+            columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
         report = {} if self.inputs.prepared is None else self.inputs.price
         noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
         columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
@@ -211,16 +201,14 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
     findings += contacts
     comparison = None
     if inputs.compared is None:
-        return findings, comparison
+        return findings, None
     if inputs.robot is None or inputs.contacts:
-        return [*findings, not_compared(inputs)], comparison
+        return [*findings, not_compared(inputs)], None
     if inputs.log.u.any() and not contacts:
         comparison, corrections = best_hypothesis(inputs)
-        compared = torque_findings(inputs, comparison)
+        compared = list(torque_findings(inputs, comparison))
         noise = inputs.compared_noise
-        if noise is not None and not any(
-            each.subject == "torque unit" and each.severity == "wrong" for each in compared
-        ):
+        if noise is not None and ("torque unit", "wrong") not in {(each.subject, each.severity) for each in compared}:
             numbers = parameter_findings(comparison.robot, comparison.rows, noise)
             compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
         findings += [*corrections, *compared]

@@ -1,43 +1,37 @@
 """Does each channel carry a signal: constant and frozen channels, saturation, limits, resolution."""
 
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput, Finding, listed, look, wrong
-from forcegp.checks.successive_rows import consecutive
+from forcegp.checks.successive_rows import consecutive, runs
 from forcegp.data import Dataset
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
-ROUNDING = 1e-12
-"""Of the largest value of any joint."""
-
-HELD_STEPS = 0.5
-"""Share of equal successive values from which on a signal is one that moves in steps, such as a held command."""
-
+ROUNDING = 1e-12  # of the largest value of any joint
+HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
-MOVES = 0.2
-"""Of its root mean square speed, above which a joint moves."""
-
-CLIPPED_RATIO = 8.0
-"""Rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4."""
-
+MOVES = 0.2  # of its root mean square speed, above which a joint moves
+CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
 CLIPPED_ROWS = 10
-TOLERANCE = 0.01
-"""Of the range between limits, by which a position may exceed them: calibration."""
-
-COARSE = {"q": 1e-3, "v": 1e-2, "u": 1e-2}
-"""Resolution relative to the range that shows: in positions early, since they are differentiated twice."""
+TOLERANCE = 0.01  # of the range between limits, by which a position may exceed them: calibration
+COARSE = {
+    "q": 1e-3,
+    "v": 1e-2,
+    "u": 1e-2,
+}  # of the range, below which steps are no finding; positions are differentiated twice
 
 
 def signal_findings(inputs: CheckInput) -> list[Finding]:
     """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
-    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs)]
-    for name in QUANTITY:
-        found += [finding for joint in range(inputs.log.nv) for finding in _frozen(inputs, name, joint)]
-    found += [finding for joint in range(inputs.log.nv) for finding in _clipped(inputs, joint)]
+    joints = range(inputs.log.nv)
+    frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
+    clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
+    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
     return [*found, *_limits(inputs), *_resolution(inputs)]
 
 
@@ -55,7 +49,7 @@ def _leaps(inputs: CheckInput) -> Iterator[Finding]:
                 seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
                 f"({int(places.sum())} times in all).",
                 remedy=remedy,
-                joints=tuple(inputs.names[k] for k in np.flatnonzero(places.any(axis=0))),
+                joints=inputs.named(np.flatnonzero(places.any(axis=0))),
                 numbers={"row": row, "count": int(places.sum())},
             )
 
@@ -74,7 +68,7 @@ def _dropped(inputs: CheckInput) -> Iterator[Finding]:
         f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
         f"{inputs.log.time[first]:.3f} s.",
         remedy="They were not measured: leave these rows out, and look at the logger.",
-        joints=tuple(inputs.names[joint] for joint in np.flatnonzero(joints)),
+        joints=inputs.named(np.flatnonzero(joints)),
         numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
     )
 
@@ -87,19 +81,14 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
         dead = np.flatnonzero(still(log, name)).tolist()
         if not dead:
             continue
-        names = tuple(inputs.names[joint] for joint in dead)
-        all_passive = name == "u" and len(dead) == log.nv and not values.any()
-        seen = (
-            "no torque was logged at all (every u is 0)."
-            if all_passive
-            else f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
-        )
-        remedy = (
-            "Right for a passive mechanism; else the torque columns are missing."
-            if name == "u"
-            else "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
-        )
+        names = inputs.named(dead)
+        seen = f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
+        remedy = "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         passive = name == "u" and not values[:, dead].any()
+        if name == "u":
+            remedy = "Right for a passive mechanism; else the torque columns are missing."
+        if passive and len(dead) == log.nv:
+            seen = "no torque was logged at all (every u is 0)."
         yield Finding(
             severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
             subject="constant channel",
@@ -116,28 +105,16 @@ def still(log: Dataset, name: str) -> np.ndarray:
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
-def _runs(same: np.ndarray) -> tuple[int, int]:
-    """Start and length of the longest run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    if not len(edges):
-        return 0, 0
-    lengths = edges[1::2] - edges[::2]
-    longest = int(np.argmax(lengths))
-    return int(edges[2 * longest]), int(lengths[longest])
-
-
-def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
+def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Finding]:
     """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
     values = getattr(log, name)[:, joint]
     follows = consecutive(log)[:-1]
     held = np.diff(values) == 0
     if np.ptp(values) == 0.0 or (name == "u" and held.mean() > HELD_STEPS):
-        return []
-    others = np.zeros(len(log) - 1, dtype=bool)
-    for other in QUANTITY:
-        if other != name:
-            others |= np.diff(getattr(log, other)[:, joint]) != 0
+        return
+    changes = [np.diff(getattr(log, other)[:, joint]) != 0 for other in QUANTITY if other != name]
+    others = np.logical_or.reduce(changes)
     seconds = np.diff(log.time)
     step = float(np.median(seconds[follows]))
     # a velocity that stands still at rest is right, also where the position is noisy; a joint that sticks while its
@@ -146,33 +123,27 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> list[Finding]:
     moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], held & others & follows, [False]]).astype(int)))
     longest = (0, 0)
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in runs(held & others & follows):
         length = int(stop - start)
         if length > longest[1] and length >= FROZEN_ROWS and length * step >= FROZEN_SECONDS:
             gone = np.cumsum(speed[start:stop]) * step
             sticks = name == "q" and stop < len(held) and abs(values[stop + 1] - values[start]) < 0.5 * abs(gone[-1])
-            if (
-                moves[start:stop].mean() > 0.5
-                and np.ptp(gone) > 0.25 * np.abs(speed[start:stop]).sum() * step
-                and not sticks
-            ):
+            far = np.ptp(gone) > 0.25 * np.abs(speed[start:stop]).sum() * step
+            if moves[start:stop].mean() > 0.5 and far and not sticks:
                 longest = (int(start), length)
     start, length = longest
     if not length or values[start] in (values.min(), values.max()):
-        return []
-    return [
-        Finding(
-            severity="look" if name == "u" and values[start] == 0.0 else "wrong",
-            subject="frozen channel",
-            seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
-            f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-            remedy="Leave this stretch out, and look at the logger.",
-            joints=(inputs.names[joint],),
-            numbers={"quantity": name, "row": start, "seconds": length * step},
-        )
-    ]
+        return
+    yield Finding(
+        severity="look" if name == "u" and values[start] == 0.0 else "wrong",
+        subject="frozen channel",
+        seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
+        f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
+        remedy="Leave this stretch out, and look at the logger.",
+        joints=(inputs.names[joint],),
+        numbers={"quantity": name, "row": start, "seconds": length * step},
+    )
 
 
 def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
@@ -188,7 +159,9 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
         below = extreme - sign * u
         at = int((below <= 1e-9 * np.ptp(u)).sum())
         near = int(((below > 1e-9 * np.ptp(u)) & (below <= 1e-9 * np.ptp(u) + width)).sum())
-        start, length = _runs(np.abs(log.u[:, joint] - sign * extreme) <= 1e-9 * np.ptp(u))
+        extremes = runs(np.abs(log.u[:, joint] - sign * extreme) <= 1e-9 * np.ptp(u))
+        start, stop = max(extremes.tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
+        length = stop - start
         if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
             yield wrong(
                 subject="saturation",
@@ -210,11 +183,9 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
     lower = np.array([-np.inf if joint.type == "continuous" else joint.lower for joint in joints])
     upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
     bounds = {"q": (lower, upper)}
-    for name, limit in (
-        ("v", [joint.velocity_limit for joint in joints]),
-        ("u", [joint.effort_limit for joint in joints]),
-    ):
-        size = np.array([value if value > 0.0 else np.inf for value in limit])  # a limit of 0 is a placeholder
+    for name, limit in (("v", "velocity_limit"), ("u", "effort_limit")):
+        size = np.array([getattr(joint, limit) for joint in joints], dtype=float)
+        size[~(size > 0.0)] = np.inf  # a limit of 0 is a placeholder
         bounds[name] = (-size, size)
     for name, (low, high) in bounds.items():
         values = getattr(log, name)
@@ -223,7 +194,7 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
         if not (excess > 0.0).any():
             continue
         row, joint = (int(index) for index in np.unravel_index(np.argmax(excess), excess.shape))
-        beyond = tuple(inputs.names[k] for k in np.flatnonzero((excess > 0.0).any(axis=0)))
+        beyond = inputs.named(np.flatnonzero((excess > 0.0).any(axis=0)))
         others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
         unit = log.units[name] if isinstance(log.units[name], str) else log.units[name][joint]
         yield look(
@@ -241,7 +212,7 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
 def _resolution(inputs: CheckInput) -> Iterator[Finding]:
     """Channels with few different values, and how coarse they are against their range."""
     for name, quantity in QUANTITY.items():
-        quantized, joints, quanta = [], [], {}
+        quantized, quanta = [], {}
         for joint, label in enumerate(inputs.names):
             values = np.unique(getattr(inputs.log, name)[:, joint])
             if len(values) < 3 or len(values) > 0.2 * len(inputs.log):
@@ -251,13 +222,12 @@ def _resolution(inputs: CheckInput) -> Iterator[Finding]:
             if quantum < COARSE[name] * np.ptp(values):
                 continue
             quantized.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
-            joints.append(label)
             quanta[label] = quantum
         if quantized:
             yield look(
                 subject="resolution",
                 seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
                 remedy="Log more digits, or expect noise from this.",
-                joints=tuple(joints),
+                joints=tuple(quanta),
                 numbers={"quantity": name, "quantum": quanta},
             )

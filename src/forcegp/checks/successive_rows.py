@@ -4,34 +4,20 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from forcegp.data import Dataset
 
-JUMP = 10.0
-"""A signal that is not measured jumps to 0 by more than so many of the steps that nine of ten rows stay below."""
-
-LEAST_JUMP = 0.02
-"""And by more than this share of its range."""
-
+JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
+LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
-
-LEAP = 0.3
-"""Median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)."""
-
-FEW_JOINTS = 3
-"""Of more joints, half as many rows."""
-
-STRETCHES, STRETCH_ROWS = 3, 400
-"""How many stretches of how many rows are looked at before a fit, where a log is longer."""
-
-MOTION = 1.5
-"""Ratio of noise as seen by third and by fourth differences above which they see motion instead."""
-
+LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
+FEW_JOINTS = 3  # of more joints, half as many rows
+STRETCHES, STRETCH_ROWS = 3, 400  # of a log that are looked at before a fit, where it is longer
+MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
 FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
 
-SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15
-"""Length of the running mean that stands for a filter before a fit: SciPy's filters take half a second to import."""
+SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciPy's filters take half a second to import
 
 
 def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
@@ -49,6 +35,11 @@ def move_on(dataset: Dataset) -> bool:
     return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
+def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
+    """First rows of all runs of True, and the rows after them."""
+    return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)
+
+
 def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
     """Where a signal is exactly 0 between values far from 0: it was not measured, or lost on its way."""
     values = getattr(dataset, name)
@@ -60,13 +51,11 @@ def drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         usual = max(
             JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max())
         )
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], x == 0.0, [False]]).astype(int)))
-        runs = edges.reshape(-1, 2)
-        into, out = runs[:, 0] - 1, runs[:, 1] - 1  # the steps that lead into a run of zeros, and out of it
-        inner = (into >= 0) & (out < len(steps))
-        runs, into, out = runs[inner], into[inner], out[inner]
+        zeros = runs(x == 0.0)
+        zeros = zeros[(zeros[:, 0] > 0) & (zeros[:, 1] <= len(steps))]
+        into, out = zeros.T - 1  # the steps that lead into a run of zeros, and out of it
         sudden = (steps[into] > usual) & (steps[out] > usual) & follows[into] & follows[out]
-        for start, stop in runs[sudden] if sudden.sum() >= FEWEST_DROPS else []:
+        for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
 

@@ -1,84 +1,66 @@
 """Findings of the comparison of torques with inverse dynamics: factor, unit, delay, what is left."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, plain
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, look, ok, plain, wrong
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT, WORTH
 from forcegp.errors import DatasetError
 
-NO_WORSE = 2.0
-"""Factor by which more may remain without a rotor inertia."""
-
-ROUGHLY = 1.5
-"""Factor either way that wrong inertias explain."""
-
-FAR = 3.0
-MUCH_MORE = 30.0
-"""Factors that they do not: less torque than bodies need cannot be; more may be the inertia of a rotor."""
-
-SAME = 0.1
-"""Spread of factors of joints that share a unit."""
-
+NO_WORSE = 2.0  # factor by which more may remain without a rotor inertia
+ROUGHLY = 1.5  # factor either way that wrong inertias explain
+FAR, MUCH_MORE = 3.0, 30.0  # that they do not: less torque than bodies need cannot be; more may be a rotor's inertia
+SAME = 0.1  # spread of factors of joints that share a unit
 UNEXPLAINED = 0.5
-LEAST_DELAY = 0.75
-"""Time steps below which a delay is not reported."""
-
-MUCH = 0.5
-"""A delay that leaves less of what was unexplained is wrong to leave in."""
+LEAST_DELAY = 0.75  # time steps below which a delay is not reported
+MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 
 
-def torque_findings(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+def torque_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     """Factor and unit, delay, and what remains unexplained, of a log with the errors corrected that were found."""
-    found = [*_factors(inputs, log), *_passive(inputs, log), *_unexplained(inputs, log)]
-    return [*found, *_delays(inputs, log)]
+    for findings in (_factors, _passive, _unexplained, _delays):
+        yield from findings(inputs, log)
 
 
-def _factors(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+def _factors(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     """Torques that are a multiple of what the motion needs."""
     fit = log.fit
     with np.errstate(invalid="ignore"):
-        means = fit.rests_on_robot
-        means = means & (fit.plain < NO_WORSE * fit.unexplained + 0.02)  # else a rotor inertia is missing, not a factor
+        no_rotor = fit.plain < NO_WORSE * fit.unexplained + 0.02  # else a rotor inertia is missing, not a factor
+        means = fit.rests_on_robot & no_rotor
         ratio = np.where(means, np.maximum(fit.factor, 1.0 / np.maximum(fit.factor, 1e-300)), 1.0)
     off = np.flatnonzero(ratio > ROUGHLY)
     if not len(off):
-        return []
-    joints = tuple(inputs.names[joint] for joint in off)
+        return
+    joints = inputs.named(off)
     factors = fit.factor[off]
     common = float(np.exp(np.log(factors).mean()))
     alike = len(off) == int(means.sum()) and len(off) > 1 and np.ptp(np.log(factors)) < SAME
     each = ", ".join(f"{name} {value:.4g}" for name, value in zip(joints, factors, strict=True))
-    kilo = np.abs(np.log(factors / 1000.0)).max() < np.log(ROUGHLY)
-    milli = np.abs(np.log(factors * 1000.0)).max() < np.log(ROUGHLY)
-    if kilo or milli:
-        unit = "mNm" if kilo else "kNm"
-        seen = f"the measured torque of {listed(joints)} is {common:.4g} times what the motion needs: it looks like "
-        seen += f"{unit}."
-        remedy = f"Convert it (forcegp import --unit u={unit}, or a factor)."
-    else:
-        seen = f"the measured torque is a multiple of what the motion needs: {each}."
-        remedy = "One factor for all joints points to the unit of u or to wrong masses; compare with the data sheet."
-        if not alike:
-            remedy = (
-                "A factor that differs between joints points to torque before the gears (multiply by the gear ratio), "
-                "motor current (multiply by the torque constant), a rotor inertia that is missing, or wrong masses; "
-                "compare with the data sheet."
-            )
-    return [
-        Finding(
-            severity="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
-            subject="torque unit",
-            seen=seen,
-            remedy=remedy,
-            joints=joints,
-            numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
-        )
-    ]
+    seen = f"the measured torque is a multiple of what the motion needs: {each}."
+    remedy = (
+        "One factor for all joints points to the unit of u or to wrong masses; compare with the data sheet."
+        if alike
+        else "A factor that differs between joints points to torque before the gears (multiply by the gear ratio), "
+        "motor current (multiply by the torque constant), a rotor inertia that is missing, or wrong masses; "
+        "compare with the data sheet."
+    )
+    for unit, size in (("kNm", 1e-3), ("mNm", 1e3)):
+        if np.abs(np.log(factors / size)).max() < np.log(ROUGHLY):
+            what = f"the measured torque of {listed(joints)} is {common:.4g} times what the motion needs"
+            seen = f"{what}: it looks like {unit}."
+            remedy = f"Convert it (forcegp import --unit u={unit}, or a factor)."
+    yield Finding(
+        severity="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
+        subject="torque unit",
+        seen=seen,
+        remedy=remedy,
+        joints=joints,
+        numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
+    )
 
 
 def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
@@ -89,8 +71,7 @@ def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
             continue
         others = [np.std(log.tau[:, other]) for other in range(len(inputs.names)) if np.ptp(log.rows.u[:, other]) > 0]
         if np.std(tau) > 0.1 * max(others, default=np.inf):
-            yield Finding(
-                severity="wrong",
+            yield wrong(
                 subject="dead torque",
                 seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
                 f"{np.std(tau):.3g} {'Nm' if inputs.rotates[joint] else 'N'} rms.",
@@ -100,90 +81,78 @@ def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
             )
 
 
-def _unexplained(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+def _unexplained(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     """How well the torques fit at all."""
     left = log.fit.unexplained
     known = np.isfinite(left)
     if not known.any():
-        return []
+        return
     worst = int(np.nanargmax(left))
     bad = np.flatnonzero(known & (left > UNEXPLAINED))
-    what = (
-        f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance of a "
-    )
-    what += f"torque unexplained ({inputs.names[worst]})"
     if not len(bad):
-        return [Finding(severity="ok", subject="torque", seen=f"{what}.")]
-    shares = ", ".join(f"{inputs.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
-    return [
-        Finding(
-            severity="look",
-            subject="torque",
-            seen=f"most of some torques is not what inverse dynamics with a factor and friction gives: {shares} of "
-            "their variance.",
-            remedy="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
-            "nearly all friction or noise.",
-            joints=tuple(inputs.names[joint] for joint in bad),
-            numbers={"unexplained": plain(left[bad])},
+        seen = (
+            f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance "
         )
-    ]
+        yield ok(subject="torque", seen=f"{seen}of a torque unexplained ({inputs.names[worst]}).")
+        return
+    shares = ", ".join(f"{inputs.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
+    yield look(
+        subject="torque",
+        seen=f"most of some torques is not what inverse dynamics with a factor and friction gives: {shares} of "
+        "their variance.",
+        remedy="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
+        "nearly all friction or noise.",
+        joints=inputs.named(bad),
+        numbers={"unexplained": plain(left[bad])},
+    )
 
 
-def _delays(inputs: CheckInput, log: Hypothesis) -> list[Finding]:
+def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     assert inputs.compared is not None
     if inputs.prepared is None:
-        return []  # without an order
+        return  # without an order
     data = log.correction.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.compared)
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:
-        return []  # too short
+        return  # too short
     step = float(np.median(np.diff(inputs.even.time)))
-    found = []
     if delay.significant and abs(delay.common) > LEAST_DELAY * step:
-        found.append(_delay(inputs.names, delay, delay.common, delay.common_std, delay.remains))
+        yield _delay(inputs.names, delay, delay.common, delay.common_std, delay.remains)
     for joint, name in enumerate(inputs.names):
         own, std = float(delay.seconds[joint]), float(delay.std[joint])
         remains = float(delay.residual[1, joint] / max(delay.residual[0, joint], 1e-12))
         differs = abs(own - delay.significant) > max(SIGNIFICANT * std, 2.0 * step, 2e-3)
         worth = remains < min(WORTH, MUCH) and delay.residual[0, joint] > 1e-4
         if np.isfinite(own) and differs and worth and abs(own) > SIGNIFICANT * std:
-            found.append(_delay((name,), delay, own, std, remains))
-    return found
+            yield _delay((name,), delay, own, std, remains)
 
 
 def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, remains: float) -> Finding:
     one = len(names) == 1
-    numbers: dict[str, Any] = {"delay": seconds, "std": std, "remains": remains}
-    numbers["per_joint"] = plain(delay.seconds)
     late = "later" if seconds > 0.0 else "earlier"
     friction = " In a joint with much friction this can also be the friction's own lag." if one else ""
     return Finding(
         severity="wrong" if remains < MUCH and not one else "look",
         subject="delay",
         seen=f"the torque of {names[0] if one else 'all joints'} is logged {1e3 * abs(seconds):.1f} ms ± "
-        f"{1e3 * std:.1f} ms "
-        f"{late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained remains.{friction}",
+        f"{1e3 * std:.1f} ms {late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained "
+        f"remains.{friction}",
         remedy="If the other joints show none, leave it: shifting one joint can hide friction."
         if one
         else "forcegp prepare --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
         joints=names,
-        numbers=numbers,
+        numbers={"delay": seconds, "std": std, "remains": remains, "per_joint": plain(delay.seconds)},
     )
 
 
 def not_compared(inputs: CheckInput) -> Finding:
     """The finding where torques cannot be compared."""
     if inputs.contacts:
-        return Finding(
-            severity="ok",
+        return ok(
             subject="torque",
             seen="not compared with inverse dynamics: the robot touches something, and the forces of contacts are not "
             "known. Check a log of free motion, too.",
         )
-    return Finding(
-        severity="look",
-        subject="torque",
-        seen="not compared with inverse dynamics: no robot was given.",
-        remedy="Give the robot: `system`.",
-    )
+    seen = "not compared with inverse dynamics: no robot was given."
+    return look(subject="torque", seen=seen, remedy="Give the robot: `system`.")

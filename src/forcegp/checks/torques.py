@@ -15,13 +15,10 @@ from scipy.optimize import nnls
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
-CONSTANT = 1e-24
-"""Variance relative to the square below which a torque is constant: rounding."""
-
+CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding
 RESTS_ON_ROBOT = 0.5
 POOR = 0.2
-SLOW = 0.1
-"""Of the root mean square velocity: where dry friction turns over."""
+SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,9 +33,8 @@ class Correction:
     @classmethod
     def none(cls, nv: int) -> "Correction":
         """Everything stays."""
-        return cls(
-            motion_from=np.arange(nv), motion_factor=np.ones(nv), torque_from=np.arange(nv), torque_factor=np.ones(nv)
-        )
+        order, ones = np.arange(nv), np.ones(nv)
+        return cls(motion_from=order, motion_factor=ones, torque_from=order, torque_factor=ones)
 
     def motion(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> "Correction":
         """Then motions in another order, by further factors."""
@@ -88,6 +84,11 @@ class TorqueFit:
         return s * tau + armature * rows.a + viscous * rows.v + dry * np.tanh(rows.v / self.slow) + constant
 
 
+def turning_speed(v: Float[np.ndarray, " rows"]) -> float:
+    """The velocity at which dry friction turns over."""
+    return SLOW * float(np.sqrt(np.square(v).mean())) + 1e-12
+
+
 def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
     """Torques of the rigid bodies [Nm or N]."""
     with torch.no_grad():
@@ -113,13 +114,8 @@ def fit_torques(
     )
 
 
-def unexplained_share(
-    tau: Float[np.ndarray, " rows"],
-    v: Float[np.ndarray, " rows"],
-    a: Float[np.ndarray, " rows"],
-    u: Float[np.ndarray, " rows"],
-) -> float:
-    """Share of the variance of one torque that one joint's inverse dynamics and motion leave; NaN if u is constant."""
+def unexplained_share(tau: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> float:
+    """Share of the variance of one torque (rows,) that one joint's tau, v and a leave; NaN if u is constant."""
     return _JointFit(tau, v, a, u).solved((0, 1, 2, 3))[1]
 
 
@@ -127,7 +123,7 @@ class _JointFit:
     """One joint's torque and what may explain it; a free constant takes the means out of both sides."""
 
     def __init__(self, tau: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> None:
-        self.slow = SLOW * float(np.sqrt(np.square(v).mean())) + 1e-12
+        self.slow = turning_speed(v)
         self.columns = np.stack([tau, a, v, np.tanh(v / self.slow)], axis=1)
         self.centered = self.columns - self.columns.mean(axis=0)
         self.size = np.linalg.norm(self.centered, axis=0)
@@ -158,8 +154,7 @@ class _JointFit:
         return self.columns @ solution[:4] + solution[4]
 
 
-UNSEEN = 1e-3
-"""Singular values below this fraction of the largest belong to directions that no torque shows."""
+UNSEEN = 1e-3  # singular values below this fraction of the largest belong to directions that no torque shows
 
 
 def estimated_gravity(
@@ -178,8 +173,7 @@ def estimated_gravity(
     matrices, targets = [], []
     for joint in np.flatnonzero(np.isfinite(fit.unexplained)):
         v, a, u, pull = rows.v[:, joint], rows.a[:, joint], rows.u[:, joint], pulls[:, joint]
-        slow = SLOW * np.sqrt(np.square(v).mean()) + 1e-12
-        free = np.stack([tau[:, joint] - pull @ nominal, a, v, np.tanh(v / slow), np.ones_like(v)], axis=1)
+        free = np.stack([tau[:, joint] - pull @ nominal, a, v, np.tanh(v / turning_speed(v)), np.ones_like(v)], axis=1)
         basis = np.linalg.qr(free)[0]
         factor = fit.factor[joint] if fit.factor[joint] > 0.0 else 1.0
         weight = 1.0 / max(float(np.std(u)), 1e-12)

@@ -9,12 +9,11 @@ import torch
 
 from forcegp.data import farthest_rows, low_pass
 from forcegp.evaluation import evaluate
-from forcegp.experiments.data import scored_rows, training_rows
+from forcegp.experiments.data import scored_rows, simulated, training_rows
 from forcegp.experiments.fits import MODEL, MODELS
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.models import Noise, StructuredGP, load_posterior
-from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 PAPER_STEPS, PAPER_RATE = 500, 0.2
 SCHEDULES = {"maximum-likelihood": "L-BFGS, no hyperprior", "adam-ones": "Adam from ones"}
@@ -42,7 +41,7 @@ def search(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str
 
 def filtered(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """One model on accelerations that were low-pass filtered before the rows were chosen, with learned noise."""
-    everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
+    everything = simulated(spec["seed"], spec["train_seconds"])
     if spec["cutoff"] is not None:
         everything = low_pass(everything, spec["cutoff"], signals=("a",))
     train = farthest_rows(everything, spec["points"])
@@ -57,7 +56,7 @@ def filtered(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
 
 def overlap(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """A fit tested on a window of its own training trajectory, as the reference implementation does."""
-    everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
+    everything = simulated(spec["seed"], spec["train_seconds"])
     rows = min(WINDOW_ROWS * WINDOW_EVERY, len(everything))
     first = (len(everything) - rows) // 2
     window = everything.rows(slice(first, first + rows, WINDOW_EVERY))

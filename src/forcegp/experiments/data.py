@@ -10,11 +10,8 @@ from forcegp.jobs import Job, JobStore
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
-SIMULATION_COST = 0.1
-"""CPU seconds per simulated second, about."""
-
-TEST_SEED = 1000
-"""The test trajectory of seed k has seed k + 1000: other way-points, another noise."""
+SIMULATION_COST = 0.1  # CPU seconds per simulated second, about
+TEST_SEED = 1000  # the test trajectory of seed k has seed k + 1000: other way-points, another noise
 
 
 def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float, every: int) -> Job:
@@ -28,16 +25,26 @@ def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float,
     return Job(f"data/seed{seed}", "forcegp.experiments.data:simulate", spec, cost=cost)
 
 
+def simulated(seed: int, seconds: float, **scenario: Any) -> Dataset:
+    """One trajectory of `kuka-surface`."""
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=seconds, seed=seed, **scenario))
+
+
+def farthest(usable: Dataset, rows: int, seconds: float) -> Dataset:
+    """So many rows that lie far apart. Raises InvalidInput where there are fewer."""
+    if rows > len(usable):
+        raise InvalidInput(
+            f"{rows} training points are asked for, but {seconds:g} s of motion have {len(usable)} rows; ask for fewer "
+            "points or a longer recording."
+        )
+    return farthest_rows(usable, rows)
+
+
 def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Simulate both trajectories and keep them. Raises InvalidInput where more rows are wanted than there are."""
-    everything = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["train_seconds"], seed=spec["seed"]))
-    if spec["rows"] > len(everything):
-        raise InvalidInput(
-            f"{spec['rows']} training points are asked for, but {spec['train_seconds']:g} s of motion have "
-            f"{len(everything)} rows; ask for fewer points or a longer recording."
-        )
-    train = farthest_rows(everything, spec["rows"])
-    test = simulate_kuka_surface(KukaSurfaceConfig(seconds=spec["test_seconds"], seed=TEST_SEED + spec["seed"]))
+    everything = simulated(spec["seed"], spec["train_seconds"])
+    train = farthest(everything, spec["rows"], spec["train_seconds"])
+    test = simulated(TEST_SEED + spec["seed"], spec["test_seconds"])
     train.save(folder / TRAIN)
     test.save(folder / TEST)
     return {"train_rows_available": len(everything), "train_rows": len(train), "test_rows": len(test)}

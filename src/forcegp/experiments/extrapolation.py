@@ -2,20 +2,24 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, medians
-from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row, heading, model_table
 from forcegp.experiments.extrapolation_jobs import REGIONS, SIDES, TEST_X, TRAIN_X
 from forcegp.experiments.figures import extrapolation_figure
 from forcegp.experiments.fits import ANALYTICAL, GAUSSIAN_PROCESSES, MODELS, NETWORKS, FitSettings, fit_cost
 from forcegp.jobs import Job, JobStore
 
 TASKS = "forcegp.experiments.extrapolation_jobs"
+_fit_name = "extrapolation/{}/{}/seed{}".format  # region, model, seed
+_scale_name = "extrapolation/scale/seed{}".format
 SCORES = ("mae_noise_free", "mae", "nlpd", "coverage_95", "constraint_error")
+OUTSIDE = {"nlpd": 1, "coverage_95": 3, "constraint_error": 4}  # further scores of the page, and their decimals
+
 TARGETS = {
     "acceleration": "the acceleration a, which the GP learns [rad/s²]",
     "unconstrained_acceleration": "the acceleration without constraint, which S-GP [38] learns [rad/s²]",
@@ -28,8 +32,7 @@ TARGETS = {
 class Extrapolation(Experiment):
     """Gaussian processes and analytical models on `points` rows, networks on all training rows of the region."""
 
-    name: ClassVar[str] = "extrapolation"
-    title: ClassVar[str] = "Extrapolation: the other half of the table, and faster"
+    name, title = "extrapolation", "Extrapolation: the other half of the table, and faster"
 
     points: int
     seeds: tuple[int, ...]
@@ -41,27 +44,24 @@ class Extrapolation(Experiment):
         out: list[Job] = []
         for seed in self.seeds:
             data = self.data.job(seed)
-            out.append(data)
-            out.append(Job(_scale_name(seed), f"{TASKS}:scale", {"data": data.name}, (data.name,), 3.0))
+            out += [data, Job(_scale_name(seed), f"{TASKS}:scale", {"data": data.name}, (data.name,), 3.0)]
             for region in REGIONS:
                 for model in self.models:
                     points = None if model in NETWORKS else self.points
                     settings = self.settings.of_network() if model in NETWORKS else self.settings.of(self.points)
                     spec = {"model": model, "data": data.name, "region": region, "points": points, "seed": seed}
                     cost = 30.0 if model in NETWORKS else fit_cost(model, self.points, settings)
-                    name = _fit_name(model, region, seed)
-                    out.append(Job(name, f"{TASKS}:fit", spec | settings, (data.name,), cost))
+                    out.append(Job(_fit_name(region, model, seed), f"{TASKS}:fit", spec | settings, (data.name,), cost))
         return out
 
     @override
     def summary(self, results: JobStore) -> dict[str, Any]:
-        regions: dict[str, Any] = {}
-        for region in REGIONS:
-            regions[region] = {}
+        regions: dict[str, Any] = {region: {} for region in REGIONS}
+        for region, of_models in regions.items():
             for model in self.models:
-                found = [results.result(_fit_name(model, region, seed)) for seed in self.seeds]
+                found = [results.result(_fit_name(region, model, seed)) for seed in self.seeds]
                 scores = {side: medians([job[side] for job in found], SCORES) for side in SIDES}
-                regions[region][model] = scores | medians(found, ("points",))
+                of_models[model] = scores | medians(found, ("points",))
         scales = [results.result(_scale_name(seed)) for seed in self.seeds]
         return {"points": self.points, "regions": regions, "scale": medians(scales, (*TARGETS, "largest_H"))}
 
@@ -88,30 +88,23 @@ class Extrapolation(Experiment):
             "farthest-point sampling makes fast), outside rows one above it. "
             f"{len(self.seeds)} seeds; errors against the noise-free acceleration."
         ]
-        header = ["model", "points", "MAE inside", "MAE outside", "NLPD outside", "coverage outside", "\\|A a − b\\|"]
+        header = ("points", "MAE inside", "MAE outside", "NLPD outside", "coverage outside", "\\|A a − b\\|")
         for region, label in REGIONS.items():
-            rows = []
-            for model, scores in summary["regions"][region].items():
-                outside = scores["outside"]
-                shares = [formatted(outside["nlpd"], 1), formatted(outside["coverage_95"], 3)]
-                errors = [formatted(scores[side]["mae_noise_free"]) for side in SIDES]
-                points = f"{scores['points']['median']:.0f}"
-                rows.append([MODELS[model].label, points, *errors, *shares, formatted(outside["constraint_error"])])
-            parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table(header, rows)]
+            cells = {
+                model: [
+                    f"{scores['points']['median']:.0f}",
+                    *(formatted(scores[side]["mae_noise_free"]) for side in SIDES),
+                    *(formatted(scores["outside"][name], digits) for name, digits in OUTSIDE.items()),
+                ]
+                for model, scores in summary["regions"][region].items()
+            }
+            parts += [heading(label), model_table(header, cells)]
         scale = summary["scale"]
-        parts.append(
+        parts += [
             "What each model was left to learn, root mean square over training rows. A Gaussian process falls back to "
             "zero away from its data, so this is the size that its errors can reach there; a force error reaches the "
-            f"acceleration through H, whose largest entry on these data is {formatted(scale['largest_H'], 0)} /(kg m²)."
-        )
-        sizes = [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()]
-        parts.append(markdown_table(["what", "size"], sizes))
+            "acceleration through H, whose largest entry on these data is "
+            f"{formatted(scale['largest_H'], 0)} /(kg m²).",
+            markdown_table(["what", "size"], [[text, formatted(scale[key], 2)] for key, text in TARGETS.items()]),
+        ]
         return "\n\n".join(parts)
-
-
-def _fit_name(model: str, region: str, seed: int) -> str:
-    return f"extrapolation/{region}/{model}/seed{seed}"
-
-
-def _scale_name(seed: int) -> str:
-    return f"extrapolation/scale/seed{seed}"

@@ -16,9 +16,7 @@ from forcegp.experiments.fits import MODEL, fitted, search_report
 from forcegp.jobs import JobStore
 from forcegp.models import save_posterior
 
-TRAIN_X, TEST_X = 0.0, 0.1
-"""Training rows have their tool at x below the first, test rows above the second [m]."""
-
+TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first, test rows above the second [m]
 REGIONS = {"place": "other half of the table", "place-and-speed": "other half and faster"}
 SIDES = ("inside", "outside")
 
@@ -37,20 +35,17 @@ def tool_motion(dataset: Dataset) -> tuple[Float[np.ndarray, " rows"], Float[np.
 def split_by_region(train: Dataset, test: Dataset, region: str) -> dict[str, Dataset]:
     """Rows to train on, and to test inside and outside of where they lie."""
     (train_x, train_speed), (test_x, test_speed) = tool_motion(train), tool_motion(test)
-    limit = np.median(train_speed) if region == "place-and-speed" else None
+    limit = np.median(train_speed) if region == "place-and-speed" else np.inf
 
     def rows(dataset: Dataset, where: Bool[np.ndarray, " rows"], what: str) -> Dataset:
         if not where.any():
             raise InvalidInput(f"no {what} rows in region {region!r}; make the trajectories longer.")
         return dataset.rows(where)
 
-    everywhere = np.full(len(test), True)
-    slow = everywhere if limit is None else test_speed <= limit
-    fast = everywhere if limit is None else test_speed > limit
-    trained = (train_x < TRAIN_X) & (np.full(len(train), True) if limit is None else train_speed <= limit)
+    fast = (test_speed > limit) | np.isinf(limit)
     return {
-        "train": rows(train, trained, "training"),
-        "inside": rows(test, (test_x < TRAIN_X) & slow, "inside"),
+        "train": rows(train, (train_x < TRAIN_X) & (train_speed <= limit), "training"),
+        "inside": rows(test, (test_x < TRAIN_X) & (test_speed <= limit), "inside"),
         "outside": rows(test, (test_x > TEST_X) & fast, "outside"),
     }
 

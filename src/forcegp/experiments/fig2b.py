@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, medians
 from forcegp.experiments import published
-from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row, model_table
 from forcegp.experiments.figures import learning_curves_figure
 from forcegp.experiments.fits import (
     ANALYTICAL,
@@ -24,8 +24,7 @@ from forcegp.experiments.fits import (
 )
 from forcegp.jobs import Job, JobStore
 
-SCORES = ("mae", "mae_noise_free", "constraint_error", "nlpd", "coverage_95", "cpu_seconds")
-HEADINGS = {
+SCORES = {
     "mae": "MAE against noisy accelerations [rad/s²]",
     "mae_noise_free": "MAE against noise-free accelerations [rad/s²]",
     "constraint_error": "mean constraint error \\|A a − b\\| [m/s²]",
@@ -33,14 +32,15 @@ HEADINGS = {
     "coverage_95": "share of measurements inside the 95 % interval",
     "cpu_seconds": "CPU seconds of the search of this fit alone, without those that it began from",
 }
+OF_ALL_ROWS = tuple(SCORES)[:-1]
+DIGITS = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}
 
 
 @dataclass(frozen=True)
 class Fig2b(Experiment):
     """Every model on the first N farthest points of `seeds` trajectories; beyond `few_points`, on fewer seeds."""
 
-    name: ClassVar[str] = "fig2b"
-    title: ClassVar[str] = "Figure 2b: error against training points"
+    name, title = "fig2b", "Figure 2b: error against training points"
 
     points: tuple[int, ...]
     seeds: tuple[int, ...]
@@ -74,26 +74,24 @@ class Fig2b(Experiment):
             for count in self.points:
                 found = [results.result(fit_name(model, count, seed)) for seed in self.seeds_of(count)]
                 scores = [{**job["evaluation"], "cpu_seconds": job["search"]["cpu_seconds"]} for job in found]
-                converged = sum(job["search"]["converged"] for job in found)
-                counted = {"converged": converged, "seeds": len(found)}
+                counted = {"converged": sum(job["search"]["converged"] for job in found), "seeds": len(found)}
                 curves[model][str(count)] = medians(scores, SCORES) | counted
         many = {}
         for model in self.on_all_rows:
             found = [results.result(all_name(model, seed))["evaluation"] for seed in self.seeds_many_points]
-            many[model] = medians(found, SCORES[:-1])
+            many[model] = medians(found, OF_ALL_ROWS)
         floor = results.result(fit_name(self.models[0], self.points[0], self.seeds[0]))["evaluation"]["noise_floor"]
         return {"curves": curves, "all_rows": {"rows": self.data.rows, "models": many}, "noise_floor": floor}
 
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
-        out: list[Row] = []
-        for model, curve in summary["curves"].items():
-            for count, scores in curve.items():
-                paper = published.FIG2B_MAE[model].get(int(count))
-                row: Row = {"model": MODELS[model].label, "points": int(count), "seeds": scores["seeds"]}
-                row |= {"paper_mae": paper, "converged": scores["converged"]}
-                out.append(row | in_columns({name: scores[name] for name in SCORES}))
-        return out
+        return [
+            {"model": MODELS[model].label, "points": int(count), "seeds": scores["seeds"]}
+            | {"paper_mae": published.FIG2B_MAE[model].get(int(count)), "converged": scores["converged"]}
+            | in_columns({name: scores[name] for name in SCORES})
+            for model, curve in summary["curves"].items()
+            for count, scores in curve.items()
+        ]
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
@@ -102,10 +100,9 @@ class Fig2b(Experiment):
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
         by_points = {count: self.settings.of(count) for count in self.points}
-        searches = [
-            f"N = {count}: {each['restarts']} starts, tolerance {each['tolerance']:g}"
-            for count, each in by_points.items()
-        ]
+        searches = (
+            f"N = {n}: {each['restarts']} starts, tolerance {each['tolerance']:g}" for n, each in by_points.items()
+        )
         parts = [
             f"Medians over seeds (least–largest), {len(self.seeds)} seeds up to N = {self.few_points}, "
             f"{len(self.seeds_many_points)} above. Training and test rows come from different trajectories. The floor "
@@ -113,37 +110,32 @@ class Fig2b(Experiment):
             + "; ".join(searches)
             + ". From the second number of points on, the first start is where the fit to fewer points ended."
         ]
-        for score in SCORES:
+        for score, heading in SCORES.items():
             rows = []
             for model, curve in summary["curves"].items():
                 if score == "mae":
                     cells = [formatted(published.FIG2B_MAE[model].get(int(count))) for count in curve]
                     rows.append([f"{MODELS[model].label}, paper", *cells])
                 label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
-                digits = {"cpu_seconds": 1, "nlpd": 2, "coverage_95": 3}.get(score, 4)
-                rows.append([label, *(formatted(scores[score], digits) for scores in curve.values())])
-            parts += [f"**{HEADINGS[score]}**", markdown_table(["N", *map(str, self.points)], rows)]
+                rows.append([label, *(formatted(scores[score], DIGITS.get(score, 4)) for scores in curve.values())])
+            parts += [f"**{heading}**", markdown_table(["N", *map(str, self.points)], rows)]
         unconverged = [
             f"{MODELS[model].label} N = {count}: {scores['converged']} of {scores['seeds']}"
             for model, curve in summary["curves"].items()
             for count, scores in curve.items()
             if scores["converged"] < scores["seeds"]
         ]
-        parts.append(
+        many = {
+            model: [formatted(published.MAE_10000.get(model), 2)]
+            + [formatted(scores[name], DIGITS.get(name, 4)) for name in OF_ALL_ROWS]
+            for model, scores in summary["all_rows"]["models"].items()
+        }
+        parts += [
             f"**Models of {summary['all_rows']['rows']} points** (the analytical model has the true parameters; "
             "fitted, the tool's mass and centre of mass and a viscous friction of every joint are estimated by maximum "
-            "likelihood, but no friction of joints is a friction of the tool)"
-        )
-        rows = []
-        for model, scores in summary["all_rows"]["models"].items():
-            paper = published.MAE_10000.get(model)
-            digits = {"nlpd": 2, "coverage_95": 3}
-            cells = [formatted(scores[name], digits.get(name, 4)) for name in SCORES[:-1]]
-            rows.append([MODELS[model].label, "–" if paper is None else f"{paper:.2f}", *cells])
-        header = ["model", "MAE, paper", "MAE", "noise-free", "\\|A a − b\\|", "NLPD", "coverage"]
-        parts.append(markdown_table(header, rows))
-        parts.append(
+            "likelihood, but no friction of joints is a friction of the tool)",
+            model_table(("MAE, paper", "MAE", "noise-free", "\\|A a − b\\|", "NLPD", "coverage"), many),
             "Searches that met their tolerance before the limit of iterations: "
-            + (f"all but ({'; '.join(unconverged)})." if unconverged else "all.")
-        )
+            + (f"all but ({'; '.join(unconverged)})." if unconverged else "all."),
+        ]
         return "\n\n".join(parts)

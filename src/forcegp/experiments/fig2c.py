@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
@@ -14,15 +14,18 @@ from forcegp.experiments.figures import estimation_figure
 from forcegp.experiments.fits import fit_cost
 from forcegp.jobs import Job, JobStore
 
+TASKS = "forcegp.experiments.fig2c_jobs"
 AXES = ("com.x", "com.y", "com.z")
+ERRORS = ("mass_error", "center_error", "mae")
+_trace_name = "fig2c/trace/{}/{}".format  # model, mean
+_estimate_name = "fig2c/estimate/seed{}".format
 
 
 @dataclass(frozen=True)
 class Fig2c(Experiment):
     """Traces at `points` points from one seed; estimates with standard errors at `points_interval` points."""
 
-    name: ClassVar[str] = "fig2c"
-    title: ClassVar[str] = "Figure 2c: the tool's mass and centre of mass"
+    name, title = "fig2c", "Figure 2c: the tool's mass and centre of mass"
 
     points: int
     seed: int
@@ -41,13 +44,11 @@ class Fig2c(Experiment):
                 where = data[self.seed].name
                 spec = {"model": model, "mean": mean, "data": where, "points": self.points, **search}
                 cost = 10.0 + fit_cost("s-gp", self.points, {"restarts": 1, **search}) * (model == "s-gp")
-                name = _trace_name(model, mean)
-                out.append(Job(name, "forcegp.experiments.fig2c_jobs:trace", spec, (where,), cost))
+                out.append(Job(_trace_name(model, mean), f"{TASKS}:trace", spec, (where,), cost))
         for seed in self.seeds:
             spec = {"data": data[seed].name, "points": self.points_interval, **search}
             cost = 3.0 * fit_cost("s-gp", self.points_interval, {"restarts": 1, **search})
-            task = "forcegp.experiments.fig2c_jobs:estimate"
-            out.append(Job(_estimate_name(seed), task, spec, (data[seed].name,), cost))
+            out.append(Job(_estimate_name(seed), f"{TASKS}:estimate", spec, (data[seed].name,), cost))
         return out
 
     @override
@@ -57,30 +58,22 @@ class Fig2c(Experiment):
             for trace in model.values():
                 trace["found_at"] = _found_at(trace)
         estimates = [results.result(_estimate_name(seed)) for seed in self.seeds]
-        names = list(estimates[0]["error"])
         intervals = {
             name: {
                 "inside": sum(_inside(each["error"][name], each["std"][name]) for each in estimates),
                 "error": median_and_range(abs(each["error"][name]) for each in estimates),
                 "std": median_and_range(each["std"][name] for each in estimates),
             }
-            for name in names
+            for name in estimates[0]["error"]
         }
-        converged = sum(each["converged"] for each in estimates)
-        out = {"points": self.points, "traces": traces, "intervals": intervals}
-        return {**out, "seeds": len(estimates), "converged": converged}
+        out = {"points": self.points, "traces": traces, "intervals": intervals, "seeds": len(estimates)}
+        return out | {"converged": sum(each["converged"] for each in estimates)}
 
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
         return [
-            {
-                "model": MODELS[model],
-                "mean": mean,
-                "iteration": iteration,
-                "mass_error": trace["mass_error"][iteration],
-                "center_error": trace["center_error"][iteration],
-                "mae": trace["mae"][iteration],
-            }
+            {"model": MODELS[model], "mean": mean, "iteration": iteration}
+            | {name: trace[name][iteration] for name in ERRORS}
             for model, means in summary["traces"].items()
             for mean, trace in means.items()
             for iteration in range(len(trace["mass_error"]))
@@ -95,21 +88,14 @@ class Fig2c(Experiment):
         rows = []
         for model, means in summary["traces"].items():
             for mean, trace in means.items():
-                last = [number(trace[name][-1]) for name in ("mass_error", "center_error", "mae")]
+                last = [number(trace[name][-1]) for name in ERRORS]
                 found = "never" if trace["found_at"] is None else str(trace["found_at"])
                 std = [formatted(trace["std"]["mass"]), " ".join(formatted(trace["std"][axis]) for axis in AXES)]
                 iterations = f"{len(trace['mass_error']) - 1}{'' if trace['converged'] else ' (limit)'}"
                 rows.append([f"{MODELS[model]}, {MEANS[mean]}", iterations, found, *last[:2], *std, last[2]])
-        header = [
-            "model",
-            "iterations",
-            f"within {MASS_BOUND} kg and {1000 * CENTER_BOUND:g} mm from",
-            "mass error at the end [kg]",
-            "centre error at the end [m]",
-            "standard error of the mass [kg]",
-            "of the centre, x y z [m]",
-            "MAE [rad/s²]",
-        ]
+        found = f"within {MASS_BOUND} kg and {1000 * CENTER_BOUND:g} mm from"
+        ends = ["mass error at the end [kg]", "centre error at the end [m]", "standard error of the mass [kg]"]
+        header = ["model", "iterations", found, *ends, "of the centre, x y z [m]", "MAE [rad/s²]"]
         intervals = [
             [name, formatted(entry["error"]), formatted(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
             for name, entry in summary["intervals"].items()
@@ -138,14 +124,6 @@ class Fig2c(Experiment):
         return "\n\n".join(parts)
 
 
-def _trace_name(model: str, mean: str) -> str:
-    return f"fig2c/trace/{model}/{mean}"
-
-
-def _estimate_name(seed: int) -> str:
-    return f"fig2c/estimate/seed{seed}"
-
-
 def _inside(error: float, std: float | None) -> bool:
     """Is the truth in the 95 % interval? One of infinite width holds everything."""
     return std is None or abs(error) <= 1.96 * std
@@ -157,7 +135,5 @@ def _found_at(trace: Mapping[str, Any]) -> int | None:
         abs(mass) <= MASS_BOUND and center <= CENTER_BOUND
         for mass, center in zip(trace["mass_error"], trace["center_error"], strict=True)
     ]
-    if not good[-1]:
-        return None
-    wrong = [iteration for iteration, fine in enumerate(good) if not fine]
-    return wrong[-1] + 1 if wrong else 0
+    first = max((iteration + 1 for iteration, fine in enumerate(good) if not fine), default=0)
+    return first if first < len(good) else None

@@ -20,13 +20,8 @@ from forcegp.simulation.kuka_motion import TOOL_LINK
 
 MODELS = {"s-gp": "S-GP", "analytical": "analytical model"}
 MEANS = {"analytical": "with Q_K", "zero": "without Q_K"}
-MASS_BOUND, CENTER_BOUND = 0.02, 1e-3
-"""Errors that count as found [kg, m]."""
-
-MASS_OFFSET = 0.5
-CENTER_OFFSET = (0.05, 0.05, -0.03)
-"""How wrong the start is [kg, m]."""
-
+MASS_BOUND, CENTER_BOUND = 0.02, 1e-3  # errors that count as found [kg, m]
+MASS_OFFSET, CENTER_OFFSET = 0.5, (0.05, 0.05, -0.03)  # how wrong the start is [kg, m]
 PRIORS = {"s-gp": JointForces(), "analytical": NoForces()}
 NAMES = {f"{TOOL_LINK}.{name}": name for name in ("mass", "com.x", "com.y", "com.z")}
 
@@ -36,8 +31,8 @@ def trace(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
     train = training_rows(results, spec["data"], spec["points"])
     test = scored_rows(results, spec["data"])
     true = _values(train.system)
-    posterior = _fitted(train, spec)
-    history = [{NAMES[name]: value for name, value in point.items()} for point in _identification(posterior).history]
+    posterior, identification = _fitted(train, spec)
+    history = [{NAMES[name]: value for name, value in point.items()} for point in identification.history]
     return {
         "mass_error": [point["mass"] - true["mass"] for point in history],
         "center_error": [math.dist(*([x[f"com.{axis}"] for axis in "xyz"] for x in (at, true))) for at in history],
@@ -46,7 +41,7 @@ def trace(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
         "start_center": list(CENTER_OFFSET),
         "converged": posterior.result.converged,
         "status": posterior.result.status,
-        **_uncertainty(posterior),
+        **_uncertainty(identification),
     }
 
 
@@ -54,11 +49,10 @@ def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
     """Errors and standard errors of S-GP + analytical mean."""
     train = training_rows(results, spec["data"], spec["points"])
     true = _values(train.system)
-    posterior = _fitted(train, {**spec, "model": "s-gp", "mean": "analytical"})
-    values = {NAMES[name]: value for name, value in _identification(posterior).values.items()}
-    error = {name: values[name] - true[name] for name in values}
+    posterior, identification = _fitted(train, {**spec, "model": "s-gp", "mean": "analytical"})
+    error = {NAMES[name]: value - true[NAMES[name]] for name, value in identification.values.items()}
     search = {"iterations": len(posterior.result.history) - 1, "converged": posterior.result.converged}
-    return {"error": error, **search, **_uncertainty(posterior)}
+    return {"error": error, **search, **_uncertainty(identification)}
 
 
 def wrong_system(system: MechanicalSystem) -> MechanicalSystem:
@@ -71,12 +65,15 @@ def wrong_system(system: MechanicalSystem) -> MechanicalSystem:
     )
 
 
-def _fitted(train: Dataset, spec: Mapping[str, Any]) -> StructuredPosterior:
+def _fitted(train: Dataset, spec: Mapping[str, Any]) -> tuple[StructuredPosterior, Identification]:
     assert train.system is not None
     system = wrong_system(train.system)
     options = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"], keep_iterates=True)
     learn = system.robot.link(TOOL_LINK).inertial("mass", "com")
-    return StructuredGP(system, PRIORS[spec["model"]], spec["mean"]).identify(train, learn, restarts=1, options=options)
+    model = StructuredGP(system, PRIORS[spec["model"]], spec["mean"])
+    posterior = model.identify(train, learn, restarts=1, options=options)
+    assert posterior.identification is not None, "the fit was given parameters to learn"
+    return posterior, posterior.identification
 
 
 def _values(system: MechanicalSystem | None) -> dict[str, float]:
@@ -89,14 +86,8 @@ def _mae(posterior: StructuredPosterior, test: Dataset) -> float:
     return float(np.abs(posterior.predict(test.q, test.v, test.u, covariance=False).mean.numpy() - test.a).mean())
 
 
-def _uncertainty(posterior: StructuredPosterior) -> dict[str, Any]:
+def _uncertainty(identification: Identification) -> dict[str, Any]:
     """Standard errors by parameter (None where infinite), and a sentence about what cannot be identified."""
-    identification = _identification(posterior)
-    errors = {NAMES[name]: value for name, value in identification.standard_errors.items()}
-    std = {name: value if math.isfinite(value) else None for name, value in errors.items()}
+    errors = identification.standard_errors
+    std = {NAMES[name]: value if math.isfinite(value) else None for name, value in errors.items()}
     return {"std": std, "verdict": identification.verdict.replace(f"{TOOL_LINK}.", "")}
-
-
-def _identification(posterior: StructuredPosterior) -> Identification:
-    assert posterior.identification is not None, "the fit was given parameters to learn"
-    return posterior.identification

@@ -3,16 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.metrics import interval_coverage, markdown_table, number
+from forcegp.evaluation.metrics import interval_coverage, number
 from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row, model_table, stored_arrays
 from forcegp.experiments.figures import prediction_window_figure
 from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
@@ -25,8 +25,7 @@ ARRAYS = "prediction.npz"
 class Fig3(Experiment):
     """The first `points` rows of one seed, and `seconds` of its test trajectory from `start` on."""
 
-    name: ClassVar[str] = "fig3"
-    title: ClassVar[str] = "Figure 3: four models on the same three seconds"
+    name, title = "fig3", "Figure 3: four models on the same three seconds"
 
     points: tuple[int, ...]
     seed: int
@@ -40,7 +39,7 @@ class Fig3(Experiment):
         data = self.data.job(self.seed)
         out = [data]
         for model in self.models:
-            series = fit_series(model, data.name, self.seed, list(self.points), self.settings)
+            series = fit_series(model, data.name, self.seed, self.points, self.settings)
             spec = {"fit": series[-1].name, "data": data.name, "start": self.start, "seconds": self.seconds}
             out += [*series, Job(self._name(model), "forcegp.experiments.fig3:predict", spec, (series[-1].name,), 3.0)]
         return out
@@ -62,30 +61,21 @@ class Fig3(Experiment):
 
     @override
     def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
-        arrays = {}
-        for model in self.models:
-            with np.load(results.place(self._name(model)) / ARRAYS) as stored:
-                arrays[model] = dict(stored)
+        arrays = {model: stored_arrays(results, self._name(model), ARRAYS) for model in self.models}
         return {"fig3": prediction_window_figure(arrays)}
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        header = ["model", "MAE, noise-free", "mean std of the prediction", "truth inside 95 %", "measured inside 95 %"]
-        rows = [
-            [
-                MODELS[model].label,
-                number(scores["mae_noise_free"]),
-                number(scores["mean_std"]),
-                number(scores["coverage_95_noise_free"], 3),
-                number(scores["coverage_95"], 3),
-            ]
+        digits = {"mae_noise_free": 4, "mean_std": 4, "coverage_95_noise_free": 3, "coverage_95": 3}
+        cells = {
+            model: [number(scores[name], each) for name, each in digits.items()]
             for model, scores in summary["models"].items()
-        ]
-        text = (
+        }
+        header = ("MAE, noise-free", "mean std of the prediction", "truth inside 95 %", "measured inside 95 %")
+        return (
             f"{summary['points']} training points, seed {summary['seed']}, {self.seconds:g} s of its test trajectory "
-            "(all joints in the table, three in the figure); rad/s²."
+            f"(all joints in the table, three in the figure); rad/s².\n\n{model_table(header, cells)}"
         )
-        return f"{text}\n\n{markdown_table(header, rows)}"
 
 
 def predict(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:

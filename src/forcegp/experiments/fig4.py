@@ -2,32 +2,33 @@
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.evaluation.metrics import in_columns, markdown_table, median_and_range, number
-from forcegp.experiments.experiment import Experiment, Row
+from forcegp.experiments.experiment import Experiment, Row, heading, stored_arrays
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.figures import rollouts_figure
 from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series, fit_to_all
 from forcegp.jobs import Job, JobStore
 
+TASKS = "forcegp.experiments.fig4_jobs"
+_name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed
+_truth_name = "fig4/truth/seed{}".format
 BLACK_BOXES = ("gp", "neural-network")
-WITHOUT_CONSTRAINT = ("none", "projected")
-"""Variants of models without a constraint, and so cannot be stabilised by it."""
+WITHOUT_CONSTRAINT = ("none", "projected")  # variants of models without a constraint, and so cannot be stabilised by it
 
 
 @dataclass(frozen=True)
 class Fig4(Experiment):
     """`starts` initial states from the test trajectory of each seed, with its recorded torques, for `seconds`."""
 
-    name: ClassVar[str] = "fig4"
-    title: ClassVar[str] = "Figure 4: roll-outs"
+    name, title = "fig4", "Figure 4: roll-outs"
 
     points: tuple[int, ...]
     seeds: tuple[int, ...]
@@ -42,19 +43,18 @@ class Fig4(Experiment):
         for seed in self.seeds:
             data = self.data.job(seed)
             rolled = {"data": data.name, "starts": self.starts, "seconds": list(self.seconds)}
-            task = "forcegp.experiments.fig4_jobs"
-            out += [data, Job(_truth_name(seed), f"{task}:truth", rolled, (data.name,), 20.0)]
+            out += [data, Job(_truth_name(seed), f"{TASKS}:truth", rolled, (data.name,), 20.0)]
             for model in self.models:
                 if model == "neural-network":
                     series = [fit_to_all(model, data.name, seed, self.settings)]
                 else:
-                    series = fit_series(model, data.name, seed, list(self.points), self.settings)
+                    series = fit_series(model, data.name, seed, self.points, self.settings)
                 out += series
                 fit = series[-1].name
                 for control in CONTROLS:
                     for variant in variants_of(model):
                         spec = {**rolled, "fit": fit, "control": control, "variant": variant}
-                        out.append(Job(_name(control, variant, model, seed), f"{task}:roll", spec, (fit,), 10.0))
+                        out.append(Job(_name(control, variant, model, seed), f"{TASKS}:roll", spec, (fit,), 10.0))
         return out
 
     @override
@@ -101,13 +101,14 @@ class Fig4(Experiment):
     @override
     def rows(self, summary: Mapping[str, Any]) -> list[Row]:
         out: list[Row] = []
-        for control, variant, model, scores in _each(summary):
-            row: Row = {"control": control, "stabilisation": VARIANTS[variant], "model": MODELS[model].label}
-            for second in self.seconds:
-                score = scores[f"{second:g}"]
-                row |= in_columns({f"{name}_{second:g}s": score[name] for name in ("joint_error", "constraint")})
-                row[f"constraint_largest_{second:g}s"] = score["constraint_largest"]
-            out.append(row | {"diverged": scores["diverged"]})
+        for control, variants in summary["motions"].items():
+            for variant, model, scores in _each(variants):
+                row: Row = {"control": control, "stabilisation": VARIANTS[variant], "model": MODELS[model].label}
+                for second in self.seconds:
+                    score = scores[f"{second:g}"]
+                    row |= in_columns({f"{name}_{second:g}s": score[name] for name in ("joint_error", "constraint")})
+                    row[f"constraint_largest_{second:g}s"] = score["constraint_largest"]
+                out.append(row | {"diverged": scores["diverged"]})
         return out
 
     @override
@@ -115,11 +116,8 @@ class Fig4(Experiment):
         figures = {}
         for control in CONTROLS:
             arrays: dict[str, dict[str, dict[str, np.ndarray]]] = {variant: {} for variant in VARIANTS}
-            for _, variant, model, _ in _each({"motions": {control: summary["motions"][control]}}):
-                parts = []
-                for seed in self.seeds:
-                    with np.load(results.place(_name(control, variant, model, seed)) / ARRAYS) as stored:
-                        parts.append(dict(stored))
+            for variant, model, _ in _each(summary["motions"][control]):
+                parts = [stored_arrays(results, _name(control, variant, model, seed), ARRAYS) for seed in self.seeds]
                 arrays[variant][model] = {
                     name: parts[0][name] if name == "time" else np.concatenate([part[name] for part in parts])
                     for name in parts[0]
@@ -150,18 +148,19 @@ class Fig4(Experiment):
             f"grown so. “With feedback” adds M(q recorded) (ω² (q recorded − q) + 2 ω (v recorded − v)) with ω = "
             f"{FREQUENCY:g} rad/s to the recorded torques, the same for every model.",
         ]
-        for control, label in CONTROLS.items():
+        columns: dict[tuple[str, str], Callable[[Mapping[str, Any]], str]] = {
+            ("joint error", "rad"): lambda score: _error(score["joint_error"]),
+            ("median \\|c(q)\\|", "m"): lambda score: number(score["constraint"]["median"]),
+            ("largest", "m"): lambda score: number(score["constraint_largest"]),
+        }
+        for control, title in CONTROLS.items():
             rows = []
-            for _, variant, model, scores in _each({"motions": {control: summary["motions"][control]}}):
-                cells = [_error(scores[second]["joint_error"]) for second in seconds]
-                cells += [number(scores[second]["constraint"]["median"]) for second in seconds]
-                cells += [number(scores[second]["constraint_largest"]) for second in seconds]
-                cells.append(f"{scores['diverged']} of {count}")
-                rows.append([f"{MODELS[model].label}, {VARIANTS[variant]}", *cells])
-            header = ["model", *(f"joint error, {second} s [rad]" for second in seconds)]
-            header += [f"median \\|c(q)\\|, {second} s [m]" for second in seconds]
-            header += [f"largest, {second} s [m]" for second in seconds]
-            parts += [f"**{label[0].upper()}{label[1:]}**", markdown_table([*header, "diverged"], rows)]
+            for variant, model, scores in _each(summary["motions"][control]):
+                cells = [cell(scores[second]) for cell in columns.values() for second in seconds]
+                label = f"{MODELS[model].label}, {VARIANTS[variant]}"
+                rows.append([label, *cells, f"{scores['diverged']} of {count}"])
+            header = [f"{name}, {second} s [{unit}]" for name, unit in columns for second in seconds]
+            parts += [heading(title), markdown_table(["model", *header, "diverged"], rows)]
         parts.append(
             "A motion that diverges (a joint beyond 100 rad/s) counts as infinitely wrong from there on, and its |c| "
             "up to there."
@@ -180,21 +179,8 @@ def variants_of(model: str) -> tuple[str, ...]:
     return WITHOUT_CONSTRAINT if model in BLACK_BOXES else tuple(VARIANTS)
 
 
-def _name(control: str, variant: str, model: str, seed: int) -> str:
-    return f"fig4/{control}/{variant}/{model}/seed{seed}"
-
-
-def _truth_name(seed: int) -> str:
-    return f"fig4/truth/seed{seed}"
-
-
-def _each(summary: Mapping[str, Any]) -> list[tuple[str, str, str, Mapping[str, Any]]]:
-    return [
-        (control, variant, model, scores)
-        for control, variants in summary["motions"].items()
-        for variant, models in variants.items()
-        for model, scores in models.items()
-    ]
+def _each(variants: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, Mapping[str, Any]]]:
+    return [(variant, model, scores) for variant, models in variants.items() for model, scores in models.items()]
 
 
 def _spread(errors: Sequence[float | None]) -> dict[str, Any]:

@@ -19,18 +19,10 @@ from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models import load_posterior
 
-BAUMGARTE = Baumgarte(10.0, 1.0)
-"""As in the paper, K = 100 and D = 20, and as in the simulation itself."""
-
-OFFSET = 1e-3
-"""How far off the surface the displaced motions begin [m]."""
-
-FREQUENCY = 20.0
-"""Natural frequency of the feedback [rad/s], critically damped; the simulated controller has 100."""
-
-PERTURBATIONS = (1e-8, 1e-6, 1e-4)
-"""Standard deviation of what is added to the initial positions of the true dynamics [rad]."""
-
+BAUMGARTE = Baumgarte(10.0, 1.0)  # as in the paper, K = 100 and D = 20, and as in the simulation itself
+OFFSET = 1e-3  # how far off the surface the displaced motions begin [m]
+FREQUENCY = 20.0  # natural frequency of the feedback [rad/s], critically damped; the simulated controller has 100
+PERTURBATIONS = (1e-8, 1e-6, 1e-4)  # of the true dynamics' initial positions: standard deviations [rad]
 ARRAYS = "rollout.npz"
 CONTROLS = {"open-loop": "recorded torques", "closed-loop": "recorded torques and feedback"}
 VARIANTS = {
@@ -80,13 +72,10 @@ def truth(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
     errors: dict[str, dict[str, list[float | None]]] = {}
     with torch.no_grad():
         for size in (0.0, *PERTURBATIONS):
-            start = recorded.q[:, 0] + size * change
-            motion = integrate(
-                SymplecticEuler(), acceleration, start, recorded.v[:, 0], recorded.u.movedim(0, 1), recorded.dt
-            )
+            start = (recorded.q[:, 0] + size * change, recorded.v[:, 0])
+            motion = integrate(SymplecticEuler(), acceleration, *start, recorded.u.movedim(0, 1), recorded.dt)
             error = (motion.q.movedim(0, 1) - recorded.q).abs().mean(-1).numpy()
-            rows = {f"{second:g}": round(second / recorded.dt) for second in spec["seconds"]}
-            errors[f"{size:g}"] = {name: _finite(error[:, row]) for name, row in rows.items()}
+            errors[f"{size:g}"] = {f"{x:g}": _finite(error[:, round(x / recorded.dt)]) for x in spec["seconds"]}
     c = contact.distance(system.robot.kinematics(recorded.q)).abs().numpy()
     constraint = {"largest": float(c.max()), "median": float(np.median(c))}
     return {"joint_error": errors, "recorded_constraint": constraint}
@@ -105,18 +94,15 @@ class _Recorded:
     def feedback(self) -> Feedback:
         """M (omega^2 (q_recorded - q) + 2 omega (v_recorded - v)) with the recorded M: the same for every model."""
         M = self.system.robot.mass_matrix(self.q)
-        q, v = self.q, self.v
 
         def feedback(k: int, at: Tensor, rate: Tensor) -> Tensor:
-            wanted = FREQUENCY**2 * (q[:, k] - at) + 2.0 * FREQUENCY * (v[:, k] - rate)
+            wanted = FREQUENCY**2 * (self.q[:, k] - at) + 2.0 * FREQUENCY * (self.v[:, k] - rate)
             return (M[:, k] @ wanted[..., None])[..., 0]
 
         return feedback
 
 
-def _scores(
-    error: Float[np.ndarray, "n rows"], c: Float[np.ndarray, "n rows"], step: int
-) -> dict[str, list[float | None]]:
+def _scores(error: np.ndarray, c: np.ndarray, step: int) -> dict[str, list[float | None]]:
     """Per motion: error at `step` (None if it diverged before), median and largest |c| up to there, or to its end."""
     until = c[:, : step + 1]
     return {

@@ -43,9 +43,14 @@ def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
     panels = figure.subplots(1, len(PANELS))
     counts = sorted({int(count) for curve in summary["curves"].values() for count in curve})
     for axes, (score, heading) in zip(panels, PANELS, strict=True):
+        paper = {"mae": published.FIG2B_MAE, "constraint_error": published.FIG2B_CONSTRAINT_ERROR}.get(score, {})
         for model, curve in summary["curves"].items():
-            _draw_ours(axes, curve, score, model)
-        _draw_published(axes, summary, score)
+            values = {int(count): scores[score] for count, scores in curve.items()}
+            draw_range(axes, values, COLORS[model], MODELS[model].label)
+        for model, values in paper.items():
+            if model in summary["curves"]:
+                line = {"color": COLORS[model], "linestyle": "--", "linewidth": 1.0, "alpha": 0.8}
+                axes.plot(list(values), list(values.values()), **line)
         axes.set(xscale="log", yscale="log")
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -63,21 +68,11 @@ def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _draw_ours(axes: Axes, curve: Mapping[str, Any], score: str, model: str) -> None:
-    counts = [int(count) for count in curve]
-    values = {part: [scores[score][part] for scores in curve.values()] for part in ("median", "min", "max")}
-    color = COLORS[model]
-    axes.fill_between(counts, values["min"], values["max"], color=color, alpha=0.15, linewidth=0)
-    axes.plot(counts, values["median"], color=color, marker="o", markersize=3.5, label=MODELS[model].label)
-
-
-def _draw_published(axes: Axes, summary: Mapping[str, Any], score: str) -> None:
-    curves = {"mae": published.FIG2B_MAE, "constraint_error": published.FIG2B_CONSTRAINT_ERROR}.get(score, {})
-    for model, values in curves.items():
-        if model in summary["curves"]:
-            axes.plot(
-                list(values), list(values.values()), color=COLORS[model], linestyle="--", linewidth=1.0, alpha=0.8
-            )
+def draw_range(axes: Axes, values: Mapping[int, Mapping[str, float]], color: str, label: str) -> None:
+    """Count -> median and range over seeds: a line, and a band."""
+    least, middle, largest = ([each[part] for each in values.values()] for part in ("min", "median", "max"))
+    axes.fill_between(list(values), least, largest, color=color, alpha=0.15, linewidth=0)
+    axes.plot(list(values), middle, color=color, marker="o", markersize=3.5, label=label)
 
 
 ESTIMATES = (
@@ -95,15 +90,13 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
     for axes, (name, title, bound) in zip(panels, ESTIMATES, strict=True):
         for model, means in summary["traces"].items():
             for mean, trace in means.items():
-                values = [abs(value) for value in trace[name]]
-                label = f"{ESTIMATING_MODELS[model]} {MEANS[mean]}"
-                axes.plot(values, color=COLORS[model], linestyle=LINES[mean], linewidth=1.4, label=label)
+                style = {"color": COLORS[model], "linestyle": LINES[mean], "linewidth": 1.4}
+                axes.plot(np.abs(trace[name]), label=f"{ESTIMATING_MODELS[model]} {MEANS[mean]}", **style)
         if bound is not None:
             axes.axhline(bound, color=QUIET, linewidth=0.8)
         for model, values in published.FIG2C.items():
             points = values.get(name, {})
-            errors = [abs(value) for value in points.values()]
-            axes.plot(list(points), errors, "x", color=COLORS[model], markersize=6)
+            axes.plot(list(points), np.abs(list(points.values())), "x", color=COLORS[model], markersize=6)
         axes.set_yscale("log")
         axes.set_xscale("symlog", linthresh=10)
         axes.set_xlim(0, 450)
@@ -119,10 +112,12 @@ def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
     figure = new_figure(10.0, 3.8)
     panels = figure.subplots(1, len(REGIONS), sharey=True, sharex=True)
     for axes, (region, label) in zip(panels, REGIONS.items(), strict=True):
-        models = summary["regions"][region]
-        for place, (model, scores) in enumerate(models.items()):
+        labels = {}
+        for place, (model, scores) in enumerate(summary["regions"][region].items()):
             _draw_model(axes, -place, scores, COLORS[model])
-        axes.set_yticks([-place for place in range(len(models))], [_label(model, models[model]) for model in models])
+            points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
+            labels[-place] = f"{MODELS[model].label} ({points})"
+        axes.set_yticks(list(labels), list(labels.values()))
         axes.set_xscale("log")
         quiet(axes, title=f"tested in the {label}", x="MAE against noise-free accelerations [rad/s²]")
         axes.tick_params(axis="y", length=0)
@@ -130,11 +125,6 @@ def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
     panels[0].plot([], [], "o", color=QUIET, label="outside")
     legend_below(figure, panels[0])
     return figure
-
-
-def _label(model: str, scores: Mapping[str, Any]) -> str:
-    points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
-    return f"{MODELS[model].label} ({points})"
 
 
 def _draw_model(axes: Axes, place: int, scores: Mapping[str, Any], color: str) -> None:
@@ -174,19 +164,15 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
     return figure
 
 
-Arrays = Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]
 TITLES = {
     "baumgarte": "with Baumgarte (black boxes: none)",
     "none": "not stabilised",
     "projected": "projecting integrator",
 }
+MOST_DRAWN = 300  # points of a curve, about: more than the eye sees would make megabytes of vector graphics
 
 
-MOST_DRAWN = 300
-"""Points of a curve, about: more than the eye sees would make megabytes of vector graphics."""
-
-
-def rollouts_figure(arrays: Arrays, title: str) -> Figure:
+def rollouts_figure(arrays: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]], title: str) -> Figure:
     """Joint error above (diverged: infinite), distance from the surface below (of those that have not diverged)."""
     figure = new_figure(11.0, 6.0)
     figure.suptitle(title, fontsize=LARGE, x=0.01, ha="left")

@@ -3,7 +3,7 @@
 Fits to more points begin where the fit to fewer ended, because the training sets are nested.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,7 @@ from forcegp.models import (
 from forcegp.priors import JointAccelerations, NoForces
 from forcegp.simulation.kuka_motion import TOOL_LINK
 
-START_FRICTION = 0.1
-"""Where the estimation of the joints' viscous friction begins [Nms/rad]."""
+START_FRICTION = 0.1  # where the estimation of the joints' viscous friction begins [Nms/rad]
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,7 @@ every joint are estimated by maximum likelihood. The level of the noise is learn
 GAUSSIAN_PROCESSES = ("gp", "s-gp-38", "s-gp", "s-gp-mean")
 NETWORKS = ("neural-network", "ensemble")
 ANALYTICAL = ("analytical", "analytical-fitted")
-
-
-MODEL = "model"
-"""The folder of the fitted model inside its job."""
+MODEL = "model"  # the folder of the fitted model inside its job
 
 
 @dataclass(frozen=True)
@@ -110,17 +106,11 @@ def _at(steps: Mapping[str, Any], points: int) -> Any:
     return steps[str(max(int(key) for key in steps if int(key) <= points))]
 
 
-def fit_name(model: str, points: int, seed: int) -> str:
-    """Where the fit of this model to the first `points` rows of this seed's trajectory lies."""
-    return f"fits/{model}/seed{seed}/n{points}"
+# Model, points and seed -> where the fit to the first rows of a trajectory lies; model and seed: that to all rows.
+fit_name, all_name = "fits/{0}/seed{2}/n{1}".format, "fits/{}/seed{}/all".format
 
 
-def all_name(model: str, seed: int) -> str:
-    """Where the fit of this model to all training rows of this seed lies."""
-    return f"fits/{model}/seed{seed}/all"
-
-
-def fit_series(model: str, data: str, seed: int, points: list[int], settings: FitSettings) -> list[Job]:
+def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings: FitSettings) -> list[Job]:
     """One job per number of points, each beginning from the hyper-parameters of the one before."""
     jobs: list[Job] = []
     for count in sorted(points):
@@ -178,11 +168,5 @@ def search_report(posterior: Any) -> dict[str, Any] | None:
     search = posterior.result
     if search is None:
         return None
-    return {
-        "objective": search.value,
-        "iterations": len(search.history) - 1,
-        "evaluations": search.evaluations,
-        "converged": search.converged,
-        "status": search.status,
-        "cpu_seconds": search.cpu_seconds,
-    }
+    same = {name: getattr(search, name) for name in ("evaluations", "converged", "status", "cpu_seconds")}
+    return {"objective": search.value, "iterations": len(search.history) - 1, **same}

@@ -3,8 +3,8 @@
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from textwrap import fill
-from types import MappingProxyType
 from typing import Any
 
 from matplotlib.axis import Axis
@@ -14,48 +14,33 @@ from typing_extensions import override
 
 from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, median_and_range, medians
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
+from forcegp.experiments.data import TEST_SEED
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.jobs import Job, JobStore
 
-SCENARIOS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "viscous": {},
-        "coulomb": {"friction": "coulomb"},
-        "stribeck": {"friction": "stribeck"},
-        "viscous-joints": {"joint_friction": "stribeck"},
-        "stribeck-joints": {"friction": "stribeck", "joint_friction": "stribeck"},
-        "tilted": {"surface": "tilted"},
-        "sphere": {"surface": "sphere"},
-        "tilted-joints": {"surface": "tilted", "joint_friction": "stribeck"},
-        "sphere-joints": {"surface": "sphere", "joint_friction": "stribeck"},
-        "free-joints": {"surface": "none", "joint_friction": "stribeck"},
-        "bullet": {"contact": "bullet"},
-        "patch": {"patch_factor": 4.0},
-    }
-)
+_SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+    "viscous": ("viscous tool friction (the paper's)", {}),
+    "coulomb": ("Coulomb friction at the tool, proportional to the load", {"friction": "coulomb"}),
+    "stribeck": ("Stribeck friction at the tool, proportional to the load", {"friction": "stribeck"}),
+    "viscous-joints": ("viscous at the tool, Stribeck in the joints", {"joint_friction": "stribeck"}),
+    "stribeck-joints": (
+        "Stribeck at the tool (load) and in the joints",
+        {"friction": "stribeck", "joint_friction": "stribeck"},
+    ),
+    "tilted": ("tilted plane", {"surface": "tilted"}),
+    "sphere": ("sphere", {"surface": "sphere"}),
+    "tilted-joints": ("tilted plane", {"surface": "tilted", "joint_friction": "stribeck"}),
+    "sphere-joints": ("sphere", {"surface": "sphere", "joint_friction": "stribeck"}),
+    "free-joints": ("free motion", {"surface": "none", "joint_friction": "stribeck"}),
+    "bullet": ("PyBullet's unilateral contact", {"contact": "bullet"}),
+    "patch": ("viscous, four times as much on a strip", {"patch_factor": 4.0}),
+}
+SCENARIOS = {name: fields for name, (_, fields) in _SCENARIOS.items()}
 """Name -> fields of `KukaSurfaceConfig`."""
 
-LABELS = {
-    "viscous": "viscous tool friction (the paper's)",
-    "coulomb": "Coulomb friction at the tool, proportional to the load",
-    "stribeck": "Stribeck friction at the tool, proportional to the load",
-    "viscous-joints": "viscous at the tool, Stribeck in the joints",
-    "stribeck-joints": "Stribeck at the tool (load) and in the joints",
-    "tilted": "tilted plane",
-    "sphere": "sphere",
-    "tilted-joints": "tilted plane",
-    "sphere-joints": "sphere",
-    "free-joints": "free motion",
-    "bullet": "PyBullet's unilateral contact",
-    "patch": "viscous, four times as much on a strip",
-}
-"""What pages call them."""
-
-
+LABELS = {name: label for name, (label, _) in _SCENARIOS.items()}  # what pages call them
 TASKS = "forcegp.experiments.force_jobs"
-TEST_SEED = 1000
-"""The test trajectory of seed k has seed k + 1000."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +58,11 @@ class Trial:
     tests: Mapping[str, str] = field(default_factory=dict)
     mean: str = "analytical"
     region: bool = False
+
+    @property
+    def tested_on(self) -> Mapping[str, str]:
+        """`tests`, or the own scenario where there are none."""
+        return self.tests or {self.scenario: self.scenario}
 
     @property
     def name(self) -> str:
@@ -101,7 +91,7 @@ class ForceExperiment(Experiment):
         for seed in self.seeds:
             for trial in self.trials():
                 train = self.data_job(trial.scenario, seed, training=True)
-                tests = {label: self.data_job(name, seed, training=False) for label, name in self._tests(trial).items()}
+                tests = {label: self.data_job(name, seed, training=False) for label, name in trial.tested_on.items()}
                 spec = {
                     "train": train.name,
                     "tests": {label: job.name for label, job in tests.items()},
@@ -122,17 +112,15 @@ class ForceExperiment(Experiment):
     def _summarized(self, results: JobStore, trial: Trial) -> dict[str, Any]:
         found = [results.result(trial_name(trial, seed)) for seed in self.seeds]
         tests = {}
-        for label in self._tests(trial):
+        for label in trial.tested_on:
             names = dict.fromkeys(name for job in found for name in job["tests"][label])
             tests[label] = medians([job["tests"][label] for job in found], names)
-        coverages = [curve["coverage"] for job in found for curve in job["curves"].values()]
+        coverages = [[curve["coverage"] for curve in job["curves"].values()] for job in found]
         return {
             **{name: getattr(trial, name) for name in ("label", "scenario", "prior", "points", "region")},
             "tests": tests,
-            "curve_coverage": median_and_range(coverages),
-            "curve_coverage_of_seeds": median_and_range(
-                _mean([curve["coverage"] for curve in job["curves"].values()]) for job in found if job["curves"]
-            ),
+            "curve_coverage": median_and_range(chain.from_iterable(coverages)),
+            "curve_coverage_of_seeds": median_and_range(sum(each) / len(each) for each in coverages if each),
             "leave_one_out": median_and_range(job["leave_one_out"] for job in found),
             "search_seconds": median_and_range(job["search"]["cpu_seconds"] for job in found),
         }
@@ -147,9 +135,6 @@ class ForceExperiment(Experiment):
             for label, scores in trial["tests"].items()
         ]
 
-    def _tests(self, trial: Trial) -> Mapping[str, str]:
-        return trial.tests or {trial.scenario: trial.scenario}
-
     def data_job(self, scenario: str, seed: int, *, training: bool) -> Job:
         """The trajectory of that scenario and seed."""
         spec = {
@@ -163,13 +148,7 @@ class ForceExperiment(Experiment):
         return Job(f"force-data/{scenario}/{kind}/seed{seed}", f"{TASKS}:simulate", spec, cost=0.15 * spec["seconds"])
 
 
-def trial_name(trial: Trial, seed: int) -> str:
-    """Where the job of a trial lies."""
-    return f"force-fits/{trial.name}/seed{seed}"
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
+trial_name = "force-fits/{0.name}/seed{1}".format  # where the job of a trial and a seed lies
 
 
 COLUMNS = {
@@ -195,6 +174,11 @@ def score_table(trials: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> 
         for scores in trial["tests"].values()
     ]
     return markdown_table(head, rows)
+
+
+def trials_on(scenario: str, summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The trials of a summary that were trained on that scenario."""
+    return [trial for trial in summary["trials"] if trial["scenario"] == scenario]
 
 
 def only_test(trial: Mapping[str, Any]) -> Mapping[str, Any]:

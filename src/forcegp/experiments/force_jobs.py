@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from forcegp.data import Dataset, farthest_rows, rows_in_contact
+from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
+from forcegp.experiments.data import farthest, simulated
 from forcegp.experiments.extrapolation_jobs import TEST_X, TRAIN_X, tool_motion
 from forcegp.experiments.fits import MODEL, search_report
 from forcegp.inference import OptimizerOptions
@@ -17,7 +18,7 @@ from forcegp.jobs import JobStore
 from forcegp.models import IndependentGP, StructuredGP, save_posterior
 from forcegp.models.structured.components import term_slices
 from forcegp.priors import ContactFriction, JointFriction, named_prior
-from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
 from forcegp.simulation.kuka_motion import joint_friction_of, tool_friction_of
 
@@ -45,7 +46,7 @@ def true_curves(posterior: Any) -> dict[str, Law]:
         elif isinstance(term, ContactFriction) and term.axes == "isotropic" and term.inputs == ("velocity",):
             law = _tool_law(config, term.load)
             if law is not None:
-                out[names[which][0]] = _per_speed(law) if term.viscous else law
+                out[names[which][0]] = (lambda speed, law=law: law(speed) / speed) if term.viscous else law
     return out
 
 
@@ -53,11 +54,7 @@ def _joint_law(config: KukaSurfaceConfig, joint: int) -> Law:
     law = joint_friction_of(config)
     if law is None:
         return np.zeros_like
-
-    def resisting(v: np.ndarray) -> np.ndarray:
-        return -law.force(np.asarray(v)[:, None] * np.ones(len(law.coulomb)))[:, joint]
-
-    return resisting
+    return lambda v: -law.force(np.asarray(v)[:, None] * np.ones(len(law.coulomb)))[:, joint]
 
 
 def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
@@ -71,10 +68,6 @@ def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
     return None
 
 
-def _per_speed(law: Law) -> Law:
-    return lambda speed: law(speed) / speed
-
-
 FILE = "data.h5"
 BLACK_BOX, KNOWN_PHYSICS = "independent-gp", "none"
 """Models of the trials that are no prior expressions: a Gaussian process per joint, and no unknown force at all."""
@@ -85,24 +78,18 @@ def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
 
     Where contacts can open, training rows are those that the data show to be in contact.
     """
-    config = KukaSurfaceConfig(seconds=spec["seconds"], seed=spec["seed"], **spec["scenario"])
-    everything = simulate_kuka_surface(config)
+    everything = simulated(spec["seed"], spec["seconds"], **spec["scenario"])
     counts: dict[str, Any] = {"rows_available": len(everything)}
-    if "in_contact" in everything.truth:
+    opens = "in_contact" in everything.truth
+    if opens:
         counts["in_contact_truth"] = float(everything.truth["in_contact"].mean())
     if spec["rows"] is None:
         kept = everything.rows(slice(None, None, spec["every"]))
     else:
-        usable = everything
-        if "in_contact" in everything.truth:
-            usable = rows_in_contact(everything)
+        usable = rows_in_contact(everything) if opens else everything
+        if opens:
             counts["in_contact_detected"] = len(usable) / len(everything)
-        if spec["rows"] > len(usable):
-            raise InvalidInput(
-                f"{spec['rows']} rows are asked for, but {spec['seconds']:g} s of motion have {len(usable)}; ask for "
-                "fewer points or a longer recording."
-            )
-        kept = farthest_rows(usable, spec["rows"])
+        kept = farthest(usable, spec["rows"], spec["seconds"])
     kept.save(folder / FILE)
     return counts | {"rows": len(kept)}
 
@@ -127,9 +114,8 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
         if spec["region"]:
             test = test.rows(tool_motion(test)[0] > TEST_X)
         tests[label] = scores(posterior, test)
-    left_out = posterior.leave_out().total / spec["points"]
-    search = search_report(posterior)
-    return {"tests": tests, "curves": curve_scores(posterior), "leave_one_out": left_out, "search": search}
+    left_out = {"leave_one_out": posterior.leave_out().total / spec["points"]}
+    return {"tests": tests, "curves": curve_scores(posterior), **left_out, "search": search_report(posterior)}
 
 
 def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
@@ -157,9 +143,7 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
         for name, where in (("touching", open_contacts == 0), ("in_the_air", open_contacts > 0)):
             chosen = np.flatnonzero(where)
             kept[f"mae_{name}"] = evaluate(posterior, test.rows(chosen)).mae if chosen.size else None
-    if not posterior.predicts_forces:
-        return kept
-    return kept | _forces(posterior, test)
+    return kept | _forces(posterior, test) if posterior.predicts_forces else kept
 
 
 def _forces(posterior: Any, test: Dataset) -> dict[str, Any]:

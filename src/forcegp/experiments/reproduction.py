@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, unknown_name_message
 from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
 from forcegp.experiments.ablation import Ablation
-from forcegp.experiments.data_efficiency import DataEfficiency, DeepKernel
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.extrapolation import Extrapolation
 from forcegp.experiments.fig2b import Fig2b
@@ -24,7 +21,7 @@ from forcegp.experiments.fig2c import Fig2c
 from forcegp.experiments.fig3 import Fig3
 from forcegp.experiments.fig4 import Fig4
 from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.friction import Friction, Transfer, UnilateralContact
+from forcegp.experiments.force_priors import DataEfficiency, DeepKernel, Friction, Transfer, UnilateralContact
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
 
@@ -45,69 +42,38 @@ FORCE_SMOKE_DATA = DataSettings(train_seconds=5.0, rows=200, test_seconds=5.0, e
 PAPER_POINTS = (100, 200, 400, 600, 800, 1000)
 SMOKE_POINTS = (20, 40)
 
+PAPER: dict[str, Any] = {"data": PAPER_DATA, "settings": PAPER_SEARCH}
+SMOKE: dict[str, Any] = {"data": SMOKE_DATA, "settings": SMOKE_SEARCH, "seeds": (101,)}
+FORCES: dict[str, Any] = {"data": FORCE_DATA, "settings": PAPER_SEARCH, "seeds": FORCE_SEEDS}
+FORCES_SMOKE: dict[str, Any] = {"data": FORCE_SMOKE_DATA, "settings": SMOKE_SEARCH, "seeds": (201,)}
+
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "paper": (
-        Fig2b(
-            data=PAPER_DATA,
-            points=PAPER_POINTS,
-            seeds=PAPER_SEEDS,
-            seeds_many_points=PAPER_SEEDS[:2],
-            few_points=400,
-            settings=PAPER_SEARCH,
-        ),
-        Fig2c(
-            data=PAPER_DATA,
-            points=300,
-            seed=101,
-            points_interval=300,
-            seeds=tuple(range(101, 111)),
-            iterations=150,
-            tolerance=1e-7,
-        ),
-        Fig3(data=PAPER_DATA, points=PAPER_POINTS[:1], seed=101, start=5.0, seconds=3.0, settings=PAPER_SEARCH),
-        Fig4(
-            data=PAPER_DATA,
-            points=PAPER_POINTS,
-            seeds=PAPER_SEEDS[:2],
-            starts=10,
-            seconds=(1.0, 5.0),
-            settings=PAPER_SEARCH,
-        ),
-        Extrapolation(data=PAPER_DATA, points=200, seeds=PAPER_SEEDS[:2], settings=PAPER_SEARCH),
-        Ablation(
-            data=PAPER_DATA, points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:1], settings=PAPER_SEARCH, cutoffs=(30.0,)
-        ),
+        Fig2b(points=PAPER_POINTS, seeds=PAPER_SEEDS, seeds_many_points=PAPER_SEEDS[:2], few_points=400, **PAPER),
+        Fig2c(PAPER_DATA, 300, 101, points_interval=300, seeds=tuple(range(101, 111)), iterations=150, tolerance=1e-7),
+        Fig3(points=PAPER_POINTS[:1], seed=101, start=5.0, seconds=3.0, **PAPER),
+        Fig4(points=PAPER_POINTS, seeds=PAPER_SEEDS[:2], starts=10, seconds=(1.0, 5.0), **PAPER),
+        Extrapolation(points=200, seeds=PAPER_SEEDS[:2], **PAPER),
+        Ablation(points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:1], cutoffs=(30.0,), **PAPER),
     ),
     "smoke": (
-        Fig2b(
-            data=SMOKE_DATA,
-            points=SMOKE_POINTS,
-            seeds=(101,),
-            seeds_many_points=(101,),
-            few_points=SMOKE_POINTS[-1],
-            settings=SMOKE_SEARCH,
-        ),
-        Fig2c(data=SMOKE_DATA, points=40, seed=101, points_interval=30, seeds=(101,), iterations=8, tolerance=1e-6),
-        Fig3(data=SMOKE_DATA, points=SMOKE_POINTS, seed=101, start=1.0, seconds=1.0, settings=SMOKE_SEARCH),
-        Fig4(data=SMOKE_DATA, points=SMOKE_POINTS, seeds=(101,), starts=2, seconds=(0.1, 0.2), settings=SMOKE_SEARCH),
-        Extrapolation(data=SMOKE_DATA, points=30, seeds=(101,), settings=SMOKE_SEARCH),
-        Ablation(data=SMOKE_DATA, points=SMOKE_POINTS, seeds=(101,), settings=SMOKE_SEARCH, cutoffs=(30.0,), steps=20),
+        Fig2b(points=SMOKE_POINTS, seeds_many_points=(101,), few_points=SMOKE_POINTS[-1], **SMOKE),
+        Fig2c(SMOKE_DATA, 40, 101, points_interval=30, seeds=(101,), iterations=8, tolerance=1e-6),
+        Fig3(SMOKE_DATA, SMOKE_POINTS, 101, start=1.0, seconds=1.0, settings=SMOKE_SEARCH),
+        Fig4(points=SMOKE_POINTS, starts=2, seconds=(0.1, 0.2), **SMOKE),
+        Extrapolation(points=30, **SMOKE),
+        Ablation(points=SMOKE_POINTS, cutoffs=(30.0,), steps=20, **SMOKE),
     ),
     "forces": (
-        DataEfficiency(data=FORCE_DATA, points=(10, 20, 50, 100), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
-        Friction(data=FORCE_DATA, points=(200,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
-        Transfer(data=FORCE_DATA, points=(100,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
-        UnilateralContact(data=FORCE_DATA, points=(200,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
-        DeepKernel(data=FORCE_DATA, points=(200,), seeds=FORCE_SEEDS, settings=PAPER_SEARCH),
+        DataEfficiency(points=(10, 20, 50, 100), **FORCES),
+        Friction(points=(200,), **FORCES),
+        Transfer(points=(100,), **FORCES),
+        UnilateralContact(points=(200,), **FORCES),
+        DeepKernel(points=(200,), **FORCES),
     ),
     "forces-smoke": (
-        DataEfficiency(
-            data=FORCE_SMOKE_DATA, points=(10, 20), seeds=(201,), settings=SMOKE_SEARCH, region_points=SMOKE_POINTS[0]
-        ),
-        Friction(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
-        Transfer(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
-        UnilateralContact(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
-        DeepKernel(data=FORCE_SMOKE_DATA, points=(20,), seeds=(201,), settings=SMOKE_SEARCH),
+        DataEfficiency(points=(10, 20), region_points=SMOKE_POINTS[0], **FORCES_SMOKE),
+        *(kind(points=(20,), **FORCES_SMOKE) for kind in (Friction, Transfer, UnilateralContact, DeepKernel)),
     ),
 }
 
@@ -156,24 +122,21 @@ class Page:
     introduction: str
 
 
-PAPER = Page("reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
-FORCES = Page("force-priors", "Force priors: results", FORCES_INTRODUCTION)
-
-TRIAL_PRESETS = ("smoke", "forces-smoke")
-"""Presets that test the machinery; their numbers mean nothing for the models."""
+PAPER_PAGE = Page("reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
+FORCES_PAGE = Page("force-priors", "Force priors: results", FORCES_INTRODUCTION)
+TRIAL_PRESETS = ("smoke", "forces-smoke")  # presets that test the machinery; their numbers mean nothing for the models
 
 
 def page_of(preset: str) -> Page:
     """The page of the results of that preset."""
-    return FORCES if preset.startswith("forces") else PAPER
+    return FORCES_PAGE if preset.startswith("forces") else PAPER_PAGE
 
 
 def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]]) -> str:
     """Markdown from the documents of the experiments: one section for each, then the times."""
     preset = documents[experiments[0].name]["preset"]
     page = page_of(preset)
-    parts = [f"# {page.title}"]
-    parts.append(page.introduction.format(command=documents[experiments[0].name]["command"]))
+    parts = [f"# {page.title}", page.introduction.format(command=documents[experiments[0].name]["command"])]
     if preset in TRIAL_PRESETS:
         parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers mean nothing for the models.**")
     for experiment in experiments:
@@ -237,14 +200,16 @@ def reproduce(
     for experiment in experiments:
         experiment.require_possible()
     results = JobStore.open(out, KIND, {"preset": preset})
-    for root in (out, docs) if docs is not None else (out,):
+    roots = (out,) if docs is None else (out, docs)
+    for root in roots:
         _make_folder(root / page_of(preset).name)
     jobs = {job.name: job for experiment in experiments for job in experiment.jobs()}
     run_jobs(results, list(jobs.values()), backend, progress)
-    documents, pictures, tables = {}, {}, {}
+    documents, pictures = {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)
         figures = experiment.figures(summary, results)
+        pictures |= figures
         stored = {job.name: results.load(job.name) for job in experiment.jobs()}
         documents[experiment.name] = {
             "kind": KIND,
@@ -258,28 +223,16 @@ def reproduce(
             "warnings": {name: job["warnings"] for name, job in stored.items() if job["warnings"]},
             "summary": summary,
         }
-        pictures |= figures
-        tables[experiment.name] = as_csv(experiment.rows(summary))
-    for root in (out, docs) if docs is not None else (out,):
-        _publish(root, preset, experiments, documents, pictures, tables)
+    for root in roots:
+        beside = root / page_of(preset).name
+        for name, figure in pictures.items():
+            save_figure(figure, beside / f"{name}.png")
+        for experiment in experiments:
+            document = documents[experiment.name]
+            write_json(beside / f"{experiment.name}.json", document)
+            write_text(beside / f"{experiment.name}.csv", as_csv(experiment.rows(document["summary"])))
+        write_text(root / page_name(experiments, preset), report(experiments, documents))
     return {name: document["summary"] for name, document in documents.items()}
-
-
-def _publish(
-    root: Path,
-    preset: str,
-    experiments: Sequence[Experiment],
-    documents: Mapping[str, Mapping[str, Any]],
-    pictures: Mapping[str, Figure],
-    tables: Mapping[str, str],
-) -> None:
-    beside = root / page_of(preset).name
-    for name, figure in pictures.items():
-        save_figure(figure, beside / f"{name}.png")
-    for name, document in documents.items():
-        write_json(beside / f"{name}.json", document)
-        write_text(beside / f"{name}.csv", tables[name])
-    write_text(root / page_name(experiments, preset), report(experiments, documents))
 
 
 def page_name(experiments: Sequence[Experiment], preset: str) -> str:

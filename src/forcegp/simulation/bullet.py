@@ -4,7 +4,6 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ class BulletArm:
         self.bullet: Any = pybullet
         self.time_step = time_step
         self.client = pybullet.connect(pybullet.DIRECT)
+        self._client = {"physicsClientId": self.client}
         try:
             self._load(urdf, gravity, time_step, tool_point)
         except BaseException:
@@ -41,7 +41,7 @@ class BulletArm:
             raise
 
     def _load(self, urdf: str, gravity: float, time_step: float, tool_point: Sequence[float]) -> None:
-        bullet, client = self.bullet, {"physicsClientId": self.client}
+        bullet, client = self.bullet, self._client
         bullet.setGravity(0.0, 0.0, -gravity, **client)
         bullet.setPhysicsEngineParameter(fixedTimeStep=time_step, numSubSteps=0, **client)
         with tempfile.TemporaryDirectory() as folder:
@@ -50,15 +50,13 @@ class BulletArm:
             # Without this flag Bullet would compute the inertia of every link from its (missing) collision shape.
             flags = bullet.URDF_USE_INERTIA_FROM_FILE
             self.body = bullet.loadURDF(str(path), useFixedBase=True, flags=flags, **client)
-        information = [
-            bullet.getJointInfo(self.body, index, **client) for index in range(bullet.getNumJoints(self.body, **client))
-        ]
+        joints = range(bullet.getNumJoints(self.body, **client))
+        information = [bullet.getJointInfo(self.body, index, **client) for index in joints]
         for link in range(-1, len(information)):
             # Damping of links is 0.04 by default. Masses must not be changed in this way: the mass matrix would go
             # stale (bullet3 issue 4809); they are in the URDF.
-            bullet.changeDynamics(
-                self.body, link, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6, **client
-            )
+            undamped = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e6}
+            bullet.changeDynamics(self.body, link, **undamped, **client)
         moving = [joint for joint in information if joint[2] == bullet.JOINT_REVOLUTE]
         self.joints = [joint[0] for joint in moving]
         frames = bullet.getLinkStates(self.body, self.joints, **client)
@@ -76,9 +74,7 @@ class BulletArm:
     def __enter__(self) -> "BulletArm":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -89,24 +85,21 @@ class BulletArm:
     def reset(self, q: Float[np.ndarray, " nv"], v: Float[np.ndarray, " nv"]) -> None:
         """Put the arm into a state."""
         for index, position, velocity in zip(self.joints, q.tolist(), v.tolist(), strict=True):
-            self.bullet.resetJointState(self.body, index, position, velocity, physicsClientId=self.client)
+            self.bullet.resetJointState(self.body, index, position, velocity, **self._client)
 
     def state(self) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " nv"]]:
         """Joint positions [rad] and velocities [rad/s]."""
-        states = self.bullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
+        states = self.bullet.getJointStates(self.body, self.joints, **self._client)
         return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 
     def mass_matrix(self, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray, "nv nv"]:
         """Joint-space inertia [kg m^2]."""
-        return np.array(self.bullet.calculateMassMatrix(self.body, q.tolist(), physicsClientId=self.client))
+        return np.array(self.bullet.calculateMassMatrix(self.body, q.tolist(), **self._client))
 
     def bias_forces(self, q: Float[np.ndarray, " nv"], v: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
         """Coriolis, centrifugal and gravity torques [Nm]: what holds the joint acceleration at zero."""
-        return np.array(
-            self.bullet.calculateInverseDynamics(
-                self.body, q.tolist(), v.tolist(), self._zeros, physicsClientId=self.client
-            )
-        )
+        state = (q.tolist(), v.tolist(), self._zeros)
+        return np.array(self.bullet.calculateInverseDynamics(self.body, *state, **self._client))
 
     def tool(
         self, v: Float[np.ndarray, " nv"]
@@ -117,9 +110,7 @@ class BulletArm:
         et al., Robotics, section 3.1.3). With `w_i = z_1 v_1 + ... + z_i v_i`, the angular velocity of link i,
         `Jdot v = sum_i v_i [(w_i + w_(i-1)) x l_i; w_i x z_i]`.
         """
-        states = self.bullet.getLinkStates(
-            self.body, self.joints, computeForwardKinematics=1, physicsClientId=self.client
-        )
+        states = self.bullet.getLinkStates(self.body, self.joints, computeForwardKinematics=1, **self._client)
         # Poses of the centres of mass: PyBullet gives the link frames in single precision only.
         turned = _rotation_matrices([state[1] for state in states]) @ self._local
         axes, centers = turned[:, :, 0], turned[:, :, 1]
@@ -137,10 +128,9 @@ class BulletArm:
         """Advance by one time step under joint torques [Nm]. Raises SimulationError if they are not finite."""
         if not np.isfinite(torques).all():
             raise SimulationError("the torques are not finite; the simulated motion has diverged.")
-        self.bullet.setJointMotorControlArray(
-            self.body, self.joints, self.bullet.TORQUE_CONTROL, forces=torques.tolist(), physicsClientId=self.client
-        )
-        self.bullet.stepSimulation(physicsClientId=self.client)
+        how = {"forces": torques.tolist(), **self._client}
+        self.bullet.setJointMotorControlArray(self.body, self.joints, self.bullet.TORQUE_CONTROL, **how)
+        self.bullet.stepSimulation(**self._client)
 
 
 def _without_limits_and_damping(urdf: str) -> str:

@@ -142,20 +142,19 @@ class NoContact:
         return ContactForces(0.0, np.zeros(3), np.zeros_like(applied), False)
 
 
+@dataclass
 class IdealContact:
     """The tool point stays on the table from its first touch on: `A a = b` with Baumgarte's b, and friction there.
 
     `omega` [rad/s] and `zeta` stabilise the constraint; where a `patch` is given friction is scaled with the place.
     """
 
-    def __init__(
-        self, table: Table, friction: PointFriction, omega: float, zeta: float, patch: RoughPatch | None = None
-    ):
-        self.table = table
-        self.friction = friction
-        self.omega, self.zeta = omega, zeta
-        self.patch = patch
-        self.touched = False
+    table: Table
+    friction: PointFriction
+    omega: float
+    zeta: float
+    patch: RoughPatch | None = None
+    touched: bool = False
 
     def step(self, arm: BulletArm, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
         """Advance the arm by one step under the torques of actuators and joint friction [Nm] and those of the table.

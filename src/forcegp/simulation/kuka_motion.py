@@ -79,29 +79,26 @@ def _original() -> Path:
 def _write_inertial(
     inertial: ElementTree.Element, mass: float, center_of_mass: Sequence[float], moments: Sequence[float]
 ) -> None:
-    inertial.clear()
-    ElementTree.SubElement(inertial, "origin", rpy="0 0 0", xyz=_numbers(center_of_mass))
-    ElementTree.SubElement(inertial, "mass", value=repr(float(mass)))
-    diagonal = dict(zip(("ixx", "iyy", "izz"), (repr(float(moment)) for moment in moments), strict=True))
-    ElementTree.SubElement(inertial, "inertia", ixy="0", ixz="0", iyz="0", **diagonal)
+    ixx, iyy, izz = map(float, moments)
+    inertial[:] = ElementTree.fromstring(
+        f'<inertial><origin rpy="0 0 0" xyz="{_numbers(center_of_mass)}"/><mass value="{float(mass)}"/>'
+        f'<inertia ixy="0" ixz="0" iyz="0" ixx="{ixx}" iyy="{iyy}" izz="{izz}"/></inertial>'
+    )
 
 
 def _mount(root: ElementTree.Element, height: float) -> None:
-    joint = ElementTree.Element("joint", name="world_joint", type="fixed")
-    ElementTree.SubElement(joint, "parent", link="world")
-    ElementTree.SubElement(joint, "child", link=BASE_LINK)
-    ElementTree.SubElement(joint, "origin", rpy="0 0 0", xyz=_numbers((0.0, 0.0, height)))
-    root.insert(0, joint)
-    root.insert(0, ElementTree.Element("link", name="world"))
+    joint = (
+        f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
+        f'<origin rpy="0 0 0" xyz="{_numbers((0.0, 0.0, height))}"/></joint>'
+    )
+    root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
 
 
 def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])
-"""Euler angles (0, -pi, 0) as a quaternion (x, y, z, w): the tool points straight down."""
-
+TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])  # quaternion (x, y, z, w): the tool points straight down
 STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
@@ -137,9 +134,7 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table, controller = np.array(config.torque_limits), table_of(config), _controller(config)
     joint_law = joint_friction_of(config)
-    columns = {name: np.zeros((steps + 1, 7)) for name in ("q", "v", "u", "tool_torques", "joint_torques")}
-    tool_force, multiplier, gap = np.zeros((steps, 3)), np.zeros(steps), np.zeros(steps)
-    saturated, in_contact = np.zeros(steps, dtype=bool), np.zeros(steps, dtype=bool)
+    columns: dict[str, np.ndarray] = {}
     if config.contact == "bullet":
         urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
 
@@ -151,7 +146,7 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
         path = PathOverTable.random(config, table, tool, steps * config.time_step, *streams)
         reference = path.sample(config.time_step * np.arange(steps))
         for step in range(steps):
-            aim = (reference[0][step], reference[1][step], reference[2][step])
+            aim = reference[0][step], reference[1][step], reference[2][step]
             _require_bounded(config, arm.state()[1], episode, step)
             state = ArmState.of(arm)
             v = state.v
@@ -169,39 +164,29 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
                 asked = asked - config.pressing_force * (table.normal(state.position) @ state.jacobian[:3])
             commanded = np.clip(asked, -limits, limits)
             u = commanded - config.joint_damping * v
-            applied = u
-            if joint_law is not None:
-                columns["joint_torques"][step] = joint_law.force(v)
-                applied = u + columns["joint_torques"][step]
-            forces = contact.step(arm, state, applied)
-
-            columns["q"][step], columns["v"][step], columns["u"][step] = state.q, v, u
-            columns["tool_torques"][step] = forces.joint_friction_torques
-            tool_force[step], multiplier[step] = forces.friction, forces.normal_force
-            gap[step], in_contact[step] = table.distance(state.position), forces.acts
-            saturated[step] = (commanded != asked).any()
+            joint_torques = np.zeros(7) if joint_law is None else joint_law.force(v)
+            forces = contact.step(arm, state, u + joint_torques)
+            row = {"q": state.q, "v": v, "u": u, "joint_torques": joint_torques}
+            row |= {"tool_force": forces.friction, "tool_torques": forces.joint_friction_torques}
+            row |= {"multiplier": forces.normal_force, "in_contact": forces.acts, "gap": table.distance(state.position)}
+            row["saturated"] = (commanded != asked).any()
+            if step == 0:
+                columns = {name: np.zeros((steps, *np.shape(x)), np.asarray(x).dtype) for name, x in row.items()}
+            for name, value in row.items():
+                columns[name][step] = value
             if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
                 report(step + 1)
-        columns["q"][steps], columns["v"][steps] = arm.state()
-        _require_bounded(config, columns["v"][steps], episode, steps)
+        last_v = arm.state()[1]
+        _require_bounded(config, last_v, episode, steps)
 
-    if config.surface != "none" and not in_contact[: settle + 1].any():
+    if config.surface != "none" and not columns["in_contact"][: settle + 1].any():
         raise SimulationError(
             f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
             "Give it more time, or a start posture nearer to the surface."
         )
-    recorded = slice(settle, steps)
-    acceleration = np.diff(columns["v"], axis=0) / config.time_step
-    return Motion(
-        **{name: values[recorded] for name, values in columns.items()},
-        a=acceleration[recorded],
-        multiplier=multiplier[recorded],
-        tool_force=tool_force[recorded],
-        in_contact=in_contact[recorded],
-        gap=gap[recorded],
-        saturated=saturated[recorded],
-        time=config.time_step * np.arange(settle, steps),
-    )
+    columns["a"] = np.diff(columns["v"], axis=0, append=last_v[None]) / config.time_step
+    columns["time"] = config.time_step * np.arange(steps)
+    return Motion(**{name: values[settle:] for name, values in columns.items()})
 
 
 def _controller(config: KukaSurfaceConfig) -> TaskSpaceController:

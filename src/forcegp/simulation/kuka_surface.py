@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import numpy as np
 
@@ -45,11 +46,9 @@ def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None =
     )
     robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
     motions = []
-    per_episode = config.steps // config.episodes
     for episode in range(config.episodes):
-        done = episode * per_episode
 
-        def report(step: int, done: int = done) -> None:
+        def report(step: int, done: int = episode * config.steps // config.episodes) -> None:
             if progress is not None:
                 progress(done + step, config.steps)
 
@@ -92,12 +91,8 @@ def _system(config: KukaSurfaceConfig, robot: Robot) -> MechanicalSystem:
     )
 
 
-def _truth(config: KukaSurfaceConfig, motions: list[Motion]) -> dict[str, np.ndarray]:
+def _truth(config: KukaSurfaceConfig, column: Callable[[str], np.ndarray]) -> dict[str, np.ndarray]:
     """Every true force of the rows, as far as it exists."""
-
-    def column(name: str) -> np.ndarray:
-        return np.concatenate([getattr(motion, name) for motion in motions])
-
     truth, parts = {"a": column("a")}, {}
     if config.surface != "none":
         truth["lambda"] = column("multiplier")[:, None]
@@ -111,22 +106,20 @@ def _truth(config: KukaSurfaceConfig, motions: list[Motion]) -> dict[str, np.nda
 
 
 def _dataset(config: KukaSurfaceConfig, robot: Robot, motions: list[Motion]) -> Dataset:
-    true_acceleration = np.concatenate([motion.a for motion in motions])
-    noise = [
-        random_stream(config, episode, 1).standard_normal(motion.a.shape) for episode, motion in enumerate(motions)
-    ]
+    def column(name: str) -> np.ndarray:
+        return np.concatenate([getattr(motion, name) for motion in motions])
+
+    noise = [random_stream(config, number, 1).standard_normal(motion.a.shape) for number, motion in enumerate(motions)]
+    signals: dict[str, Any] = {name: column(name) for name in ("q", "v", "u", "time")}
     return Dataset(
-        q=np.concatenate([motion.q for motion in motions]),
-        v=np.concatenate([motion.v for motion in motions]),
-        u=np.concatenate([motion.u for motion in motions]),
-        a=true_acceleration + config.noise * np.concatenate(noise),
-        time=np.concatenate([motion.time for motion in motions]),
+        **signals,
+        a=column("a") + config.noise * np.concatenate(noise),
         episode=np.repeat(np.arange(config.episodes), config.rows_per_episode),
         joint_names=tuple(robot.joint_names),
         units=units_for(robot),
         system=_system(config, robot),
         noise_std=np.full(robot.nv, config.noise) if config.noise > 0 else None,
-        truth=_truth(config, motions),
+        truth=_truth(config, column),
         metadata={
             "scenario": "kuka-surface",
             "config": dataclasses.asdict(config),

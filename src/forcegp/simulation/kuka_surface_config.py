@@ -204,7 +204,7 @@ class KukaSurfaceConfig:
         if self.friction is None:
             object.__setattr__(self, "friction", "coulomb" if self.contact == "bullet" else "viscous")
         for name, choices in _CHOICES.items():
-            require_choice(name, getattr(self, name), choices)
+            require_choice(name, getattr(self, name), get_args(choices))
         self._require_parts_that_fit()
 
     def _require_parts_that_fit(self) -> None:
@@ -234,25 +234,19 @@ class KukaSurfaceConfig:
     @property
     def pressing_force(self) -> float:
         """Force towards the surface that the controller adds [N]."""
-        if self.surface == "none":
-            return 0.0
-        if self.press is None:
-            return 0.0 if self.friction == "viscous" else PRESS_FOR_DRY_FRICTION
-        return self.press
+        usual = 0.0 if self.surface == "none" or self.friction == "viscous" else PRESS_FOR_DRY_FRICTION
+        return usual if self.press is None or self.surface == "none" else self.press
 
     @property
     def waypoint_height(self) -> float:
         """Height of way-points in the middle of their region [m], which follow the surface elsewhere."""
-        if self.surface == "none":
-            return self.surface_height + self.clearance
-        return self.surface_height - self.waypoint_depth
+        return self.surface_height + (self.clearance if self.surface == "none" else -self.waypoint_depth)
 
     @property
     def share_of_lifts(self) -> float:
         """Share of way-points above the surface."""
-        if self.lift_share is None:
-            return LIFT_SHARE_OF_BULLET if self.contact == "bullet" else 0.0
-        return self.lift_share
+        usual = LIFT_SHARE_OF_BULLET if self.contact == "bullet" else 0.0
+        return usual if self.lift_share is None else self.lift_share
 
     @property
     def rows_per_episode(self) -> int:
@@ -296,12 +290,7 @@ _RANGES: dict[str, Range] = {
     **dict.fromkeys(_FINITE, FINITE),
 }
 _LENGTHS = {item.name: len(item.default) for item in fields(KukaSurfaceConfig) if isinstance(item.default, tuple)}
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "friction": get_args(Friction),
-    "joint_friction": get_args(JointFriction),
-    "surface": get_args(Surface),
-    "contact": get_args(ContactKind),
-}
+_CHOICES = {"friction": Friction, "joint_friction": JointFriction, "surface": Surface, "contact": ContactKind}
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,9 @@ from jaxtyping import Float
 import forcegp.mechanics
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 
+Heights = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]
+Motions = tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]
+
 
 @dataclass(frozen=True, eq=False)
 class FlatTable:
@@ -36,9 +39,7 @@ class FlatTable:
         """`p'^T s_pp p'` [m/s^2], the part of the distance's second derivative that is due to curvature."""
         return 0.0
 
-    def height(
-        self, xy: Float[np.ndarray, "times 2"]
-    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+    def height(self, xy: Float[np.ndarray, "times 2"]) -> Heights:
         """Height [m] above the surface's middle, its gradient and its Hessian [1/m] in x and y."""
         slope = -self.upward[:2] / self.upward[2]
         return (xy - self.middle[:2]) @ slope, np.broadcast_to(slope, xy.shape), np.zeros((len(xy), 2, 2))
@@ -69,9 +70,7 @@ class SphericalTable:
         """`(|p'|^2 - (n . p')^2) / |p - center|`."""
         return float((velocity @ velocity - (self.normal(p) @ velocity) ** 2) / np.linalg.norm(p - self.center))
 
-    def height(
-        self, xy: Float[np.ndarray, "times 2"]
-    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]:
+    def height(self, xy: Float[np.ndarray, "times 2"]) -> Heights:
         """`h = sqrt(R^2 - r^2) - R`, `h_x = -r / (h + R)`, `h_xx = -(1 + h_x h_x^T) / (h + R)`."""
         ray = xy - self.center[:2]
         rise = np.sqrt(self.radius**2 - (ray**2).sum(axis=1))
@@ -115,9 +114,7 @@ class SegmentPath:
     durations: Float[np.ndarray, " segments"]
     accelerations: Float[np.ndarray, " segments"]
 
-    def sample(
-        self, time: Float[np.ndarray, " times"]
-    ) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]:
+    def sample(self, time: Float[np.ndarray, " times"]) -> Motions:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; at rest before and after."""
         starts = np.concatenate([[0.0], np.cumsum(self.durations)])
         segment = np.clip(np.searchsorted(starts, time, side="right") - 1, 0, len(self.durations) - 1)
@@ -170,9 +167,7 @@ class PathOverTable:
         origin[2] -= table.height(origin[None, :2])[0][0]
         return cls(random_path(config, origin, seconds, rng, lifts), table)
 
-    def sample(
-        self, time: Float[np.ndarray, " times"]
-    ) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]:
+    def sample(self, time: Float[np.ndarray, " times"]) -> Motions:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; z and h by the chain rule."""
         position, velocity, acceleration = self.path.sample(time)
         height, gradient, hessian = self.table.height(position[:, :2])

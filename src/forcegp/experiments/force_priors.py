@@ -1,0 +1,285 @@
+"""The experiments on force priors: data efficiency, friction as it is, other contacts, one that opens, deep kernels."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi
+from typing import Any
+
+from matplotlib.figure import Figure
+from typing_extensions import override
+
+from forcegp.evaluation import friction_curves_figure, normal_force_figure
+from forcegp.evaluation.metrics import formatted, markdown_table, medians
+from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
+from forcegp.experiments import published
+from forcegp.experiments.experiment import heading
+from forcegp.experiments.figures import draw_range
+from forcegp.experiments.force_experiment import (
+    LABELS,
+    ForceExperiment,
+    Trial,
+    dots_figure,
+    only_test,
+    plain_ticks,
+    score_table,
+    trial_name,
+    trials_on,
+)
+from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS, MODEL, load
+from forcegp.jobs import JobStore
+from forcegp.models import load_posterior
+
+EFFICIENT = {
+    "joint forces on (q, v, u), the paper's": "joint",
+    "tool friction": "tool-friction",
+    "contact friction, isotropic": "contact-friction",
+}
+
+
+@dataclass(frozen=True)
+class DataEfficiency(ForceExperiment):
+    """Every prior with the analytical mean at growing N; `region_points` of them for the extrapolation."""
+
+    name, title = "data-efficiency", "Data efficiency"
+
+    region_points: int = 50
+
+    @override
+    def trials(self) -> list[Trial]:
+        curves = [Trial(label, "viscous", prior, n) for label, prior in EFFICIENT.items() for n in self.points]
+        region = [Trial(label, "viscous", prior, self.region_points, region=True) for label, prior in EFFICIENT.items()]
+        return [*curves, *region]
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
+        figure = new_figure(8.6, 3.8)
+        panels = figure.subplots(1, 2)
+        scores = {"mae": "against noisy accelerations", "mae_noise_free": "against noise-free ones"}
+        for axes, (score, title) in zip(panels, scores.items(), strict=True):
+            for color, label in zip((SERIES[1], SERIES[0], SERIES[2]), EFFICIENT, strict=True):
+                trials = [trial for trial in summary["trials"] if trial["label"] == label and not trial["region"]]
+                draw_range(axes, {trial["points"]: only_test(trial)[score] for trial in trials}, color, label)
+            axes.set(xscale="log", yscale="log")
+            quiet(axes, title=f"MAE {title} [rad/s²]", x="training points N", y="")
+        paper = published.FIG2B_MAE["s-gp-mean"]
+        label = "S-GP + mean, published (2021)"
+        panels[0].plot(list(paper), list(paper.values()), color=QUIET, linestyle="--", linewidth=1.0, label=label)
+        perfect = published.NOISE_STD * (2.0 / pi) ** 0.5
+        panels[0].axhline(perfect, color=QUIET, linewidth=0.8, label="a perfect prediction")
+        for axes in panels:
+            plain_ticks(axes.xaxis)
+            plain_ticks(axes.yaxis)
+        legend_below(figure, panels[0], columns=2)
+        return {"data-efficiency": figure}
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        columns = ("mae", "mae_noise_free", "nlpd", "coverage_95", "normal_force_error", "normal_force_coverage")
+        outside, inside = ([t for t in summary["trials"] if t["region"] == region] for region in (True, False))
+        best = published.FIG2B_MAE["s-gp-mean"][1000]
+        return "\n\n".join(
+            [
+                f"The paper's scenario, analytical mean, {len(self.seeds)} seeds. The paper's best model has an MAE of "
+                f"{best} with 1000 points. A perfect one has the mean of the noise: 0.0798 in the long run, on these "
+                f"test rows {formatted(only_test(inside[0]).get('mae_of_truth'))}.",
+                score_table(inside, columns),
+                "**Extrapolation**: trained on rows with the tool at x < 0, tested at x > 0.1 m.",
+                score_table(outside, columns[:4]),
+            ]
+        )
+
+
+JOINT_FORCES = "joint forces (the paper's)"
+TOOL = {
+    JOINT_FORCES: "joint",
+    "tool friction": "tool-friction",
+    "tool forces on velocity and place": "tool-forces",
+    "contact friction": "contact-friction",
+    "load friction": "load-friction",
+}
+WITH_JOINTS = {
+    JOINT_FORCES: "joint",
+    "joint + tool friction": "joint-friction+tool-friction",
+    "joint + contact friction": "joint-friction+contact-friction",
+    "joint + load friction": "joint-friction+load-friction",
+}
+PRIORS = dict.fromkeys(("viscous", "coulomb", "stribeck"), TOOL)
+PRIORS |= dict.fromkeys(("viscous-joints", "stribeck-joints"), WITH_JOINTS)
+PICTURED = ("stribeck-joints", "joint + load friction")
+
+
+@dataclass(frozen=True)
+class Friction(ForceExperiment):
+    """Every prior that means something in a scenario, at one number of points."""
+
+    name, title = "friction", "Friction as it is"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [
+            Trial(label, scenario, prior, points)
+            for scenario, priors in PRIORS.items()
+            for label, prior in priors.items()
+            for points in self.points
+        ]
+
+    @override
+    def figures(self, summary: Mapping[str, Any], results: JobStore) -> dict[str, Figure]:
+        groups = {
+            LABELS[scenario]: {trial["label"]: only_test(trial) for trial in trials_on(scenario, summary)}
+            for scenario in ("stribeck", "stribeck-joints")
+        }
+        (pictured,) = [t for t in self.trials()[:: len(self.points)] if (t.scenario, t.label) == PICTURED]
+        seed = self.seeds[0]
+        posterior = load_posterior(results.place(trial_name(pictured, seed)) / MODEL)
+        test = load(results, self.data_job(pictured.scenario, seed, training=False).name)
+        return {
+            "friction-errors": dots_figure(groups, "mae_noise_free", "mean absolute error, noise-free [rad/s²]"),
+            "friction-curves": friction_curves_figure(posterior, test),
+            "friction-normal-force": normal_force_figure(posterior, test),
+        }
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        columns = ("mae", "mae_noise_free", "normal_force_error", "normal_force_coverage", "component_sum_error")
+        parts = [
+            f"{', '.join(map(str, self.points))} points, analytical mean, {len(self.seeds)} seeds. The normal force is "
+            "that of the simulation; its error is relative to its own root mean square. “Sum of components” is the "
+            "largest difference between the sum of all component forces and the total. “Curve in its band” is "
+            "the share of the visited velocities at which the 95 % band of a friction curve holds the law that was "
+            "simulated, mean over the model's curves, where its prior has such a law. The pictures show the last model "
+            "of the last table."
+        ]
+        for scenario in PRIORS:
+            trials = trials_on(scenario, summary)
+            parts += [heading(LABELS[scenario]), score_table(trials, columns)]
+            curves = [
+                f"{trial['label']} {formatted(trial['curve_coverage_of_seeds'], 3)}"
+                for trial in trials
+                if trial["curve_coverage_of_seeds"] is not None
+            ]
+            if curves:
+                parts.append(f"Curve in its band: {'; '.join(curves)}.")
+        return "\n\n".join(parts)
+
+
+SURFACES = {"plane": "viscous", "tilted plane": "tilted", "sphere": "sphere"}
+SURFACES_AND_JOINTS = {
+    "plane": "viscous-joints",
+    "tilted plane": "tilted-joints",
+    "sphere": "sphere-joints",
+    "free motion": "free-joints",
+}
+
+
+@dataclass(frozen=True)
+class Transfer(ForceExperiment):
+    """Trained on the plane, tested on every other surface."""
+
+    name, title = "transfer", "Transfer to other contacts"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [
+            Trial(label, scenario, priors[label], points, tests)
+            for points in self.points
+            for scenario, priors, tests, labels in (
+                ("viscous", TOOL, SURFACES, ("tool friction", "contact friction", JOINT_FORCES)),
+                ("viscous-joints", WITH_JOINTS, SURFACES_AND_JOINTS, ("joint + tool friction", JOINT_FORCES)),
+            )
+            for label in labels
+        ]
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        parts = [
+            f"`posterior.with_contacts(...)`: trained on the plane, analytical mean, {len(self.seeds)} seeds; MAE "
+            "against noise-free accelerations [rad/s²], and in brackets how many times as large as on the plane "
+            "(ratio of medians)."
+        ]
+        for scenario, tests, title in (
+            ("viscous", SURFACES, "Viscous friction at the tool"),
+            ("viscous-joints", SURFACES_AND_JOINTS, "Viscous friction at the tool, Stribeck friction in the joints"),
+        ):
+            rows = []
+            for trial in trials_on(scenario, summary):
+                home = trial["tests"]["plane"]["mae_noise_free"]
+                errors = [trial["tests"][label]["mae_noise_free"] for label in tests]
+                cells = [f"{formatted(error)} [{error['median'] / home['median']:.2f}]" for error in errors]
+                rows.append([trial["label"], str(trial["points"]), *cells])
+            parts += [f"**{title}**", markdown_table(["model", "points", *tests], rows)]
+        return "\n\n".join(parts)
+
+
+MODELS = {
+    "known physics alone": KNOWN_PHYSICS,
+    "independent GP": BLACK_BOX,
+    **{label: TOOL[label] for label in (JOINT_FORCES, "tool friction", "contact friction", "load friction")},
+}
+
+
+@dataclass(frozen=True)
+class UnilateralContact(ForceExperiment):
+    """Trained on rows that the data show to be in contact."""
+
+    name, title = "unilateral-contact", "A contact that opens and closes"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [Trial(label, "bullet", prior, points) for label, prior in MODELS.items() for points in self.points]
+
+    @override
+    def summary(self, results: JobStore) -> dict[str, Any]:
+        found = [results.result(self.data_job("bullet", seed, training=True).name) for seed in self.seeds]
+        return super().summary(results) | medians(found, ("in_contact_truth", "in_contact_detected"))
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        columns = ("mae", "mae_noise_free", "mae_touching", "mae_in_the_air", "coverage_95", "normal_force_error")
+        return (
+            "PyBullet's unilateral contact with Coulomb friction, from which the tool lifts now and then: "
+            f"{formatted(summary['in_contact_truth'], 3)} of the rows are in contact, "
+            f"{formatted(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
+            f"accelerations alone (`forcegp.data.rows_in_contact`); models are trained on these. "
+            f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
+            "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.\n\n"
+        ) + score_table(summary["trials"], columns)
+
+
+KERNELS = {
+    "squared exponential": "friction-map",
+    "Matérn 3/2": "friction-map:kernel=matern-3/2",
+    "deep": "friction-map:kernel=deep",
+}
+STRIP = ("patch", "viscous")
+
+
+@dataclass(frozen=True)
+class DeepKernel(ForceExperiment):
+    """A map of friction over the table, on a strip of other friction and without one."""
+
+    name, title = "deep-kernel", "Deep kernels"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [
+            Trial(f"{label} kernel", scenario, prior, points)
+            for scenario in STRIP
+            for points in self.points
+            for label, prior in KERNELS.items()
+        ]
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        parts = [
+            "`friction-map`: viscous friction whose coefficient depends on the place, analytical mean, "
+            f"{len(self.seeds)} seeds. Leave-one-out: log density of a training row given all others, in nats per row, "
+            "from the same fit; the higher, the better. `forcegp compare` chooses by that of stretches of time."
+        ]
+        columns = ("mae_noise_free", "nlpd", "coverage_95")
+        for scenario in STRIP:
+            trials = trials_on(scenario, summary)
+            densities = [f"{t['label']}, N={t['points']}: {formatted(t['leave_one_out'], 3)}" for t in trials]
+            texts = (heading(LABELS[scenario]), score_table(trials, columns))
+            parts += [*texts, f"Leave-one-out: {'; '.join(densities)}."]
+        return "\n\n".join(parts)
