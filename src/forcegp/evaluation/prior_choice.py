@@ -10,6 +10,7 @@ from forcegp.analytical.least_squares import correlation_time
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError
 from forcegp.evaluation.prior_comparison import compare_priors
+from forcegp.inference import Inducing
 from forcegp.mechanics import (
     CoulombJointFriction,
     DirectionalJointFriction,
@@ -18,7 +19,7 @@ from forcegp.mechanics import (
     StribeckJointFriction,
     ViscousJointFriction,
 )
-from forcegp.models import Noise, StructuredGP
+from forcegp.models import Noise, StructuredGP, TrainingData
 from forcegp.priors import named_prior
 
 FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
@@ -71,25 +72,32 @@ def choose_prior(
             )
     except ForceGPError as error:
         return names[0], f"{names[0]}, the usual one {where}; others could not be compared with it ({error})"
-    others = ", ".join(name for name in names if name != found.preferred.name)
-    return (
-        found.preferred.name,
-        f"{found.preferred.name} {where}, compared with {others} on {points} rows: {found.verdict}",
-    )
+    supported = [score.name for score in found.supported]
+    chosen = names[0] if names[0] in supported else found.preferred.name
+    others = ", ".join(name for name in names if name != chosen)
+    by = f"left-out stretches of {found.block_seconds:.3g} s of {points} rows"
+    if chosen == names[0]:
+        return chosen, f"{chosen} {where}; {by} do not show {others} to be better"
+    scores = {score.name: score for score in found.scores}
+    gain = scores[chosen].leave_block_out - scores[names[0]].leave_block_out
+    return chosen, f"{chosen} {where}; by {by} it is better than {names[0]}, by {gain:.3g} nats per row"
 
 
 def independent_rows(model: StructuredGP, dataset: Dataset, seed: int = 0) -> tuple[Dataset, str | None]:
     """Every k-th row, so that what the model leaves of the acceleration is about independent; and a note if k > 1.
 
     Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would
-    count as 20,000 facts. k is the integrated correlation time of the residuals of a fit to `LOOK` rows, in rows.
+    count as 20,000 facts. k is the integrated correlation time, in rows, of what is left after the forces are learned
+    from all of them, at hyper-parameters from `LOOK` rows: what the forces still lack would not be noise.
     """
     if len(dataset) <= FEWEST or not dataset.time_ordered:
         return dataset, None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # the fit gives it
         rough = model.fit(dataset, points=LOOK, restarts=1, seed=seed)
-    some = dataset.rows(slice(RESIDUALS))
+        some = dataset.rows(slice(RESIDUALS))
+        given = replace(TrainingData.of(some, rough.training.q.device), reference=rough.training)
+        rough = rough.model.condition(given, rough.parameters, rough.result, rough.settings, Inducing())
     residual = rough.predict(some.q, some.v, some.u).mean.cpu().numpy() - some.a
     spread = residual.std(axis=0)
     time = correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)
