@@ -29,6 +29,12 @@ AT_ONCE = 256  # points at which a function is differentiated together: its kern
 CURVES: dict[str, tuple[Callable[[Tensor], Tensor], str, str]] = {
     "identity": (lambda z: z, "{z}", "{rate}"),
     "tanh": (torch.tanh, "r_tanh({z})", "{rate} * (1.0 - {y} * {y})"),
+    "beyond": (
+        lambda z: z - z.clamp(-1.0, 1.0),
+        "({z} - 0.5 * (r_sqrt(({z} + 1.0) * ({z} + 1.0)) - r_sqrt(({z} - 1.0) * ({z} - 1.0))))",
+        "{rate} * (1.0 - 0.5 * (({z} + 1.0) / r_sqrt(({z} + 1.0) * ({z} + 1.0) + 1e-300)"
+        " - ({z} - 1.0) / r_sqrt(({z} - 1.0) * ({z} - 1.0) + 1e-300)))",
+    ),
     "asinh": (torch.asinh, "r_asinh({z})", "{rate} / r_sqrt(1.0 + {z} * {z})"),
 }
 """y as a function of z = rate * s: in torch, in C, and its derivative to s in C."""
@@ -286,6 +292,8 @@ def markov_functions(
     constants: dict[tuple[int, ...], Tensor] = {}
     sides, rates, starts, polynomials = [], [], [], [np.zeros((len(knots) + 1, coefficients.shape[1], 0))]
     for number, term in enumerate(terms):
+        if not drawn and not term.factors and not bool(term.columns(centers[:, None]).any()):
+            continue  # nothing at any centre, as of what lies beyond them
         weights, envelope, root = coefficients * float(term.scale), [], widening * math.sqrt(float(term.scale))
         for feature in term.features:
             amplitude, curve = _curve(feature, centers)
@@ -367,6 +375,9 @@ def _curve(points: PointMap, centers: Float[Tensor, " N"]) -> tuple[float, tuple
 
     Whatever its class: value and slope at zero and far away give the numbers; values at all widths and centres decide.
     """
+    owner = getattr(points, "__self__", None)
+    if isinstance(limit := getattr(owner, "limit", None), float):  # its numbers do not show at zero and far away
+        return float(owner.slope) * limit, ("beyond", 1.0 / limit)  # type: ignore[union-attr]  # it has both
     values, slopes = value_and_slope(lambda s: points(s[:, None]), centers.new_tensor([0.0, FAR]))
     if values.shape[1] == 1:
         (a, c), (b, d) = values[:, 0].tolist(), slopes[:, 0].tolist()

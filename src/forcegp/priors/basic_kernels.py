@@ -167,6 +167,8 @@ WIDTH = 0.1
 """Start value of the velocity at which dry friction is developed, as a fraction of the rms velocity."""
 
 WIDTH_LOG_SPREAD = 1.0
+NOWHERE = 1e9
+"""Largest velocity before any is visited."""
 
 
 def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
@@ -175,13 +177,13 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     phi(s) = tanh(s / w) is zero at rest; g = c + h(s) is the level of dry friction, a constant (Coulomb) and a function
     of velocity (Stribeck's dip, and a difference between the two directions); d is viscous:
 
-        k = tanh(s / w) tanh(s' / w) (c^2 + r^2 exp(-|x(s) - x(s')| / l)) + d^2 s s',   x(s) = asinh(s / w')
+        k = tanh(s / w) tanh(s' / w) (c^2 + r^2 exp(-|x(s) - x(s')| / l)) + d^2 s s' + e(s) e(s'),  x(s) = asinh(s / w')
 
     x counts velocity by factors, like the logarithm, but passes through zero: dry friction changes within a small
-    velocity near rest, and little beyond. Each of the three shares gets a third of `variance` at the start; w and w'
-    start at 0.1, l at 1; all have log-normal priors about their start values, of a spread of 1, variances of 2. h is
-    rough (Matern 1/2): smoother ones are as good where a law bends slowly, and fail where it bends within a few cm/s
-    (docs/forces.md).
+    velocity near rest, and little beyond. e is zero at visited velocities (`BeyondVisitedKernel`). Each of the three
+    shares gets a third of `variance` at the start; w and w' start at 0.1, l at 1; all have log-normal priors about
+    their start values, of a spread of 1, variances of 2. h is rough (Matern 1/2): smoother ones are as good where a law
+    bends slowly, and fail where it bends within a few cm/s (docs/forces.md).
     Source of the law: Olsson et al., "Friction models and friction compensation", Eur. J. Control (1998), section 2.
     """
     if dimension != 1:
@@ -194,7 +196,8 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     change.outputscale = share
     register_log_normal_prior(change, "outputscale", share, LOG_VARIANCE_SPREAD)
     level = AdditiveKernel(constant(1, share), change)
-    return AdditiveKernel(ProductKernel(SmoothSignKernel(), level), linear(1, share))
+    viscous = linear(1, share)
+    return AdditiveKernel(ProductKernel(SmoothSignKernel(), level), viscous, BeyondVisitedKernel(level, viscous))
 
 
 class _WidthKernel(Kernel):
@@ -227,6 +230,44 @@ class SmoothSignKernel(_WidthKernel):
     def weight_features(self, z: Tensor) -> Tensor:
         """phi (n, 1), with k = phi phi^T."""
         return torch.tanh(z / self.width)
+
+    @override
+    def forward(
+        self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **params: Any
+    ) -> Tensor:
+        left, right = self.weight_features(x1), self.weight_features(x2)
+        return (left * right).sum(-1) if diag else left @ right.mT
+
+
+class BeyondVisitedKernel(Kernel):
+    """k = e(s) e(s'), e(s) = g (|s| - s_max)+ sign(s): beyond the visited velocities, friction may go on otherwise.
+
+    Data say nothing about it, so means stay as they are, and intervals widen. The change of slope g is half of the
+    slope that the rest of the kernel has over the visited range: g^2 = ((c^2 + r^2) / s_max^2 + d^2) / 4.
+    """
+
+    def __init__(self, level: AdditiveKernel, viscous: LinearKernel) -> None:
+        super().__init__()
+        self.parts = level, viscous  # in a tuple, which registers nothing: their parameters have their own place
+        self.limit = NOWHERE
+
+    def visit(self, z: Tensor) -> None:
+        """Take the largest of these velocities (n, 1) as s_max."""
+        self.limit = max(float(z.abs().max()), 1e-9)
+
+    @property
+    def slope(self) -> Tensor:
+        """g."""
+        level, viscous = self.parts
+        constant, change = level.kernels
+        assert isinstance(constant, ConstantKernel)
+        assert isinstance(change, ScaleKernel)
+        dry = constant.constant + torch.as_tensor(change.outputscale)
+        return 0.5 * (dry / self.limit**2 + viscous.variance.reshape(())).sqrt()
+
+    def weight_features(self, z: Tensor) -> Tensor:
+        """e (n, 1)."""
+        return self.slope * (z - z.clamp(-self.limit, self.limit))
 
     @override
     def forward(

@@ -178,6 +178,8 @@ class MarginalLikelihood:
         Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force
         residual.
         """
+        if self.training.reference is not None:  # on whose rows kernels were made
+            return replace(self, training=self.training.reference).kernels(parameters)
         any_noise = {ACCELERATION: torch.zeros_like(self.training.a[0])}
         with torch.no_grad():
             features, W, residual, _ = self.terms({**any_noise, **(parameters or {})})
@@ -192,6 +194,10 @@ class MarginalLikelihood:
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         dimensions = tuple(z.shape[-1] for z in features)
         kernels = self.prior.kernels(self.system.robot, dimensions, variances)
+        for kernel, z in zip(kernels, features, strict=True):
+            for part in kernel.modules():
+                if hasattr(part, "visit"):
+                    part.visit(z)
         return LatentKernels(checked_kernels(self.prior, kernels, len(dimensions))).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
