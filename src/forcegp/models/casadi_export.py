@@ -6,6 +6,7 @@ and only here.
 """
 
 import math
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from forcegp.atomic_files import write_text
-from forcegp.codegen.graph import Graph
+from forcegp.codegen.graph import ARITHMETIC, COMPARED, Graph
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
@@ -30,6 +31,7 @@ STATES = 100
 TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
 """Largest difference from `predict`, relative to the largest value; implicit steps end at 1e-9."""
 
+OPERATORS = {**ARITHMETIC, **COMPARED, "negate": operator.neg}
 NAMES = {"absolute": "fabs"}
 
 
@@ -198,16 +200,8 @@ def expressed(
                 found[node] = rest[0]
             case "input":
                 found[node] = inputs[rest[0]]
-            case "add" | "subtract" | "multiply" | "divide":
-                x, y = given
-                found[node] = {"add": x + y, "subtract": x - y, "multiply": x * y}.get(operation)
-                if operation == "divide":
-                    found[node] = x / y
-            case "negate":
-                found[node] = -given[0]
-            case "less" | "at_most" | "equal":
-                x, y = given
-                found[node] = {"less": x < y, "at_most": x <= y, "equal": x == y}[operation]
+            case str() if operation in OPERATORS:
+                found[node] = OPERATORS[operation](*given)
             case "choose":
                 found[node] = casadi.if_else(*given)
             case "look up":

@@ -13,7 +13,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
+from forcegp.data import Dataset, Windows, farthest_rows
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import (
     DataWarning,
@@ -70,16 +70,6 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
         return dataset
     points = whole_number("points", points, 2, len(dataset), "the rows of the dataset")
     return dataset if points == len(dataset) else farthest_rows(dataset, points)
-
-
-def training_windows(
-    joint_names: Sequence[str], dataset: Dataset, points: int | None, observe: WindowObservation | str
-) -> Windows:
-    """The `points` windows of the dataset that lie farthest apart; all of them for None.
-
-    Raises InvalidInput for other joints, names and numbers out of range, DatasetError for logs without windows.
-    """
-    return observation_of(observe).windows(checked_rows(joint_names, dataset), points)
 
 
 def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:

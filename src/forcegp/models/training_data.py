@@ -1,7 +1,7 @@
 """What a model is conditioned on: rows or windows with standardised features, and the noise of their measurements."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -207,25 +207,13 @@ class Noise:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
-        return {
-            "acceleration": list(self.acceleration) if isinstance(self.acceleration, tuple) else self.acceleration,
-            "force": list(self.force) if isinstance(self.force, tuple) else self.force,
-            "learn": self.learn,
-            "measured_torque": self.measured_torque,
-            "from_data": self.from_data,
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Noise":
         """The noise that `to_dict` stored."""
-        force = stored["force"]
-        return cls(
-            tuple(stored["acceleration"]) if isinstance(stored["acceleration"], list) else stored["acceleration"],
-            tuple(force) if isinstance(force, list) else force,
-            bool(stored["learn"]),
-            bool(stored.get("measured_torque", False)),
-            bool(stored.get("from_data", False)),
-        )
+        given: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items()}
+        return cls(**given)
 
 
 def _positive(name: str, given: object) -> float | tuple[float, ...]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.errors import FitError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, best_of, minimize_objective
-from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters, inertials_of
+from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, PhysicalParameters, inertials_of
 from forcegp.models.search import (
     SMALL,
     FitProgress,
@@ -112,7 +112,7 @@ def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """How a fit searches: what the three ways to fit share. The fields are documented at `StructuredGP.fit`.
+    """How a fit searches: what the three ways to fit share, documented at `StructuredGP.fit` and `identify`.
 
     Raises InvalidInput for numbers out of range and a start in units of another fit.
     """
@@ -124,9 +124,13 @@ class Search:
     options: OptimizerOptions | None
     start: Mapping[str, Tensor] | None
     progress: FitProgress | None
+    learn: Learned | Sequence[Learned] | None = None
+    prior_strength: float = 0.0
 
     @usable_arguments("fit")
     def __post_init__(self) -> None:
+        if not 0.0 <= self.prior_strength < float("inf"):
+            raise InvalidInput(f"prior_strength is {self.prior_strength}; it must be finite and at least 0")
         check_search_numbers(1 if self.restarts is None else self.restarts, self.seed)
         require_type("hyperprior", self.hyperprior, bool)
         if self.options is not None:
