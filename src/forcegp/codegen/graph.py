@@ -51,7 +51,7 @@ class Graph:
     def __init__(self, inputs: int = 0) -> None:
         self.nodes: list[tuple] = []
         self.slopes: dict[int, Slopes] = {}
-        self._outputs: dict[int, int] = {}
+        self.outputs_of: dict[int, int] = {}  # how many numbers a call gives
         self._found: dict[tuple, int] = {}
         self._record(("constant", 0.0))
         self._record(("constant", 1.0))
@@ -75,14 +75,10 @@ class Graph:
     def call(self, name: str, operands: Sequence[int], outputs: int, slopes: Slopes | None = None) -> list[int]:
         """The outputs of a C function; `slopes` names those beyond them that are derivatives."""
         call = self._record(("call", name, *operands))
-        self._outputs[call] = max([outputs, *(1 + k for k in (slopes or {}).values())])
+        self.outputs_of[call] = max([outputs, *(1 + k for k in (slopes or {}).values())])
         if slopes is not None:
             self.slopes[call] = slopes
         return [self.output(call, k) for k in range(outputs)]
-
-    def outputs_of(self, call: int) -> int:
-        """How many numbers a call gives."""
-        return self._outputs[call]
 
     def output(self, call: int, position: int) -> int:
         """One output of a call."""

@@ -41,10 +41,10 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import (
     PointMap,
+    StationaryMatrix,
     embedding,
     lengthscale_of,
     of_distance,
-    stationary_matrix,
     weight_features,
 )
 
@@ -187,7 +187,7 @@ class _OfDistance(DenseKernel):
     @override
     def matrix(self, z: Tensor) -> Tensor:
         embed, lengthscale, smoothness = self._form(z)
-        return stationary_matrix(embed(z), lengthscale, self._variance(z), smoothness)
+        return cast(Tensor, StationaryMatrix.apply(embed(z), lengthscale, self._variance(z), smoothness))
 
     @override
     def cross(self, z: Tensor, other: Tensor) -> Tensor:

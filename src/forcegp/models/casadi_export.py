@@ -20,7 +20,7 @@ from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.c_export import named_refusal
+from forcegp.models.c_export import exported_code
 from forcegp.models.c_files import identifier
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
@@ -56,10 +56,7 @@ def casadi_function(
         ) from None
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(f"no program can be written of a {posterior.description}; export a StructuredGP.")
-    try:
-        code = posterior.code()
-    except InvalidInput as error:
-        raise named_refusal(posterior, error) from None
+    code = exported_code(posterior)
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)

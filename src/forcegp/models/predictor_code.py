@@ -20,9 +20,9 @@ from forcegp.codegen.library import Purpose, VectorUnit, aligned, default_folder
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_sums import PADDING
-from forcegp.inference.one_input_calls import LatentCall, drawn_calls
+from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance
+from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
@@ -79,11 +79,12 @@ class PredictorCode:
         cls,
         traced: Callable[..., list[Tensor]],
         example: Sequence[Tensor],
-        sums: tuple[LatentCall, ...],
+        latent: LatentPosterior,
+        prepared: PreparedKernels,
         compressed: CompressedCovariance | None,
         widening: float,
     ) -> "PredictorCode":
-        """Trace the physics at an example (1, nv) of a state.
+        """Trace the physics at an example (1, nv) of a state, and the kernels.
 
         Raises InvalidInput for a system on another device and for operations that a graph cannot hold.
         """
@@ -92,6 +93,7 @@ class PredictorCode:
                 f"a compiled predictor runs on the CPU, and the model is on {example[0].device}; give compile=False, "
                 "or a model on the CPU."
             )
+        sums = latent_calls(latent, prepared, compressed)
         latents = sum(len(part.latents) for part in sums)
         graph, found = trace(traced, [*example, torch.ones(1, latents, dtype=torch.float64)])
         a, W, *features = (nodes[0].tolist() for nodes in found)

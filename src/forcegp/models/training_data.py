@@ -1,7 +1,7 @@
 """What a model is conditioned on: rows or windows with standardised features, and the noise of their measurements."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -57,11 +57,7 @@ class TrainingData:
 
     def to(self, device: torch.device) -> "TrainingData":
         """The same rows on another device."""
-        states = (getattr(self, name).to(device) for name in ("q", "v", "u", "a"))
-        noise_std = None if self.noise_std is None else self.noise_std.to(device)
-        reference = None if self.reference is None else self.reference.to(device)
-        weights = None if self.weights is None else self.weights.to(device)
-        return TrainingData(*states, noise_std=noise_std, reference=reference, weights=weights)
+        return replace(self, **{name: x.to(device) for name, x in vars(self).items() if x is not None})
 
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:
@@ -259,13 +255,3 @@ def shrunk(
     covariance = torque_noise @ kept.mT
     matrix, offset = kept @ acceleration.matrix, (kept @ acceleration.offset[..., None])[..., 0]
     return AffineMap(offset, matrix), 0.5 * (covariance + covariance.mT)
-
-
-def without_force_noise(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Parameters of what a measured acceleration has left of noise, once that of the torque counts as unknown."""
-    return {name: value for name, value in parameters.items() if name != FORCE}
-
-
-def plus(covariance: Tensor | None, more: Tensor) -> Tensor | None:
-    """The sum, where a covariance was asked for."""
-    return None if covariance is None else covariance + more

@@ -136,14 +136,6 @@ def checked_tensor(name: str, value: object, size: int, meaning: str, device: to
     return real_tensor(name, value, device)
 
 
-def check_mapping(inertials: object) -> None:
-    """:class:`~forcegp.errors.InvalidInput` unless inertials are given by link name."""
-    if not isinstance(inertials, Mapping):
-        raise InvalidInput(
-            f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
-        )
-
-
 def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
     """Common batch shape; :class:`~forcegp.errors.InvalidInput` where there is none."""
     different = {shape for shape in shapes.values() if shape}

@@ -1,7 +1,6 @@
 """`NetworkEnsemble`: several residual networks that predict a mean and a variance, and differ where data are few."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -181,10 +180,7 @@ class _Training:
         better = loss < self.best_loss
         self.best_loss = torch.where(better, loss, self.best_loss)
         self.best_step[better] = self.step
-        self._keep(self.weights, better)
-        self.history.append(float(loss.mean()))
-
-    def _keep(self, weights: Mapping[str, Tensor], members: Tensor) -> None:
-        for name, value in weights.items():
-            here = members.to(value.device)
+        for name, value in self.weights.items():
+            here = better.to(value.device)
             self.best[name][here] = value.detach()[here]
+        self.history.append(float(loss.mean()))

@@ -316,21 +316,15 @@ class Identification(Summary):
     @property
     def verdict(self) -> str:
         """What the data do not identify, as a sentence, after what the search did not reach."""
-        if not self.at_optimum:
-            doubts = "; ".join(self.curvature.doubts)
-            return f"The search has not ended at a minimum ({doubts}): let it go on. {self._identified}"
-        return self._identified
-
-    @property
-    def _identified(self) -> str:
+        doubts = "; ".join(self.curvature.doubts)
+        begin = f"The search has not ended at a minimum ({doubts}): let it go on. " if doubts else ""
         if not self.weak_directions:
-            return "The data identify every parameter that was learned."
-        listed = "; ".join(map(str, self.weak_directions))
-        count = len(self.weak_directions)
+            return f"{begin}The data identify every parameter that was learned."
+        named, count = "; ".join(map(str, self.weak_directions)), len(self.weak_directions)
         noun = "combination" if count == 1 else f"{count} combinations"
         return (
-            f"The data do not identify the {noun} {listed}, where logarithms stand for factors and r for the link's "
-            f"radius of gyration: fix one of its parameters, give a prior, or move the robot in other ways."
+            f"{begin}The data do not identify the {noun} {named}, where logarithms stand for factors and r for the "
+            "link's radius of gyration: fix one of its parameters, give a prior, or move the robot in other ways."
         )
 
     def to_dict(self) -> dict[str, Any]:

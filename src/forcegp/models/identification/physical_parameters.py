@@ -13,7 +13,7 @@ exist. The search moves z with s = T z; T makes its steps comparable (`models.ph
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -154,7 +154,7 @@ class _Coefficients:
 
 @dataclass(frozen=True, eq=False)
 class PhysicalParameters:
-    """What is learned of a system, as a function of free numbers z (k,), which are 0 at the start values.
+    """What is learned of a system, as a function of free numbers z (k,), 0 at the start values; s = `transform` z.
 
     `names` such as 'tool.mass', 'tool.com.x' or 'viscous-joint-friction.A1' and `units` have the order of `values(z)`.
     """
@@ -182,10 +182,6 @@ class PhysicalParameters:
             raise InvalidInput(f"{twice} is named twice in learn; name it once")
         identity = torch.eye(len(names), dtype=torch.float64, device=system.robot.device)
         return cls(system, groups, identity)
-
-    def with_transform(self, transform: Float[Tensor, "k k"]) -> "PhysicalParameters":
-        """The same with s = transform z."""
-        return replace(self, transform=transform)
 
     @property
     def names(self) -> tuple[str, ...]:

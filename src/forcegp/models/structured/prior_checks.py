@@ -73,7 +73,8 @@ def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], featur
                 f"({_values(z[0])}), so its function cannot be learned; give data in which it changes, or leave this "
                 "prior (or this joint) out"
             )
-        if which and any(way != "none" for way in _ways(scalings[index], z)):
+        ways = scalings[index]
+        if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
             idle.setdefault(which, []).append(name)
     for which, latents in idle.items():
         some = f"{', '.join(which[:4])}{' ...' if len(which) > 4 else ''}"
@@ -157,10 +158,6 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
             DataWarning,
             stacklevel=5,
         )
-
-
-def _ways(scaling: Sequence[str] | str, z: Tensor) -> Sequence[str]:
-    return (scaling,) * z.shape[-1] if isinstance(scaling, str) else scaling
 
 
 def _values(row: Tensor) -> str:

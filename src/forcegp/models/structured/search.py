@@ -104,10 +104,14 @@ def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "
     "Geometric robot dynamic identification: a convex programming approach", T-RO 2020). It is the same in every frame
     and unit: a body of twice the mass and inertia is 2 log 2 away, wherever it is.
     """
-    lower = torch.linalg.cholesky(pseudo_inertia_from_parameters(reference))
+    relative = relative_inertia(parameters, torch.linalg.cholesky(pseudo_inertia_from_parameters(reference)))
+    return torch.linalg.eigvalsh(0.5 * (relative + relative.mT)).log().square().sum()
+
+
+def relative_inertia(parameters: Float[Tensor, "10"], lower: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """L^-1 P L^-T of the pseudo-inertia P of these log-Cholesky parameters."""
     half = torch.linalg.solve_triangular(lower, pseudo_inertia_from_parameters(parameters), upper=False)
-    whitened = torch.linalg.solve_triangular(lower, half.mT, upper=False)
-    return torch.linalg.eigvalsh(0.5 * (whitened + whitened.mT)).log().square().sum()
+    return torch.linalg.solve_triangular(lower, half.mT, upper=False)
 
 
 @dataclass(frozen=True, eq=False)
