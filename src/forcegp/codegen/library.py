@@ -48,10 +48,7 @@ class Purpose:
     instead: str
 
     def compiler(self) -> list[str]:
-        """The command of the C compiler, with the options that the environment variable CC gives.
-
-        Raises :class:`~forcegp.errors.CompilerError` where there is none.
-        """
+        """The C compiler's command, with options from the variable CC. Raises CompilerError where there is none."""
         try:
             chosen = shlex.split(os.environ.get(VARIABLE, ""))
         except ValueError as error:
@@ -243,10 +240,7 @@ NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
 
 
 class RowFunction:
-    """`evaluate` of a library, whose inputs and outputs have these lengths.
-
-    `tables` are the addresses of flat arrays, which the caller keeps alive.
-    """
+    """`evaluate` of a library, with inputs and outputs of these lengths; `tables` are flat arrays for it."""
 
     def __init__(
         self, library: ctypes.CDLL, inputs: Sequence[int], outputs: Sequence[int], tables: Sequence[Tensor] = ()

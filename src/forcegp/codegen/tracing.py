@@ -120,10 +120,7 @@ class _Recording(TorchDispatchMode):
 
 @cache
 def _decompositions() -> dict[Any, Callable[..., Any]]:
-    """What makes few operations of the many that torch has.
-
-    The public function gives those of torch.export as well, and takes a second to import it.
-    """
+    """What makes few operations of many; the public function has more, and takes a second to import it."""
     return getattr(_decomp, "_core_aten_decompositions_post_autograd", _decomp.core_aten_decompositions)()
 
 

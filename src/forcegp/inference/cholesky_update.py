@@ -65,10 +65,7 @@ def bytes_to_choose(rows: int, rank: int) -> int:
 
 
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
-    """The posterior of some of the rows, in the order given: their covariance is factorised anew.
-
-    Raises NumericalError where it cannot be.
-    """
+    """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
     with torch.no_grad():
         deflation = Deflation(*(getattr(latent.system.deflation, name)[rows] for name in _PARTS))
         features = tuple(z[rows] for z in latent.features)

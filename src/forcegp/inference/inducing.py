@@ -149,10 +149,7 @@ class WeightSpace:
     def at(
         cls, kernels: LatentKernels, points: Sequence[Float[Tensor, "_ _"]], precision: CholeskyFactor, mean: Tensor
     ) -> "WeightSpace":
-        """With weights that were found elsewhere, of which nothing is said of what they leave out.
-
-        Raises NumericalError where the kernel matrix of the points cannot be factorised.
-        """
+        """With weights found elsewhere. Raises NumericalError where the points' kernel matrix cannot be factorised."""
         points = tuple(z.detach() for z in points)
         lowers = tuple(
             factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
@@ -238,10 +235,7 @@ class InducingPosterior(LatentPosterior):
 
     @classmethod
     def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> "InducingPosterior":
-        """Condition on the data through at most `points` inducing points for each latent.
-
-        Fewer where each latent leaves out less than its share of `tolerance`, see `left_out`.
-        """
+        """On at most `points` points per latent; fewer where its share of `tolerance` suffices (`left_out`)."""
         with torch.no_grad():
             deflation, features = terms.deflated(), terms.features
             pivots = inducing_pivots(kernels, features, deflation.C, points, tolerance)

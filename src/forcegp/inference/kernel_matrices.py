@@ -35,10 +35,7 @@ def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
 
 
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
-    """e(z) and the smoothness nu of k as a function of |e(z) - e(z')|, infinite for the squared exponential.
-
-    None for kernels that are not of that form, or not known to be.
-    """
+    """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
     squared_exponential = squared_exponential_embedding(kernel)
     if squared_exponential is not None:
         return squared_exponential, math.inf

@@ -82,10 +82,7 @@ class KernelSum:
         diagonal: Callable[[Tensor], Tensor],
         level: tuple[float, ...],
     ) -> "KernelSum":
-        """Traced from the kernels less a constant `level` of each.
-
-        Raises InvalidInput, naming the operation, for those that no graph holds.
-        """
+        """Traced from kernels less a constant `level` each. Raises InvalidInput, naming what no graph holds."""
         example = centers[:1]
         pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
         prior, (variances,) = trace(lambda z: [diagonal(z)], [example])

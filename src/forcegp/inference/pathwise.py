@@ -163,10 +163,7 @@ class ComposedSamples:
     def draw(
         cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
     ) -> "ComposedSamples":
-        """As `FunctionSamples.draw`; `frequencies` are those of one function of one term.
-
-        Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
-        """
+        """As `FunctionSamples.draw`, `frequencies` per function and term. Raises InvalidInput as `kernel_terms`."""
         with torch.no_grad():
             generator = torch.Generator(device=latent.features[0].device).manual_seed(seed)
             terms = tuple(

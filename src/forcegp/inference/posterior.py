@@ -56,10 +56,7 @@ class LatentPosterior(ABC):
         return prior - V.mT @ V
 
     def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        """L^-1 Cov(data, f(z)) of one latent, with L L^T the covariance of the (whitened) data.
-
-        Raises InvalidInput for engines that do not factorise it.
-        """
+        """L^-1 Cov(data, f(z)), L L^T that of the (whitened) data. Raises InvalidInput where nothing is factorised."""
         raise InvalidInput(f"a {type(self).__name__} does not factorise the covariance of all rows; {self.remedy}.")
 
     @abstractmethod

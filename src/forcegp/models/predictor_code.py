@@ -84,10 +84,7 @@ class PredictorCode:
         compressed: CompressedCovariance | None,
         widening: float,
     ) -> "PredictorCode":
-        """Trace the physics at an example (1, nv) of a state, and the kernels.
-
-        Raises InvalidInput for a system on another device and for operations that a graph cannot hold.
-        """
+        """Trace it at an example (1, nv). Raises InvalidInput on another device, and for what no graph holds."""
         if example[0].device.type != "cpu":
             raise InvalidInput(
                 f"a compiled predictor runs on the CPU, and the model is on {example[0].device}; give compile=False, "
@@ -172,10 +169,7 @@ class PredictorCode:
     def loops(
         self, integrator: str, latent: LatentPosterior, samples: int = 0, seed: int = 0
     ) -> list[FusedLoop] | None:
-        """A loop over the mean, or one over each function drawn from the posterior.
-
-        None where a drawn function has no form in pieces. Raises CompilerError where loops cannot be compiled.
-        """
+        """Over the mean or each drawn function; None where one has no form in pieces. Raises CompilerError."""
         if not samples or not self.sums:
             return [FusedLoop(self.library(integrator), self.tables)] * max(1, samples)
         drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)

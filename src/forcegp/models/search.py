@@ -42,10 +42,7 @@ QUIET = 1e-3
 
 
 def check_system_and_noise(model: Any) -> None:
-    """What every constructor asks: `system` is a MechanicalSystem, and a bare number as `noise` becomes a `Noise`.
-
-    Raises InvalidInput for another system.
-    """
+    """Check `system`, and make a bare number as `noise` a `Noise`. Raises InvalidInput for another system."""
     require_type("system", model.system, MechanicalSystem, ", for example system=dataset.system")
     if model.noise is not None and not isinstance(model.noise, Noise):
         object.__setattr__(model, "noise", Noise(model.noise))
@@ -154,9 +151,7 @@ def described_rows(rows: Dataset | Windows, dataset: Dataset) -> dict[str, Any]:
 
 
 RESTART_SPREAD = 0.7
-"""Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
-none.
-"""
+"""Standard deviation of the random factors (natural log) on the start values of restarts from 1 on."""
 
 SMOOTHER = 4.0
 """Factor on the length scales of odd restarts. On one seed of the benchmark, without a mean, one start and three

@@ -16,9 +16,7 @@ from forcegp.priors import Scaling
 CONSTANT = 1e-12
 """Spread of a feature, relative to 1 plus its size, below which it is constant."""
 RESIDUAL_FLOOR = 1e-6
-"""Smallest start variance of a latent as a fraction of the largest: a latent that the start residual does not
-excite can still grow.
-"""
+"""Smallest start variance of a latent over the largest: one that the start residual misses can still grow."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,10 +159,7 @@ _TOKEN = re.compile(r"[()+*]|[^()+*\s]+")
 
 
 class KernelExpression:
-    """One expression, read once; `kernel` makes fresh kernels of it.
-
-    Raises InvalidInput for an unknown name or a wrong expression, with what is allowed.
-    """
+    """An expression, read once. Raises InvalidInput for unknown names or a wrong form, with what is allowed."""
 
     def __init__(self, expression: str, factories: Mapping[str, KernelFactory]) -> None:
         self.expression = expression

@@ -39,10 +39,7 @@ def real_array(name: str, given: Any, kinds: str = "fiu", error: type[ForceGPErr
 
 
 def real_tensor(name: str, given: Any, device: torch.device) -> Tensor:
-    """`given` in float64: a tensor where it is, with its graph, anything else as a copy on `device`.
-
-    Raises InvalidInput for what is no real number.
-    """
+    """In float64: a tensor stays, with its graph, else a copy on `device`. Raises InvalidInput for no real numbers."""
     if type(given) is Tensor and given.dtype is torch.float64 and given.layout is torch.strided:
         return given
     if not isinstance(given, Tensor):
@@ -67,10 +64,7 @@ def require_finite(name: str, values: Tensor) -> None:
 
 
 def whole_number(name: str, given: Any, least: int, most: int = LARGEST, why: str = "") -> int:
-    """`given` as an int within these limits, of which `why` explains the upper one.
-
-    Raises InvalidInput for anything else, booleans, text and 1.0 included.
-    """
+    """`given` as an int in these limits; `why` explains the upper. Raises InvalidInput, also for booleans and 1.0."""
     try:
         value = operator.index(given)
     except TypeError:
@@ -82,10 +76,7 @@ def whole_number(name: str, given: Any, least: int, most: int = LARGEST, why: st
 
 
 def usable_device(device: torch.device | str) -> torch.device:
-    """``device`` itself, if tensors of float64 can be made there.
-
-    Raises :class:`~forcegp.errors.InvalidInput` that names the devices which are there.
-    """
+    """``device`` if float64 can be there. Raises InvalidInput that names the devices which are there."""
     try:
         asked = torch.device(device)
         torch.zeros(1, dtype=torch.float64, device=asked)

@@ -210,10 +210,7 @@ PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the rob
 
 
 def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) -> RowFunction:
-    """The program of a request: from ``folder`` if it is there, else compiled into it.
-
-    Raises :class:`~forcegp.errors.CompilerError` as `load_library`.
-    """
+    """From ``folder`` if it is there, else compiled into it. Raises CompilerError as `load_library`."""
 
     def write(unit: VectorUnit) -> str:
         return write_program(trace_dynamics(unrolled, request), unit.lanes)

@@ -61,10 +61,7 @@ class IndependentLikelihood:
         return self.standardization([self._columns(q, v, u)])[0]
 
     def kernels(self) -> LatentKernels:
-        """One kernel per joint with start values: the mean square of its acceleration, and lengths as in JointForces.
-
-        Raises InvalidInput if all accelerations are zero.
-        """
+        """One per joint; variances start at mean squares. Raises InvalidInput if all accelerations are zero."""
         variances = self.training.a.square().mean(0)
         largest = float(variances.max())
         if not largest > 0.0:

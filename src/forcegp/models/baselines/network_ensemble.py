@@ -164,10 +164,7 @@ class _Training:
                     return
 
     def _loss(self, chosen: Tensor, beta: float) -> Float[Tensor, " members"]:
-        """Seitzer et al. (2022), eq. 5: the Gaussian negative log likelihood, weighted by variance^beta as a constant.
-
-        Means over rows and joints, without the constant log(2 pi)/2.
-        """
+        """Seitzer et al. (2022), eq. 5: NLL times variance^beta as a constant, mean over rows, less log(2 pi)/2."""
         mean, variance = self.model.layers(self.weights, self.x[chosen])
         loss = 0.5 * ((self.y[chosen] - mean).square() / variance + variance.log())
         return (loss * variance.detach() ** beta).mean(dim=(1, 2)) if beta else loss.mean(dim=(1, 2))

@@ -44,8 +44,7 @@ SADDLE = -0.1
 """Curvature in the other parameters below which the search has not ended at a minimum; above it may be rounding."""
 
 NEGATIVE = -0.01
-"""The same for the physical parameters, as a fraction of the largest curvature before the others follow
-(at least 1)."""
+"""The same for the physical ones, as a fraction of the largest curvature (at least 1) before others follow."""
 
 NO_INFORMATION = 1e-4
 """Curvature, or information, below which a physical direction is not known: its standard deviation, 100 times the value

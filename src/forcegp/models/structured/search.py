@@ -190,10 +190,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class _OneStart:
-    """The optimisation from start number `index`: 0 begins at `first`, the others around the moments.
-
-    A class so that other processes can receive it.
-    """
+    """From start `index`: 0 is `first`, others lie around the moments. A class, so that processes receive it."""
 
     objective: FitObjective
     moments: Mapping[str, Tensor]
