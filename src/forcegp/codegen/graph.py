@@ -84,10 +84,6 @@ class Graph:
         """One output of a call."""
         return self._record(("output", call, position))
 
-    def copier(self, other: "Graph", known: dict[int, int]) -> "Copier":
-        """What copies nodes of another graph to this one."""
-        return Copier(self, other, known)
-
     def look_up(self, table: Sequence[float], place: int) -> int:
         """The entry of a table of numbers at the place that a node holds."""
         known = self.value(place)

@@ -1,11 +1,8 @@
 """Kernels of all latents: matrices of GPyTorch kernels, exact and lean, and their parameters by name.
 
-Sums and products are taken apart into leaves, once.
-
 GPyTorch's own sums are not used: it adds a low-rank matrix (a linear kernel) to a dense one through a root
 decomposition of the latter, which needs jitter where that is singular and is approximate where it is large. Its lazy
-paths switch silently to conjugate gradients above N D = 800 (measured error of the predictive mean 7.9 rad/s^2 on the
-iiwa).
+paths switch silently to conjugate gradients above N D = 800 (an error of the mean of 7.9 rad/s^2 on the iiwa).
 
 Functions of the distance, linear and constant kernels, and those with an embedding or weight features
 (`kernel_matrices`) are evaluated here; every other kernel is called as it is, and once more in the backward pass.
@@ -251,11 +248,9 @@ def _is_known(kernel: Kernel) -> bool:
 def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
     """A kernel of any kind, called now and again in the backward pass, so that nothing of size N x N is kept."""
     dense = _Call(kernel, lambda z: kernel(z, z).to_dense())
-    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own
-    # ones back.
+    # As arguments: by the time of the recomputation `functional_call` has put the module's own parameters back.
     names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
-    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims`
-    # back.
+    # An early stop would leave GPyTorch's call by an exception, before it has put `active_dims` back.
     with set_checkpoint_early_stop(False):
         return checkpoint(
             lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),

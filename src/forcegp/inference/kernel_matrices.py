@@ -27,16 +27,11 @@ NO_DISTANCE = 1e-8
 """Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
 
 
-def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
-    """e(z) with k = exp(-1/2 |e(z) - e(z')|^2); None for kernels that are not of that form, or not known to be."""
-    if type(kernel) is PeriodicKernel:
-        return partial(_circles, kernel)
-    return getattr(kernel, "squared_exponential_embedding", None)
-
-
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
     """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
-    squared_exponential = squared_exponential_embedding(kernel)
+    squared_exponential = getattr(kernel, "squared_exponential_embedding", None)
+    if type(kernel) is PeriodicKernel:
+        squared_exponential = partial(_circles, kernel)
     if squared_exponential is not None:
         return squared_exponential, math.inf
     matern = getattr(kernel, "matern_embedding", None)

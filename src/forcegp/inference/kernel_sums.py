@@ -23,7 +23,7 @@ from torch import Tensor
 
 from forcegp.codegen.c_writer import c_value
 from forcegp.codegen.derivatives import gradients
-from forcegp.codegen.graph import ONE, Graph, Slopes, evaluated
+from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
 from forcegp.codegen.tracing import trace
 
 PADDING = 8
@@ -128,11 +128,11 @@ class KernelSum:
 
     def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
         """The operands at features z."""
-        return graph.copier(self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)
+        return Copier(graph, self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)
 
     def variance(self, graph: Graph, z: Sequence[int]) -> list[int]:
         """Prior variances at features z."""
-        return graph.copier(self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
+        return Copier(graph, self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
 
     @cached_property
     def rows(self) -> list[int]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from forcegp.atomic_files import write_text
-from forcegp.codegen.graph import ARITHMETIC, COMPARED, Graph
+from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
@@ -158,7 +158,7 @@ def _physics(casadi: Any, code: PredictorCode) -> Any:
 def _latents(casadi: Any, code: PredictorCode, x: Sequence[Any]) -> list[Any]:
     """E f of every process in the order of their numbers."""
     graph, found = Graph(3 * code.nv), {}
-    copied = graph.copier(code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
+    copied = Copier(graph, code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
     vectors = [casadi.SX.sym(symbol, code.nv) for symbol in "qvu"]
     scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
     for part in code.sums:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
-from forcegp.codegen.graph import Graph
+from forcegp.codegen.graph import Copier, Graph
 from forcegp.codegen.library import Purpose, VectorUnit, aligned, default_folder, load_library
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
@@ -104,7 +104,7 @@ class PredictorCode:
     def program(self, kind: str) -> Program:
         """The program "mean", "linearize" or "covariance"."""
         graph, f = Graph(3 * self.nv), {}
-        copied = graph.copier(self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
+        copied = Copier(graph, self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
         features = [copied(self.features[part.latents[0]]) for part in self.sums]
         for part, z in zip(self.sums, features, strict=True):
             f |= dict(zip(part.latents, part.call(graph, z, kind == "linearize"), strict=True))

@@ -223,10 +223,17 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         raise FileFormatError(
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
-    _check_tensors(path / "tensors.safetensors", model, training, parameters)
-    solution = tensors.get(SOLUTION)
+    file, solution = path / "tensors.safetensors", tensors.get(SOLUTION)
+    for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
+        if rows is not None:
+            _check_rows(file, model, prefix, rows)
+    for name, value in parameters.items():
+        _check_numbers(file, name, value)
+    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
+    if given != model.parameter_shapes(training):
+        raise FileFormatError(f"{file} does not hold the parameters of its model")
     if solution is not None:
-        _check_numbers(path / "tensors.safetensors", SOLUTION, solution)
+        _check_numbers(file, SOLUTION, solution)
     try:
         posterior = model.condition(training, parameters, optimization, settings, engine, solution)
     except (InvalidInput, RuntimeError) as error:
@@ -284,17 +291,6 @@ def _row_tensors(prefix: str, rows: TrainingData) -> dict[str, torch.Tensor]:
 def _rows(prefix: str, tensors: Mapping[str, torch.Tensor]) -> TrainingData:
     states = (tensors[prefix + name] for name in STATES)
     return TrainingData(*states, noise_std=tensors.get(prefix + NOISE), weights=tensors.get(prefix + WEIGHTS))
-
-
-def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
-    for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
-        if rows is not None:
-            _check_rows(file, model, prefix, rows)
-    for name, value in parameters.items():
-        _check_numbers(file, name, value)
-    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
-    if given != model.parameter_shapes(training):
-        raise FileFormatError(f"{file} does not hold the parameters of its model")
 
 
 def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> None:

@@ -262,8 +262,7 @@ KERNELS: dict[str, KernelFactory] = {
     "deep": deep,
 }
 """Kernels that an expression can name: name -> factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`;
-a name may hold anything but white space, parentheses, "+" and "*".
-"""
+a name may hold anything but white space, parentheses, "+" and "*"."""
 
 
 def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kernel:

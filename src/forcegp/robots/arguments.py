@@ -82,18 +82,14 @@ def usable_device(device: torch.device | str) -> torch.device:
         torch.zeros(1, dtype=torch.float64, device=asked)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError):  # as torch's backends happen to raise
         raise InvalidInput(
-            f"device {str(device)!r} cannot be used here; there is {', '.join(available_devices())}{_why()}."
+            f"device {str(device)!r} cannot be used here; there is {', '.join(['cpu', *_gpus()])}{_why()}."
         ) from None
     return asked
 
 
-def available_devices() -> tuple[str, ...]:
-    """Names of the CPU and of every GPU that torch can compute on in float64."""
-    return ("cpu", *(f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(_gpus())))
-
-
-def _gpus() -> int:
-    return torch.cuda.device_count() if torch.cuda.is_available() else 0
+def _gpus() -> list[str]:
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    return [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(count)]
 
 
 def _why() -> str:

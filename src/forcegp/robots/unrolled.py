@@ -30,8 +30,7 @@ from forcegp.robots.structure import RobotStructure
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
 """Floats and expressions; the operators of NumPy are theirs, entry by entry."""
 
-# What is smaller in a rotation matrix or an inertia is rounding, for example of the turn onto the joint axis: sin(pi) =
-# 1e-16.
+# What is smaller in a rotation matrix or an inertia is rounding, as of the turn onto the joint axis: sin(pi) = 1e-16.
 ROUNDING = 1e-15
 
 

@@ -71,11 +71,6 @@ class Curvature:
     lowest_other: float
     tolerated: float
 
-    @classmethod
-    def unknown(cls, like: Float[Tensor, "k"]) -> "Curvature":
-        """No information about parameters of this shape, and no optimum."""
-        return cls(like.new_zeros(len(like), len(like)), float("inf"), 0.0, 0.0, 0.0)
-
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why this is not the curvature at a minimum; empty where it is."""
@@ -151,9 +146,7 @@ def curvature_about(
 
 
 WEAK = 0.3
-"""Standard deviation beyond which a direction counts as not identified: 30 % of a mass or of a coefficient, or 0.3 of
-a link's radius of gyration.
-"""
+"""Standard deviation of what is not identified: 30 % of a mass or coefficient, or 0.3 radii of gyration of a link."""
 
 NAMED_SHARE = 0.1
 """Smallest share of a direction with which a parameter is named in it."""
@@ -243,7 +236,8 @@ class Identification(Summary):
                 NumericalWarning,
                 stacklevel=2,
             )
-            return Curvature.unknown(self.physical.zero)
+            unknown = torch.zeros_like(self.physical.transform)
+            return Curvature(unknown, float("inf"), 0.0, 0.0, 0.0)
 
     @property
     def decrement(self) -> float:

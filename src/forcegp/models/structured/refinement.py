@@ -229,39 +229,34 @@ def fit_with_refined_loads(
     (NumericalWarning) where the normal forces have not settled after `rounds` fits, and where friction as the last one
     expects it nearly jams a contact.
     """
-    with warnings.catch_warnings():  # what an early round expects may jam without meaning anything
-        warnings.filterwarnings("ignore", JAMMING, NumericalWarning)
-        kept = _refined(first, again, rounds)
-    if kept is not first:
-        with torch.no_grad():
-            kept.model.prior.mixing(kept.likelihood.dynamics())  # warns where the friction that was found jams
-    return kept
-
-
-def _refined(
-    first: StructuredPosterior, again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior], rounds: int
-) -> StructuredPosterior:
     given = first.model.prior  # whose terms hold the expectations of the user
     best = last = first
-    for fits in range(rounds + 1):
-        prior = refined_loads(given, last.model.system.robot, lambda name, p=last: _table(p, name))
-        if prior is None:
-            return first
-        change = _change(last, prior)
-        if change < SETTLED:
-            # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
-            return last if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE else best
-        if fits == rounds:
-            warnings.warn(
-                f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
-                "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
-                NumericalWarning,
-                stacklevel=4,
-            )
-            break
-        last = again(prior, last).with_settings(load_refinements=fits + 1)
-        if last.negative_log_likelihood < best.negative_log_likelihood:
-            best = last
+    with warnings.catch_warnings():  # what an early round expects may jam without meaning anything
+        warnings.filterwarnings("ignore", JAMMING, NumericalWarning)
+        for fits in range(rounds + 1):
+            prior = refined_loads(given, last.model.system.robot, lambda name, p=last: _table(p, name))
+            if prior is None:
+                return first
+            change = _change(last, prior)
+            if change < SETTLED:
+                # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
+                if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE:
+                    best = last
+                break
+            if fits == rounds:
+                warnings.warn(
+                    f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
+                    "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
+                    NumericalWarning,
+                    stacklevel=3,
+                )
+                break
+            last = again(prior, last).with_settings(load_refinements=fits + 1)
+            if last.negative_log_likelihood < best.negative_log_likelihood:
+                best = last
+    if best is not first:
+        with torch.no_grad():
+            best.model.prior.mixing(best.likelihood.dynamics())  # warns where the friction that was found jams
     return best
 
 
