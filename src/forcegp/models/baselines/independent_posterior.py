@@ -138,15 +138,13 @@ class IndependentPosterior(Posterior):
 
             return acceleration
 
-        def mean() -> AccelerationFunction:
-            return through([StackedFunctions.mean_of(latent) for latent in self.latents])
-
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             seeds = np.random.SeedSequence(seed).generate_state(len(self.latents))  # joints are independent
             each = zip(self.latents, seeds, strict=True)
             return through([draw_functions(latent, samples, int(own)) for latent, own in each])
 
-        return AccelerationModel(base.system, None, mean, sampled)
+        stacked = StackedFunctions.mean_of
+        return AccelerationModel(base.system, None, lambda: through([*map(stacked, self.latents)]), sampled)
 
     @property
     @override
