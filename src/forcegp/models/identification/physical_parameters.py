@@ -9,7 +9,7 @@ Every parameter has a scaled form s with s = 0 at its start value:
 V does not depend on the mass, so a link whose inertia is not learned keeps it about its centre of mass whatever mass
 and centre become. In the log-Cholesky parameters of Rucker & Wensing (2022), whose factor carries e^alpha, that reads
 alpha = alpha0 + s/2, d_i = log V_ii + alpha0 - alpha and s_ij = V_ij e^(alpha0 - alpha). Every s gives a body that can
-exist. The search moves z with s = T z; T makes its steps comparable (`models.physical_scaling`).
+exist. The search moves z with s = T z; T makes its steps comparable (`structured.physical_start`).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
