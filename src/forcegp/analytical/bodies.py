@@ -181,7 +181,7 @@ def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
         center = np.array(link.center_of_mass)
         text = replace_inertial(text, heaviest, link.mass, center, inertia, source=robot.source)
         changed.append(heaviest if heaviest == joint.child else f"{heaviest} (of {joint.child})")
-    return (_again(robot, text) if changed else robot), tuple(changed)
+    return (robot.with_text(text) if changed else robot), tuple(changed)
 
 
 def with_bodies(robot: Robot, wanted: Float[np.ndarray, "nv 4 4"]) -> Robot:
@@ -211,7 +211,7 @@ def with_bodies(robot: Robot, wanted: Float[np.ndarray, "nv 4 4"]) -> Robot:
         second = A @ own @ A.T
         inertia = np.trace(second) * np.eye(3) - second
         text = replace_inertial(text, name, link.mass * scale**2, center, inertia, source=robot.source)
-    return _again(robot, text)
+    return robot.with_text(text)
 
 
 def with_joint_dynamics(robot: Robot, damping: np.ndarray | None, friction: np.ndarray | None) -> Robot:
@@ -221,13 +221,7 @@ def with_joint_dynamics(robot: Robot, damping: np.ndarray | None, friction: np.n
         values = {"damping": damping, "friction": friction}
         given = {name: float(value[index]) for name, value in values.items() if value is not None}
         text = replace_dynamics(text, joint.name, given, source=robot.source) if given else text
-    return _again(robot, text)
-
-
-def _again(robot: Robot, text: str) -> Robot:
-    return Robot.from_urdf_text(
-        text, source=robot.source, gravity=robot.gravity, armature=robot.armature, locked=robot.locked
-    ).to(robot.device)
+    return robot.with_text(text)
 
 
 def _definite(pseudo: np.ndarray) -> bool:

@@ -3,12 +3,8 @@
     tau = M(q) a + bias(q, v) - armature a = Y(q, v, a) pi
 
 (Atkeson, An & Hollerbach, "Estimation of inertial parameters of manipulator loads and links", IJRR 1986). A *body* is
-what one joint moves as one: its child link with every link fixed to it; only their sum shows in joint forces. Body i
-has the parameters
-
-    m [kg],  m cx, m cy, m cz [kg m],  Ixx, Ixy, Iyy, Ixz, Iyz, Izz [kg m^2]
-
-about the origin and in the axes of the child link of joint i (Pinocchio's order); ``pi`` has them body after body.
+what one joint moves as one: its child link with every link fixed to it; only their sum shows in joint forces. ``pi``
+has the `PARAMETERS` of body after body, about the origin and in the axes of the child link (Pinocchio's order).
 
 The columns of the torque regressor are linearly dependent for every motion: a link's mass shows only together with
 others. QR with column pivoting takes independent columns first, ``W P = Q [R1 R2; 0 0]``; the base parameters are

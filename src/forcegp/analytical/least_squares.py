@@ -245,15 +245,14 @@ def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.nda
     Filtered signals have residuals that resemble their neighbours; without this factor standard errors are too small.
     The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).
     """
-    centered = residual
-    total = (centered**2).sum(0)
+    total = (residual**2).sum(0)
     times = np.ones(residual.shape[1])
     open_ = np.ones(residual.shape[1], dtype=bool)
     for lag in range(1, len(residual) - 1, 2):
         pair = np.zeros(residual.shape[1])
         for shift in (lag, lag + 1):
             same = episode[shift:] == episode[:-shift]
-            pair += (centered[shift:] * centered[:-shift] * same[:, None]).sum(0) / np.maximum(total, 1e-300)
+            pair += (residual[shift:] * residual[:-shift] * same[:, None]).sum(0) / np.maximum(total, 1e-300)
         open_ &= pair > 0.0
         if not open_.any():
             break

@@ -146,10 +146,7 @@ class RecordedRows:
 
 
 def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce, ...]:
-    """Known forces that are not estimated, the rigid-body bias left out.
-
-    Raises InvalidInput for a system without it, or in contact, whose forces are not known.
-    """
+    """Known forces not estimated, less the bias. Raises InvalidInput for systems without it, or in contact."""
     if system.contacts:
         frames = ", ".join(contact.frame for contact in system.contacts)
         raise InvalidInput(

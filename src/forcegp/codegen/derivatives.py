@@ -18,10 +18,7 @@ FLAT = ("less", "at_most", "equal", "look up", "input", "constant", "call")
 def gradients(
     graph: Graph, outputs: Sequence[int], cotangents: Sequence[int], wanted: Sequence[int], held: Sequence[int] = ()
 ) -> list[int]:
-    """``sum_k cotangents_k d outputs_k / d wanted``.
-
-    ``held`` are taken as constants: nothing is differentiated through them. Nor through the cotangents.
-    """
+    """``sum_k cotangents_k d outputs_k / d wanted``; ``held`` and the cotangents count as constants."""
     adjoint: dict[int, int] = {}
     for output, cotangent in zip(outputs, cotangents, strict=True):
         adjoint[output] = graph.apply("add", adjoint.get(output, ZERO), cotangent)

@@ -8,6 +8,7 @@ numbers.
 """
 
 import math
+import operator
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -20,36 +21,20 @@ Slopes = Mapping[tuple[int, int], int]
 ZERO, ONE = 0, 1
 """Numbers of the nodes that hold these constants."""
 
+CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan")
+OTHERS = ("sqrt", "sinh", "cosh", "tanh", "asinh", "exp", "log", "log1p", "expm1", "erf")
 UNARY: dict[str, Callable[[float], float]] = {
-    "negate": lambda x: -x,
+    "negate": operator.neg,
     "absolute": abs,
-    "sqrt": math.sqrt,
-    "sin": math.sin,
-    "cos": math.cos,
-    "tan": math.tan,
-    "asin": math.asin,
-    "acos": math.acos,
-    "atan": math.atan,
-    "sinh": math.sinh,
-    "cosh": math.cosh,
-    "tanh": math.tanh,
-    "asinh": math.asinh,
-    "exp": math.exp,
-    "log": math.log,
-    "log1p": math.log1p,
-    "expm1": math.expm1,
-    "erf": math.erf,
+    **{name: getattr(math, name) for name in (*CIRCULAR, *OTHERS)},
 }
+ARITHMETIC = {"add": operator.add, "subtract": operator.sub, "multiply": operator.mul, "divide": operator.truediv}
+COMPARED = {"less": operator.lt, "at_most": operator.le, "equal": operator.eq}
 BINARY: dict[str, Callable[[float, float], float]] = {
-    "add": lambda x, y: x + y,
-    "subtract": lambda x, y: x - y,
-    "multiply": lambda x, y: x * y,
-    "divide": lambda x, y: x / y,
+    **ARITHMETIC,
     "power": math.pow,
     "atan2": math.atan2,
-    "less": lambda x, y: float(x < y),
-    "at_most": lambda x, y: float(x <= y),
-    "equal": lambda x, y: float(x == y),
+    **COMPARED,
 }
 COMMUTATIVE = ("add", "multiply", "equal")
 LEAVES = ("constant", "input")
@@ -66,7 +51,7 @@ class Graph:
     def __init__(self, inputs: int = 0) -> None:
         self.nodes: list[tuple] = []
         self.slopes: dict[int, Slopes] = {}
-        self._outputs: dict[int, int] = {}
+        self.outputs_of: dict[int, int] = {}  # how many numbers a call gives
         self._found: dict[tuple, int] = {}
         self._record(("constant", 0.0))
         self._record(("constant", 1.0))
@@ -90,22 +75,14 @@ class Graph:
     def call(self, name: str, operands: Sequence[int], outputs: int, slopes: Slopes | None = None) -> list[int]:
         """The outputs of a C function; `slopes` names those beyond them that are derivatives."""
         call = self._record(("call", name, *operands))
-        self._outputs[call] = max([outputs, *(1 + k for k in (slopes or {}).values())])
+        self.outputs_of[call] = max([outputs, *(1 + k for k in (slopes or {}).values())])
         if slopes is not None:
             self.slopes[call] = slopes
         return [self.output(call, k) for k in range(outputs)]
 
-    def outputs_of(self, call: int) -> int:
-        """How many numbers a call gives."""
-        return self._outputs[call]
-
     def output(self, call: int, position: int) -> int:
         """One output of a call."""
         return self._record(("output", call, position))
-
-    def copier(self, other: "Graph", known: dict[int, int]) -> "Copier":
-        """What copies nodes of another graph to this one."""
-        return Copier(self, other, known)
 
     def look_up(self, table: Sequence[float], place: int) -> int:
         """The entry of a table of numbers at the place that a node holds."""
@@ -234,6 +211,16 @@ class Copier:
         return [known[node] for node in nodes]
 
 
+def _operator(operation: str, swapped: bool = False) -> "Callable[..., Expression | float]":
+    def recorded(self: "Expression", *others: "Expression | float") -> "Expression | float":
+        operands = (*others, self) if swapped else (self, *others)
+        node = self.graph.apply(operation, *(node_of(self.graph, x) for x in operands))
+        value = self.graph.value(node)
+        return Expression(self.graph, node) if value is None else value
+
+    return recorded
+
+
 class Expression:
     """A scalar that stands for a node of a `Graph`; what turns out to be known is a float."""
 
@@ -242,47 +229,11 @@ class Expression:
     def __init__(self, graph: Graph, node: int) -> None:
         self.graph, self.node = graph, node
 
-    def _apply(self, operation: str, *operands: "Expression | float") -> "Expression | float":
-        node = self.graph.apply(operation, *(node_of(self.graph, x) for x in operands))
-        value = self.graph.value(node)
-        return Expression(self.graph, node) if value is None else value
-
-    def __add__(self, other: "Expression | float") -> "Expression | float":
-        return self._apply("add", self, other)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: "Expression | float") -> "Expression | float":
-        return self._apply("subtract", self, other)
-
-    def __rsub__(self, other: float) -> "Expression | float":
-        return self._apply("subtract", other, self)
-
-    def __mul__(self, other: "Expression | float") -> "Expression | float":
-        return self._apply("multiply", self, other)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: "Expression | float") -> "Expression | float":
-        return self._apply("divide", self, other)
-
-    def __rtruediv__(self, other: float) -> "Expression | float":
-        return self._apply("divide", other, self)
-
-    def __neg__(self) -> "Expression | float":
-        return self._apply("negate", self)
-
-    def exp(self) -> "Expression | float":
-        """Exponential."""
-        return self._apply("exp", self)
-
-    def sin(self) -> "Expression | float":
-        """Sine."""
-        return self._apply("sin", self)
-
-    def cos(self) -> "Expression | float":
-        """Cosine."""
-        return self._apply("cos", self)
+    __add__ = __radd__ = _operator("add")
+    __sub__, __rsub__ = _operator("subtract"), _operator("subtract", swapped=True)
+    __mul__ = __rmul__ = _operator("multiply")
+    __truediv__, __rtruediv__ = _operator("divide"), _operator("divide", swapped=True)
+    __neg__, exp, sin, cos = map(_operator, ("negate", "exp", "sin", "cos"))
 
 
 def node_of(graph: Graph, scalar: Expression | float) -> int:
@@ -293,7 +244,7 @@ def node_of(graph: Graph, scalar: Expression | float) -> int:
 def _folded(operation: str, operands: Sequence[float | None]) -> float:
     """An operation on known numbers; outside its domain NaN, as a processor has it."""
     try:
-        return {**UNARY, **BINARY}[operation](*operands)  # type: ignore[arg-type]  # the caller has checked that none is None
+        return float({**UNARY, **BINARY}[operation](*operands))  # type: ignore[arg-type]  # the caller has checked that none is None
     except (ValueError, ZeroDivisionError, OverflowError):
         return math.nan
 
@@ -302,11 +253,9 @@ FUNCTIONS: dict[str, Any] = {
     **{name: getattr(np, name) for name in ("absolute", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp")},
     **{name: getattr(np, name) for name in ("log", "log1p", "expm1", "add", "subtract", "multiply", "divide", "power")},
     **{name: getattr(np, f"arc{name[1:]}") for name in ("asin", "acos", "atan", "asinh", "atan2")},
+    **{name: lambda x, y, compared=compared: np.where(compared(x, y), 1.0, 0.0) for name, compared in COMPARED.items()},
     "negate": np.negative,
     "erf": erf,
-    "less": lambda x, y: np.where(x < y, 1.0, 0.0),
-    "at_most": lambda x, y: np.where(x <= y, 1.0, 0.0),
-    "equal": lambda x, y: np.where(x == y, 1.0, 0.0),
     "choose": lambda m, x, y: np.where(m != 0.0, x, y),
 }
 

@@ -1,11 +1,8 @@
 """Programs made at run time: C text compiled, kept in a folder, loaded by later processes, called with tensors.
 
-A file of the folder is named by a hash of everything that decides what is in it. Loading such a file runs the code in
-it with the rights of the process. So only files of the folder are loaded, and only if the file, the folder and all
-folders above it belong to the user (or to root) and no one else may write to them.
-
-C of our own and not `torch.compile`: of the same scalars inductor made code in 156-184 s per function, gcc in 0.3 s,
-which runs six times faster (`python -m benchmarks.compiled_dynamics inductor`), and this cache loads in 2 ms.
+A file of the folder is named by a hash of everything that decides what is in it. Loading it runs its code with the
+rights of the process, so it must be out of reach of others (`own_file`). docs/compiled-dynamics.md says what is
+trusted, and why this is C of our own and not `torch.compile`.
 """
 
 import ctypes
@@ -51,10 +48,7 @@ class Purpose:
     instead: str
 
     def compiler(self) -> list[str]:
-        """The command of the C compiler, with the options that the environment variable CC gives.
-
-        Raises :class:`~forcegp.errors.CompilerError` where there is none.
-        """
+        """The C compiler's command, with options from the variable CC. Raises CompilerError where there is none."""
         try:
             chosen = shlex.split(os.environ.get(VARIABLE, ""))
         except ValueError as error:
@@ -246,10 +240,7 @@ NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
 
 
 class RowFunction:
-    """`evaluate` of a library, whose inputs and outputs have these lengths.
-
-    `tables` are the addresses of flat arrays, which the caller keeps alive.
-    """
+    """`evaluate` of a library, with inputs and outputs of these lengths; `tables` are flat arrays for it."""
 
     def __init__(
         self, library: ctypes.CDLL, inputs: Sequence[int], outputs: Sequence[int], tables: Sequence[Tensor] = ()

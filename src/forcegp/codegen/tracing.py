@@ -1,11 +1,8 @@
 """From a function written in torch to a graph: the tensor operations of one call, taken apart into scalars.
 
 The function runs once on an example, and every operation of it is noted; loops and branches of Python leave no trace.
-Operations that only move numbers (slices, stacks, transposes, ...) run on tensors of node numbers instead of values, so
-torch itself does the moving.
-
-A second implementation of each force is not needed: surfaces, known forces and priors of anybody are in the graph as
-they stand. At one state the cost of rigid-body dynamics is that of calling torch operations.
+Operations that only move numbers (slices, stacks, ...) run on tensors of node numbers instead of values. So surfaces,
+known forces and priors of anybody are in the graph as they stand, without a second implementation.
 """
 
 import math
@@ -123,10 +120,7 @@ class _Recording(TorchDispatchMode):
 
 @cache
 def _decompositions() -> dict[Any, Callable[..., Any]]:
-    """What makes few operations of the many that torch has.
-
-    The public function gives those of torch.export as well, and takes a second to import it.
-    """
+    """What makes few operations of many; the public function has more, and takes a second to import it."""
     return getattr(_decomp, "_core_aten_decompositions_post_autograd", _decomp.core_aten_decompositions)()
 
 
@@ -198,19 +192,6 @@ def _looked_up(graph: Graph, values: Any, indices: list[Any]) -> _Numbers:
         return found
 
     return _elementwise(graph, one, indices[0])
-
-
-def _filled(graph: Graph, x: _Numbers, value: Any) -> _Numbers:
-    return _Numbers(torch.full_like(x.nodes, graph.constant(value)))
-
-
-def _added_multiple(graph: Graph, x: Any, y: Any, z: Any, value: Any = 1.0) -> _Numbers:
-    """addcmul. The decomposition that torch has of it takes a second to import what it needs."""
-    return _binary("add")(graph, x, _binary("multiply")(graph, y, z), value)
-
-
-def _padded(graph: Graph, x: _Numbers, pad: list[int], value: Any = 0.0) -> _Numbers:
-    return _Numbers(torch.constant_pad_nd(x.nodes, pad, graph.constant(value)))
 
 
 def _elementwise(graph: Graph, function: Callable[..., int], *values: Any) -> _Numbers:
@@ -323,9 +304,12 @@ def _added_product(graph: Graph, bias: Any, x: Any, y: Any, beta: Any = 1.0, alp
 
 
 HANDLERS: dict[str, Callable[..., Any]] = {
-    "full_like": _filled,
-    "constant_pad_nd": _padded,
-    "addcmul": _added_multiple,
+    "full_like": lambda graph, x, value: _Numbers(torch.full_like(x.nodes, graph.constant(value))),
+    "constant_pad_nd": lambda graph, x, pad, value=0.0: _Numbers(
+        torch.constant_pad_nd(x.nodes, pad, graph.constant(value))
+    ),
+    # the decomposition that torch has of it takes a second to import what it needs
+    "addcmul": lambda graph, x, y, z, value=1.0: _binary("add")(graph, x, _binary("multiply")(graph, y, z), value),
     **{name: _binary(NAMES[name]) for name in ("add", "sub", "mul", "div")},
     "rsub": lambda graph, x, y, alpha=1.0: _binary("subtract")(graph, y, _binary("multiply")(graph, x, float(alpha))),
     "atan2": _binary("atan2"),
@@ -335,12 +319,9 @@ HANDLERS: dict[str, Callable[..., Any]] = {
     "ge": _binary("at_most", swapped=True),
     "eq": _binary("equal"),
     "ne": lambda graph, x, y: _negated(graph, _binary("equal")(graph, x, y)),
-    "logical_not": _negated,
-    "bitwise_not": _negated,
-    "logical_and": _binary("multiply"),
-    "bitwise_and": _binary("multiply"),
-    "logical_or": _either,
-    "bitwise_or": _either,
+    **dict.fromkeys(("logical_not", "bitwise_not"), _negated),
+    **dict.fromkeys(("logical_and", "bitwise_and"), _binary("multiply")),
+    **dict.fromkeys(("logical_or", "bitwise_or"), _either),
     "where": lambda graph, m, x, y: _elementwise(graph, lambda *nodes: graph.apply("choose", *nodes), m, x, y),
     "reciprocal": lambda graph, x: _binary("divide")(graph, 1.0, x),
     "rsqrt": lambda graph, x: _power(graph, x, -0.5),
@@ -352,19 +333,14 @@ HANDLERS: dict[str, Callable[..., Any]] = {
         x,
     ),
     "pow": _power,
-    "clamp": _clamp,
-    "clamp_min": _clamp,
-    "clamp_max": lambda graph, x, high: _clamp(graph, x, None, high),
-    "maximum": _clamp,
-    "minimum": lambda graph, x, y: _clamp(graph, x, None, y),
+    **dict.fromkeys(("clamp", "clamp_min", "maximum"), _clamp),
+    **dict.fromkeys(("clamp_max", "minimum"), lambda graph, x, high: _clamp(graph, x, None, high)),
     "sum": _sum,
     "mean": _mean,
     "linalg_vector_norm": _norm,
     "_cdist_forward": _distances,
-    "mm": _product,
-    "bmm": _product,
+    **dict.fromkeys(("mm", "bmm"), _product),
     "mv": lambda graph, x, y: _Numbers(_product(graph, x, _Numbers(_numbers(graph, y).nodes[:, None])).nodes[:, 0]),
     "dot": lambda graph, x, y: _sum(graph, _binary("multiply")(graph, x, y)),
-    "addmm": _added_product,
-    "baddbmm": _added_product,
+    **dict.fromkeys(("addmm", "baddbmm"), _added_product),
 }

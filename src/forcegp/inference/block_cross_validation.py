@@ -86,37 +86,25 @@ def leave_blocks_out(
         rows = torch.tensor([row for block in chosen for row in block], device=device)
         order = torch.argsort(rows)
         rows = rows[order]
-        residual = torch.cat([part.residual for part in parts])[order]
-        covariance = torch.cat([part.covariance for part in parts])[order]
+        whole, *values = zip(*parts, strict=True)
+        per_row, residual, covariance = (torch.cat(part)[order] for part in values)
         lower = _lower(noise).expand(count, outputs, outputs)
         scale = lower.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * outputs * math.log(2.0 * math.pi)
-        per_row = torch.cat([part.per_row for part in parts])[order] - scale[rows]
-        whole = torch.stack([part.log_density for part in parts])
-        whole = whole - torch.stack([scale[list(block)].sum() for block in chosen])
+        whole = torch.stack(whole) - torch.stack([scale[list(block)].sum() for block in chosen])
         lower = lower[rows]
-        return LeaveOut(
-            chosen, whole, rows.cpu(), per_row, (lower @ residual[..., None])[..., 0], lower @ covariance @ lower.mT
-        )
+        residual = (lower @ residual[..., None])[..., 0]
+        return LeaveOut(chosen, whole, rows.cpu(), per_row - scale[rows], residual, lower @ covariance @ lower.mT)
 
 
-@dataclass(frozen=True, eq=False)
-class _LeftOut:
-    """One block in whitened coordinates; densities without their constants."""
-
-    log_density: Float[Tensor, ""]
-    per_row: Float[Tensor, " rows"]
-    residual: Float[Tensor, "rows D"]
-    covariance: Float[Tensor, "rows D D"]
-
-
-def _left_out_block(system: DeflatedSystem, precision: Tensor | None, rows: Int[Tensor, " rows"]) -> _LeftOut:
+def _left_out_block(system: DeflatedSystem, precision: Tensor | None, rows: Int[Tensor, " rows"]) -> tuple[Tensor, ...]:
+    """The fields of `LeaveOut` of one block in whitened coordinates; densities without their constants."""
     deflation = system.deflation
     U, remainder = deflation.U[rows], deflation.remainder[rows]
     count, outputs, rank = U.shape
     orthogonal = 0.5 * remainder.square().sum(-1)
     identity = torch.eye(outputs, dtype=U.dtype, device=U.device)
     if precision is None:
-        return _LeftOut(-orthogonal.sum(), -orthogonal, remainder, identity.expand(count, -1, -1))
+        return -orthogonal.sum(), -orthogonal, remainder, identity.expand(count, -1, -1)
     ascending, place = torch.sort(rows)  # only the lower triangle of the precision is there
     index = (ascending[:, None] * rank + torch.arange(rank, device=U.device)).reshape(-1)
     lower = precision[index[:, None], index].tril()
@@ -138,7 +126,7 @@ def _left_out_block(system: DeflatedSystem, precision: Tensor | None, rows: Int[
     per_row = -0.5 * white.square().sum((-2, -1)) - own.diagonal(dim1=-2, dim2=-1).log().sum(-1) - orthogonal
     residual = (U @ error[..., None])[..., 0] + remainder
     covariance = identity + U @ (spread - torch.eye(rank, dtype=U.dtype, device=U.device)) @ U.mT
-    return _LeftOut(log_density, per_row, residual, covariance)
+    return log_density, per_row, residual, covariance
 
 
 def _lower(noise: Tensor) -> Tensor:

@@ -64,8 +64,7 @@ class CholeskyFactor:
         return self._in_place(lapack.dpotri, "dpotri")
 
     def _in_place(self, function: Callable[..., tuple[np.ndarray, int]], name: str) -> Float[Tensor, "n n"]:
-        # The row-major lower triangle is the column-major upper one, so LAPACK works on the transposed view without a
-        # copy.
+        # The row-major lower triangle is the column-major upper one: LAPACK takes the transposed view without a copy.
         inverse, info = function(self.lower.numpy().T, lower=0, overwrite_c=1)
         if info != 0:
             raise NumericalError(

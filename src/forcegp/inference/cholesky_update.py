@@ -1,20 +1,14 @@
 """Learning from more rows without starting again: the exact posterior with rows appended or left out.
 
-Appending m rows to N costs O(N^2 m) instead of O((N + m)^3), by the block Cholesky factorisation of T in deflated
-coordinates (Golub & Van Loan 2013, section 4.2.9),
-
-    [T11 T12]   [L11    ] [L11^T L21^T]      L21 = (L11^-1 T12)^T,
-    [T21 T22] = [L21 L22] [      L22^T],     L22 L22^T = T22 - L21 L21^T.
-
-What a row is worth is how far the posterior moves with it: the Kullback-Leibler divergence from the posterior without
-the row to the one with it. With P = T^-1 and alpha = P t it needs the row's own blocks only,
+Rows are appended by the block Cholesky factorisation of T in deflated coordinates (Golub & Van Loan 2013, section
+4.2.9; docs/incremental.md). What a row is worth is the Kullback-Leibler divergence from the posterior without it to the
+one with it. With P = T^-1 and alpha = P t it needs the row's own blocks only,
 
     1/2 (tr P_ii - log|P_ii| - r + alpha_i^T (P_ii^-1 - I) alpha_i),
 
 for P_ii^-1 is the covariance of t_i given all other rows, noise I included, and P_ii^-1 alpha_i what these predict
-wrongly of it (`leave_out`). Rows that the others predict already are worth nothing; surprising ones are worth more.
-(Csato & Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a score.) Leaving a row out of P
-is a step of Cholesky's algorithm on P, so that rows can be left out one after the other without another inversion.
+wrongly of it (`leave_out`). (Csato & Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a
+score.) Leaving a row out of P is a step of Cholesky's algorithm on P, so that no other inversion is needed.
 """
 
 from collections.abc import Callable, Sequence
@@ -71,10 +65,7 @@ def bytes_to_choose(rows: int, rank: int) -> int:
 
 
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
-    """The posterior of some of the rows, in the order given: their covariance is factorised anew.
-
-    Raises NumericalError where it cannot be.
-    """
+    """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
     with torch.no_grad():
         deflation = Deflation(*(getattr(latent.system.deflation, name)[rows] for name in _PARTS))
         features = tuple(z[rows] for z in latent.features)

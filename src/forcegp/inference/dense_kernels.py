@@ -1,11 +1,8 @@
 """Kernels of all latents: matrices of GPyTorch kernels, exact and lean, and their parameters by name.
 
-Sums and products are taken apart into leaves, once.
-
 GPyTorch's own sums are not used: it adds a low-rank matrix (a linear kernel) to a dense one through a root
 decomposition of the latter, which needs jitter where that is singular and is approximate where it is large. Its lazy
-paths switch silently to conjugate gradients above N D = 800 (measured error of the predictive mean 7.9 rad/s^2 on the
-iiwa).
+paths switch silently to conjugate gradients above N D = 800 (an error of the mean of 7.9 rad/s^2 on the iiwa).
 
 Functions of the distance, linear and constant kernels, and those with an embedding or weight features
 (`kernel_matrices`) are evaluated here; every other kernel is called as it is, and once more in the backward pass.
@@ -41,10 +38,10 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import (
     PointMap,
+    StationaryMatrix,
     embedding,
     lengthscale_of,
     of_distance,
-    stationary_matrix,
     weight_features,
 )
 
@@ -187,7 +184,7 @@ class _OfDistance(DenseKernel):
     @override
     def matrix(self, z: Tensor) -> Tensor:
         embed, lengthscale, smoothness = self._form(z)
-        return stationary_matrix(embed(z), lengthscale, self._variance(z), smoothness)
+        return cast(Tensor, StationaryMatrix.apply(embed(z), lengthscale, self._variance(z), smoothness))
 
     @override
     def cross(self, z: Tensor, other: Tensor) -> Tensor:
@@ -250,12 +247,10 @@ def _is_known(kernel: Kernel) -> bool:
 
 def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
     """A kernel of any kind, called now and again in the backward pass, so that nothing of size N x N is kept."""
-    dense = _DenseCall(kernel)
-    # The parameters go in as arguments: by the time of the recomputation `functional_call` has put the module's own
-    # ones back.
+    dense = _Call(kernel, lambda z: kernel(z, z).to_dense())
+    # As arguments: by the time of the recomputation `functional_call` has put the module's own parameters back.
     names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
-    # An early stop of the recomputation would leave GPyTorch's call by an exception, before it has put `active_dims`
-    # back.
+    # An early stop would leave GPyTorch's call by an exception, before it has put `active_dims` back.
     with set_checkpoint_early_stop(False):
         return checkpoint(
             lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
@@ -265,15 +260,15 @@ def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
         )
 
 
-class _DenseCall(torch.nn.Module):
-    """A kernel whose call returns the dense matrix at once, so that `functional_call` covers the whole evaluation."""
+class _Call(torch.nn.Module):
+    """A function of kernels as a call of a module that holds them, so that `functional_call` covers all of it."""
 
-    def __init__(self, kernel: Kernel) -> None:
+    def __init__(self, kernels: torch.nn.Module, function: Callable[..., Any]) -> None:
         super().__init__()
-        self.kernel = kernel
+        self.kernels, self.function = kernels, function
 
-    def forward(self, z: Tensor) -> Tensor:
-        return self.kernel(z, z).to_dense()
+    def forward(self, *arguments: Any) -> Any:
+        return self.function(*arguments)
 
 
 class LatentKernels(torch.nn.Module):
@@ -305,7 +300,7 @@ class LatentKernels(torch.nn.Module):
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
     ) -> list[Float[Tensor, "N N"]]:
         """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
-        return self._at(parameters, self, features)
+        return self._at(parameters, self.forward, features)
 
     def crosses(
         self,
@@ -314,17 +309,17 @@ class LatentKernels(torch.nn.Module):
         right: Sequence[Float[Tensor, "_ _"]],
     ) -> list[Float[Tensor, "_ _"]]:
         """k_c(left_i, right_j) of every latent at `parameters`, differentiable in them."""
-        return self._at(parameters, _Crosses(self), left, right)
+        return self._at(parameters, self._crosses, left, right)
 
     def diagonals(
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "_ _"]]
     ) -> list[Float[Tensor, " _"]]:
         """k_c(z_i, z_i) of every latent at `parameters`, differentiable in them."""
-        return self._at(parameters, _Diagonals(self), features)
+        return self._at(parameters, self._diagonals, features)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density of the GPyTorch priors registered on the kernels, at `parameters`; 0 where there are none."""
-        return self._at(parameters, _LogPrior(self))
+        return self._at(parameters, self._log_prior)
 
     def initial_parameters(self) -> dict[str, Tensor]:
         """The unconstrained parameters by name, detached copies."""
@@ -341,41 +336,22 @@ class LatentKernels(torch.nn.Module):
             value.copy_(parameters[name].detach().reshape(value.shape))
         return self
 
-    def _at(self, parameters: Mapping[str, Tensor], what: torch.nn.Module, *arguments: object) -> Any:
-        """`what(*arguments)`, a module that holds these kernels under the same names, at `parameters`."""
-        return functional_call(what, {name: parameters[name] for name, _ in self.named_parameters()}, arguments)
+    def _at(self, parameters: Mapping[str, Tensor], function: Callable[..., Any], *arguments: object) -> Any:
+        """`function(*arguments)` while these kernels have `parameters`."""
+        named = {name: parameters[name] for name, _ in self.named_parameters()}
+        return functional_call(_Call(self.kernels, function), named, arguments)
 
-
-class _Crosses(torch.nn.Module):
-    def __init__(self, latent: LatentKernels) -> None:
-        super().__init__()
-        self.kernels, self.dense = latent.kernels, latent.dense
-
-    def forward(self, left: Sequence[Tensor], right: Sequence[Tensor]) -> list[Tensor]:
+    def _crosses(self, left: Sequence[Tensor], right: Sequence[Tensor]) -> list[Tensor]:
         return [kernel.cross(x, y) for kernel, x, y in zip(self.dense, left, right, strict=True)]
 
-
-class _Diagonals(torch.nn.Module):
-    def __init__(self, latent: LatentKernels) -> None:
-        super().__init__()
-        self.kernels, self.dense = latent.kernels, latent.dense
-
-    def forward(self, features: Sequence[Tensor]) -> list[Tensor]:
+    def _diagonals(self, features: Sequence[Tensor]) -> list[Tensor]:
         return [kernel.diagonal(z) for kernel, z in zip(self.dense, features, strict=True)]
 
-
-class _LogPrior(torch.nn.Module):
-    """Sum of the log densities of all priors that are registered on some kernels, once where latents share a kernel."""
-
-    def __init__(self, latent: LatentKernels) -> None:
-        super().__init__()
-        self.kernels = latent.kernels
-        named = [entry for kernel in latent for entry in kernel.named_priors()]
-        self.priors = {(id(module), id(prior)): (module, prior, closure) for _, module, prior, closure, _ in named}
-
-    def forward(self) -> Tensor:
+    def _log_prior(self) -> Tensor:
+        named = [entry for kernel in self for entry in kernel.named_priors()]  # once where latents share a kernel
+        priors = {(id(module), id(prior)): (module, prior, closure) for _, module, prior, closure, _ in named}
         total = torch.zeros((), dtype=torch.float64)
-        for module, prior, closure in self.priors.values():
+        for module, prior, closure in priors.values():
             value = prior.log_prob(closure(module)).sum()
             total = total.to(value.device) + value
         return total

@@ -330,10 +330,7 @@ def engine_from_dict(stored: object) -> Engine:
 
 
 def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = True) -> Choice:
-    """By number of rows, features and free memory; without `inducing`, another than inducing points.
-
-    Raises NotEnoughMemory where no engine fits.
-    """
+    """By rows, features and memory; without `inducing`, no inducing points. Raises NotEnoughMemory where none fits."""
     exact, rows = Exact(), f"{size.rows} rows"
     needed, free = exact.required_bytes(size), free_memory(device)
     fits = needed <= USABLE * free

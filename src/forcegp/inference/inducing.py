@@ -1,32 +1,27 @@
 """Variational inducing points: all data through a few points per latent, with a bound on what that costs.
 
-The collapsed bound of Titsias (2009, "Variational learning of inducing variables in sparse Gaussian processes"), here
-for several latents that share their data through mixing vectors:
-
-    -log p(y) <= -log N(t; 0, Phi Phi^T + I) + 1/2 sum_i sum_c |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2) + the rest
-
-and for data as the model draws them the expected difference, like the expected divergence of the posteriors, is at
-most the sum itself, rows times `left_out` (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational
-inference in Gaussian process regression", theorem 4): where the points leave nothing of the prior variance
-unexplained, bound and posterior are exact. For functions of one or two features (friction curves) some dozens of points
-come close, and the cost is linear in the number of rows.
-
-Of Gaussian processes as finitely many weights (`WeightSpace`), k_c(z, z') ~ phi_c(z) . phi_c(z') with phi_c(z) = L_c^-1
-k_c(p_c, z), the points p_c of latent c are a few of the training points, chosen by pivoted Cholesky, L_c the Cholesky
-factor of their kernel matrix, so that the weights w_c are standard normal a priori. With the deflated data t_i = sum_c
-C_ic f_c(z_i) + noise of covariance D_i (r x r), the weights of all latents together have the precision
+Gaussian processes are finitely many weights (`WeightSpace`): k_c(z, z') ~ phi_c(z) . phi_c(z'), phi_c(z) = L_c^-1
+k_c(p_c, z), with points p_c of latent c chosen from the training points by pivoted Cholesky and L_c the factor of their
+kernel matrix. With deflated data t_i = sum_c C_ic f_c(z_i) + noise of covariance D_i the weights have the precision
 
     B = I + Phi^T D^-1 Phi,      Phi[i, (c, p)] = C_ic phi_cp(z_i).
 
 D = I is the variational posterior of Titsias (2009, "Variational learning of inducing variables in sparse Gaussian
-processes"); D_i = I + sum_c C_ic C_ic^T (k_c(z_i, z_i) - |phi_c(z_i)|^2) gives the points what the weights leave out as
-noise of their own, the fully independent training conditional of Snelson & Ghahramani (2006).
+processes"); D_i = I + sum_c C_ic C_ic^T (k_c(z_i, z_i) - |phi_c(z_i)|^2) makes what the weights leave out noise of the
+points, the fully independent training conditional of Snelson & Ghahramani (2006). The bound of Titsias,
+
+    -log p(y) <= -log N(t; 0, Phi Phi^T + I) + 1/2 sum_i sum_c |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2) + the rest,
+
+is, for data as the model draws them, like the divergence of the posteriors, off by the sum at most on average, rows
+times `left_out` (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational inference in Gaussian process
+regression", theorem 4): exact where nothing is left out. The cost is linear in the number of rows.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import accumulate, pairwise
 
 import torch
 from jaxtyping import Float, Int
@@ -154,10 +149,7 @@ class WeightSpace:
     def at(
         cls, kernels: LatentKernels, points: Sequence[Float[Tensor, "_ _"]], precision: CholeskyFactor, mean: Tensor
     ) -> "WeightSpace":
-        """With weights that were found elsewhere, of which nothing is said of what they leave out.
-
-        Raises NumericalError where the kernel matrix of the points cannot be factorised.
-        """
+        """With weights found elsewhere. Raises NumericalError where the points' kernel matrix cannot be factorised."""
         points = tuple(z.detach() for z in points)
         lowers = tuple(
             factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
@@ -172,7 +164,8 @@ class WeightSpace:
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Which of all weights belong to each latent."""
-        return _slices([len(lower) for lower in self.lowers])
+        ends = accumulate((len(lower) for lower in self.lowers), initial=0)
+        return tuple(slice(start, stop) for start, stop in pairwise(ends))
 
     def columns(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "_ n"]]:
         """phi_c at points, one column each."""
@@ -218,14 +211,6 @@ class WeightSpace:
         return remainder + self.precision.solve_lower(wide).square().sum(0)
 
 
-def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
-    parts, start = [], 0
-    for size in sizes:
-        parts.append(slice(start, start + size))
-        start += size
-    return tuple(parts)
-
-
 CHUNK_BYTES = 64 * 2**20
 """Working memory of one block of rows."""
 
@@ -250,10 +235,7 @@ class InducingPosterior(LatentPosterior):
 
     @classmethod
     def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> "InducingPosterior":
-        """Condition on the data through at most `points` inducing points for each latent.
-
-        Fewer where each latent leaves out less than its share of `tolerance`, see `left_out`.
-        """
+        """On at most `points` points per latent; fewer where its share of `tolerance` suffices (`left_out`)."""
         with torch.no_grad():
             deflation, features = terms.deflated(), terms.features
             pivots = inducing_pivots(kernels, features, deflation.C, points, tolerance)

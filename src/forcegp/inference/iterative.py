@@ -1,10 +1,7 @@
 """The exact posterior mean of all points without their covariance matrix: preconditioned conjugate gradients.
 
-In deflated coordinates T alpha = t with T = sum_c (C_c C_c^T) K_c + I. A product with T needs the kernel matrices one
-panel after the other; the preconditioner is the covariance of the same model with a few weights per latent and the rest
-of the prior variance as noise of every point (`WeightSpace`), inverted by Woodbury's identity. docs/solvers.md
-compares it with others: a pivoted Cholesky factor of T is as good where its rank is chosen well, but gives no
-covariance.
+In deflated coordinates T alpha = t with T = sum_c (C_c C_c^T) K_c + I. docs/large-data.md describes products with T and
+the preconditioner (`WeightSpace`), docs/solvers.md compares it with others.
 """
 
 from collections.abc import Callable, Sequence
@@ -247,7 +244,11 @@ class IterativePosterior(LatentPosterior):
             features = tuple(z.detach() for z in terms.features)
             panels = KernelPanels(kernels, features, memory)
             preconditioner = LowRankPlusDiagonal.of(kernels, features, deflation.C, deflation.t, points)
-            _check_start(start, deflation)
+            if start is not None and start.numel() != deflation.t.numel():
+                raise InvalidInput(
+                    f"the solution to begin from has {start.numel()} numbers, these rows need {deflation.t.numel()}; "
+                    "give that of the same rows, or none."
+                )
             solved = conjugate_gradients(
                 lambda x: _covariance_product(deflation.C, panels, x),
                 preconditioner.solve,
@@ -306,14 +307,6 @@ class IterativePosterior(LatentPosterior):
             ).solution
         finally:
             self.panels.release()
-
-
-def _check_start(start: Tensor | None, deflation: Deflation) -> None:
-    if start is not None and start.numel() != deflation.t.numel():
-        raise InvalidInput(
-            f"the solution to begin from has {start.numel()} numbers, these rows need {deflation.t.numel()}; give that "
-            "of the same rows, or none."
-        )
 
 
 def _covariance_product(C: Float[Tensor, "N r C"], panels: KernelPanels, x: Float[Tensor, "n S"]) -> Tensor:

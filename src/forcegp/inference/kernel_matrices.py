@@ -27,19 +27,11 @@ NO_DISTANCE = 1e-8
 """Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
 
 
-def squared_exponential_embedding(kernel: Kernel) -> PointMap | None:
-    """e(z) with k = exp(-1/2 |e(z) - e(z')|^2); None for kernels that are not of that form, or not known to be."""
-    if type(kernel) is PeriodicKernel:
-        return partial(_circles, kernel)
-    return getattr(kernel, "squared_exponential_embedding", None)
-
-
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
-    """e(z) and the smoothness nu of k as a function of |e(z) - e(z')|, infinite for the squared exponential.
-
-    None for kernels that are not of that form, or not known to be.
-    """
-    squared_exponential = squared_exponential_embedding(kernel)
+    """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
+    squared_exponential = getattr(kernel, "squared_exponential_embedding", None)
+    if type(kernel) is PeriodicKernel:
+        squared_exponential = partial(_circles, kernel)
     if squared_exponential is not None:
         return squared_exponential, math.inf
     matern = getattr(kernel, "matern_embedding", None)
@@ -83,13 +75,6 @@ def lengthscale_of(kernel: Kernel) -> Float[Tensor, " d"]:
     return cast(Tensor, kernel.lengthscale).reshape(-1)
 
 
-def stationary_matrix(
-    z: Float[Tensor, "n d"], lengthscale: Float[Tensor, " d"], outputscale: Tensor, smoothness: float
-) -> Float[Tensor, "n n"]:
-    """s k(|(z_i - z_j) / l|), the squared exponential or a Matern, of which there are first derivatives only."""
-    return cast(Tensor, _StationaryMatrix.apply(z, lengthscale, outputscale, smoothness))
-
-
 def of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:
     """The squared exponential (smoothness inf) or a Matern of the distances between points that are scaled already."""
     if smoothness == math.inf:
@@ -118,14 +103,15 @@ def _matern_slope(r: Tensor, smoothness: float) -> Tensor:
     return 3.0 * decay if smoothness == 1.5 else 5.0 / 3.0 * (1.0 + a) * decay
 
 
-class _StationaryMatrix(torch.autograd.Function):
+class StationaryMatrix(torch.autograd.Function):
     """s k(r) with r_ij = |(z_i - z_j) / l|: the squared exponential (smoothness inf) or a Matern.
 
-    Saves nothing of size N x N but its own result and, for a Matern, the derivative of it.
+    Has first derivatives only; saves nothing of size N x N but its result and, for a Matern, the derivative of it.
     """
 
     @staticmethod
     def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor, smoothness: float) -> Tensor:  # type: ignore[override]  # the base takes *args
+        """The matrix (n, n)."""
         scaled = z / lengthscale
         if smoothness == math.inf:
             K = squared_distance(scaled, scaled).mul_(-0.5)
@@ -140,6 +126,7 @@ class _StationaryMatrix(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
+        """Gradients in z, length scales and output scale."""
         # With create_graph=True: `once_differentiable` would let it pass where upstream is a constant.
         if torch.is_grad_enabled():
             raise NotImplementedError(

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from forcegp.codegen.c_writer import c_value
 from forcegp.codegen.derivatives import gradients
-from forcegp.codegen.graph import ONE, Graph, Slopes, evaluated
+from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
 from forcegp.codegen.tracing import trace
 
 PADDING = 8
@@ -82,10 +82,7 @@ class KernelSum:
         diagonal: Callable[[Tensor], Tensor],
         level: tuple[float, ...],
     ) -> "KernelSum":
-        """Traced from the kernels less a constant `level` of each.
-
-        Raises InvalidInput, naming the operation, for those that no graph holds.
-        """
+        """Traced from kernels less a constant `level` each. Raises InvalidInput, naming what no graph holds."""
         example = centers[:1]
         pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
         prior, (variances,) = trace(lambda z: [diagonal(z)], [example])
@@ -131,11 +128,11 @@ class KernelSum:
 
     def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
         """The operands at features z."""
-        return graph.copier(self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)
+        return Copier(graph, self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)
 
     def variance(self, graph: Graph, z: Sequence[int]) -> list[int]:
         """Prior variances at features z."""
-        return graph.copier(self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
+        return Copier(graph, self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
 
     @cached_property
     def rows(self) -> list[int]:

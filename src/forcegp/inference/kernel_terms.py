@@ -67,10 +67,7 @@ class KernelTerm:
 
 
 def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
-    """The kernel, multiplied out.
-
-    Raises InvalidInput for kernels of which neither features nor a spectrum are known.
-    """
+    """The kernel, multiplied out. Raises InvalidInput where neither features nor a spectrum are known."""
     one = KernelTerm(torch.ones((), dtype=torch.float64))
     whole = not kernel.batch_shape and kernel.active_dims is None
     if whole:

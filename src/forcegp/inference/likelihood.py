@@ -32,9 +32,7 @@ from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.memory import return_freed_memory
 
 RANK_TOLERANCE = 1e-12
-"""Singular values of W~_i below this fraction of the largest one count as zero (they come from rounding in H A^T =
-0).
-"""
+"""Singular values of W~_i below this fraction of the largest count as zero: rounding in H A^T = 0."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,10 +87,7 @@ def weighted(weights: Float[Tensor, "N n"], values: Float[Tensor, "Nn *rest"]) -
 def functional_negative_log_likelihood(
     weights: Float[Tensor, "N n"], terms: Terms, kernel_matrices: Sequence[Float[Tensor, "Nn Nn"]]
 ) -> Float[Tensor, ""]:
-    """Exact -log p(y) of the functionals (`Functionals.of`); differentiable once in every argument.
-
-    Raises NumericalError when a covariance cannot be factorised.
-    """
+    """Exact -log p(y) of `Functionals.of`; once differentiable. Raises NumericalError without a factorisation."""
     functionals = Functionals.of(weights, terms)
     quadratic_and_logdet = _NormalNLL.apply(functionals.covariance(kernel_matrices), functionals.y.flatten())
     constant = 0.5 * functionals.y.numel() * math.log(2.0 * math.pi)

@@ -87,10 +87,7 @@ LatentCall = KernelSum | OneInputCall
 def latent_calls(
     latent: LatentPosterior, prepared: PreparedKernels, compressed: CompressedCovariance | None
 ) -> tuple[LatentCall, ...]:
-    """The processes of a posterior as C functions, each in the form that suits its kernel.
-
-    Raises InvalidInput for a kernel that cannot be traced.
-    """
+    """The processes as C functions, in the form that suits each. Raises InvalidInput for an untraceable kernel."""
     found: list[LatentCall] = []
     factors = [None] * len(prepared.groups) if compressed is None else compressed.factors
     for part, F in zip(prepared.sums(), factors, strict=True):

@@ -254,10 +254,7 @@ def one_input_form(
 def drawn_form(
     drawn: FunctionSamples | ComposedSamples, latent: LatentPosterior, index: int, tolerance: float = TOLERANCE
 ) -> OneInputFunctions | None:
-    """S functions of one latent, drawn from its posterior: exact where they have no cosines, otherwise a cubic table.
-
-    None as in `one_input_form`.
-    """
+    """S drawn functions of one latent: exact where without cosines, else a table. None as in `one_input_form`."""
     centers = latent.features[index].detach()
     if centers.shape[-1] != 1:
         return None

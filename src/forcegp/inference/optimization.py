@@ -55,13 +55,8 @@ class OptimizerOptions:
         if min(map(operator.index, (self.iterations, self.adam_steps, self.patience))) < 0:
             counts = f"iterations={self.iterations}, adam_steps={self.adam_steps} and patience={self.patience}"
             raise InvalidInput(f"{counts} must be >= 0")
-        if not (
-            self.tolerance >= 0
-            and self.slow >= 0
-            and self.gradient_tolerance >= 0
-            and self.adam_rate > 0
-            and self.memory > 0
-        ):
+        tolerances = (self.tolerance, self.slow, self.gradient_tolerance)
+        if not (all(x >= 0 for x in tolerances) and self.adam_rate > 0 and self.memory > 0):
             raise InvalidInput("tolerances must be >= 0, adam_rate and memory > 0")
 
 

@@ -1,16 +1,14 @@
 """Pathwise conditioning: functions drawn from the posterior, and its mean, evaluated fast at few points many times.
 
 A drawn function is a prior sample plus an update by the data (Matheron's rule; Wilson et al. 2020, "Efficiently
-sampling functions from Gaussian process posteriors", eq. 10), here with the
-centres z_j of the posterior, whose weights `LatentPosterior.function_weights` finds:
+sampling functions from Gaussian process posteriors", eq. 10), with the centres z_j of the posterior:
 
     f_s(z) = g_s(z) + sum_j k(z, z_j) beta_s,j
 
 with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
 many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
-approximate, and the better the more cosines there are. Where all kernels are squared exponentials, all latents are one
-batched operation (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`). A
-Matern 1/2 of one input has too high frequencies for cosines and is drawn on a grid (`kernel_terms.DrawnTerm`).
+approximate, and the better the more cosines there are. Squared exponentials of all latents are one batched operation
+(`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`).
 """
 
 from collections.abc import Sequence
@@ -165,10 +163,7 @@ class ComposedSamples:
     def draw(
         cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
     ) -> "ComposedSamples":
-        """As `FunctionSamples.draw`; `frequencies` are those of one function of one term.
-
-        Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
-        """
+        """As `FunctionSamples.draw`, `frequencies` per function and term. Raises InvalidInput as `kernel_terms`."""
         with torch.no_grad():
             generator = torch.Generator(device=latent.features[0].device).manual_seed(seed)
             terms = tuple(

@@ -19,7 +19,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.likelihood import DeflatedSystem, deflate, solve_deflated, whiten
+from forcegp.inference.likelihood import DeflatedSystem, Terms, solve_deflated
 
 BLOCK_BYTES = 64 * 2**20
 """Working memory of one block of test points."""
@@ -56,10 +56,7 @@ class LatentPosterior(ABC):
         return prior - V.mT @ V
 
     def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        """L^-1 Cov(data, f(z)) of one latent, with L L^T the covariance of the (whitened) data.
-
-        Raises InvalidInput for engines that do not factorise it.
-        """
+        """L^-1 Cov(data, f(z)), L L^T that of the (whitened) data. Raises InvalidInput where nothing is factorised."""
         raise InvalidInput(f"a {type(self).__name__} does not factorise the covariance of all rows; {self.remedy}.")
 
     @abstractmethod
@@ -151,8 +148,7 @@ class ExactPosterior(FactorizedPosterior):
     ) -> "ExactPosterior":
         """Condition on residual = y - m; the arguments are those of `negative_log_likelihood`."""
         with torch.no_grad():
-            W_white, y_white, _ = whiten(W, residual, noise)
-            system = solve_deflated(deflate(W_white, y_white), kernels(features))
+            system = solve_deflated(Terms(list(features), W, residual, noise).deflated(), kernels(features))
         return cls(kernels, tuple(z.detach() for z in features), system)
 
     @property

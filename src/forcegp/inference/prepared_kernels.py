@@ -1,10 +1,7 @@
 """Kernel functions and covariances of all latents, prepared for many calls with few points.
 
-Scaled squared exponentials of latents that share their centres are one matrix product and one exponential:
-
-    log k_c(z, z_j) = log s_c - 1/2 |z / l_c|^2 + (z / l_c^2) . z_j - 1/2 |z_j / l_c|^2
-
-is one matrix product with the centres for all of them. Every other kernel is evaluated by itself.
+Scaled squared exponentials of latents that share their centres are one matrix product and one exponential (the formula
+stands in `kernel_sums`). Every other kernel is evaluated by itself.
 
 The exact covariance of the latents is k(z, z) - V^T V with V = L^-1 K(z), where K(z) (n, C) is the covariance of the
 whitened data with f(z) and L L^T = T theirs. With orthonormal columns B (n, R),
@@ -14,8 +11,8 @@ whitened data with f(z) and L L^T = T theirs. With orthonormal columns B (n, R),
 is the covariance given only the R numbers (L^-T B)^T t of the data t: that of a Gaussian process which has seen less.
 So it is never below the exact one (the difference V^T (I - B B^T) V is positive semidefinite) and needs R instead of n
 numbers per latent and centre. B holds leading left singular vectors of V at sample states, each weighted by what it
-does to the standard deviations there. They are found a block at a time, where most is missing, until they are enough:
-up to a tenth more than the best ones, in a third of the time that a singular value decomposition takes.
+does to the standard deviations there, found a block at a time, where most is missing, until they are enough: up to a
+tenth more than the best ones, in a third of the time that a singular value decomposition takes.
 """
 
 from collections.abc import Sequence

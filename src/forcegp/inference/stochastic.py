@@ -8,8 +8,7 @@ with the correlations between latents that the mixing vectors make. The expected
 
 is known, so that nothing is sampled but the rows (Hensman, Fusi & Lawrence 2013, "Gaussian processes for big data").
 Inducing values follow natural gradients, hyper-parameters Adam (Salimbeni, Eleftheriadis & Hensman 2018, "Natural
-gradients in practice"). At fixed hyper-parameters nothing of this is needed: `InducingPosterior` has the optimum after
-one pass over the rows, which is where the search begins and what follows it.
+gradients in practice"). The search begins at, and is followed by, an `InducingPosterior`.
 """
 
 import math

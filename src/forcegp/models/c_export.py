@@ -20,12 +20,11 @@ from forcegp.atomic_files import atomic_folder, require_writable
 from forcegp.codegen.library import Purpose, compile_library
 from forcegp.codegen.tracing import trace
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
-from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.posterior import ExactPosterior
+from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.c_files import CFiles, Check, identifier
 from forcegp.models.fused_rollouts import STEPS
-from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -109,7 +108,7 @@ def export_c(
         raise InvalidInput(f"{folder} exists already and is not an empty folder; choose another name.")
     require_writable(folder)
     reference = posterior.predictor(covariance="compressed" if covariance else "none", compile=False)
-    code = _code(posterior, reference)
+    code = exported_code(posterior, reference.compressed)
     called = identifier(name or posterior.system.robot.name)
     export = CFiles(posterior, reference, code, called, jacobian, steps, integrator)
     checks = _checks(export)
@@ -127,18 +126,15 @@ def export_c(
     return CExport(export.name, folder, files, differences, inflation)
 
 
-def _code(posterior: StructuredPosterior, made: Predictor) -> PredictorCode:
+def exported_code(posterior: StructuredPosterior, compressed: CompressedCovariance | None = None) -> PredictorCode:
     """The programs. Raises InvalidInput that names the term of the prior, where one cannot be traced."""
-    states = [x[:1] for x in (posterior.training.q, posterior.training.v, posterior.training.u)]
-    physics = posterior._physics(posterior.system).traced
     try:
-        calls = latent_calls(made.latent, made.prepared, made.compressed)
-        return PredictorCode.of(physics, states, calls, made.compressed, made.widening)
+        return posterior.code(compressed=compressed)
     except InvalidInput as error:
-        raise named_refusal(posterior, error) from None
+        raise _named(posterior, error) from None
 
 
-def named_refusal(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
+def _named(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
     """The error of a graph that cannot be made, with the term of the prior that is the cause; others as they are."""
     why, traced, _ = str(error).partition(", which the model's")
     if not traced:

@@ -6,6 +6,7 @@ and only here.
 """
 
 import math
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,12 @@ import numpy as np
 import torch
 
 from forcegp.atomic_files import write_text
-from forcegp.codegen.graph import Graph
+from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.c_export import named_refusal
+from forcegp.models.c_export import exported_code
 from forcegp.models.c_files import identifier
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
@@ -30,6 +31,7 @@ STATES = 100
 TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
 """Largest difference from `predict`, relative to the largest value; implicit steps end at 1e-9."""
 
+OPERATORS = {**ARITHMETIC, **COMPARED, "negate": operator.neg}
 NAMES = {"absolute": "fabs"}
 
 
@@ -54,10 +56,7 @@ def casadi_function(
         ) from None
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(f"no program can be written of a {posterior.description}; export a StructuredGP.")
-    try:
-        code = posterior.code()
-    except InvalidInput as error:
-        raise named_refusal(posterior, error) from None
+    code = exported_code(posterior)
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
@@ -159,7 +158,7 @@ def _physics(casadi: Any, code: PredictorCode) -> Any:
 def _latents(casadi: Any, code: PredictorCode, x: Sequence[Any]) -> list[Any]:
     """E f of every process in the order of their numbers."""
     graph, found = Graph(3 * code.nv), {}
-    copied = graph.copier(code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
+    copied = Copier(graph, code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
     vectors = [casadi.SX.sym(symbol, code.nv) for symbol in "qvu"]
     scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
     for part in code.sums:
@@ -198,16 +197,8 @@ def expressed(
                 found[node] = rest[0]
             case "input":
                 found[node] = inputs[rest[0]]
-            case "add" | "subtract" | "multiply" | "divide":
-                x, y = given
-                found[node] = {"add": x + y, "subtract": x - y, "multiply": x * y}.get(operation)
-                if operation == "divide":
-                    found[node] = x / y
-            case "negate":
-                found[node] = -given[0]
-            case "less" | "at_most" | "equal":
-                x, y = given
-                found[node] = {"less": x < y, "at_most": x <= y, "equal": x == y}[operation]
+            case str() if operation in OPERATORS:
+                found[node] = OPERATORS[operation](*given)
             case "choose":
                 found[node] = casadi.if_else(*given)
             case "look up":

@@ -1,9 +1,8 @@
 """What took long to make of a posterior, kept on disk: later processes that make the same predictor find it there.
 
-Records lie beside the compiled libraries and hold numbers: a compressed covariance, or the tables of a program and the
-file name of its library. They are named by a hash of all that decides them: the code of this package, the system, the
-prior, the data and the hyper-parameters. Models whose parts cannot be described, such as surfaces of the user's own
-code, have none. The oldest records go where all together grow too large.
+Records lie beside the compiled libraries, named by a hash of all that decides them: the code of this package, the
+system, the prior, the data and the hyper-parameters. Models whose parts cannot be described, such as surfaces of the
+user's own code, have none. The oldest records go where all together grow too large.
 """
 
 import contextlib

@@ -110,24 +110,13 @@ class Prediction(Gaussian):
 def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Prediction:
     """One prediction from blocks of rows, with these batch dimensions."""
 
-    def join(parts: Sequence[Tensor]) -> Tensor:
-        rows = torch.cat(list(parts))
-        return rows.reshape(*batch, *rows.shape[1:])
-
-    def gaussian(parts: Sequence[Gaussian | None]) -> Gaussian | None:
-        known = [part for part in parts if part is not None]
-        if not known:
+    def joined(parts: Sequence[Any]) -> Any:
+        first = parts[0]
+        if isinstance(first, Tensor):
+            rows = torch.cat(list(parts))
+            return rows.reshape(*batch, *rows.shape[1:])
+        if first is None:
             return None
-        covariances = [part.covariance for part in known if part.covariance is not None]
-        return Gaussian(join([part.mean for part in known]), join(covariances) if covariances else None)
+        return type(first)(*(joined([getattr(part, item.name) for part in parts]) for item in fields(first)))
 
-    acceleration = gaussian([block.acceleration for block in blocks])
-    assert acceleration is not None, "there is at least one block"
-    return Prediction(
-        acceleration.mean,
-        acceleration.covariance,
-        multiplier=gaussian([block.multiplier for block in blocks]),
-        contact_force=gaussian([block.contact_force for block in blocks]),
-        unknown_force=gaussian([block.unknown_force for block in blocks]),
-        noise_covariance=join([block.noise_covariance for block in blocks]),
-    )
+    return joined(blocks)

@@ -8,7 +8,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -369,11 +368,8 @@ class Predictor(Summary):
         return [x[None] if single else x for x in states], single
 
     def _blocks(self, states: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
-        return list(zip(*(x.split(self._block_rows) if len(x) else (x,) for x in states), strict=True))
-
-    @cached_property
-    def _block_rows(self) -> int:
-        return max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
+        rows = max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
+        return list(zip(*(x.split(rows) if len(x) else (x,) for x in states), strict=True))
 
 
 NO_RESULT = (

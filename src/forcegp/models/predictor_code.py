@@ -15,14 +15,14 @@ from torch import Tensor
 
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
-from forcegp.codegen.graph import Graph
+from forcegp.codegen.graph import Copier, Graph
 from forcegp.codegen.library import Purpose, VectorUnit, aligned, default_folder, load_library
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_sums import PADDING
-from forcegp.inference.one_input_calls import LatentCall, drawn_calls
+from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance
+from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
@@ -79,19 +79,18 @@ class PredictorCode:
         cls,
         traced: Callable[..., list[Tensor]],
         example: Sequence[Tensor],
-        sums: tuple[LatentCall, ...],
+        latent: LatentPosterior,
+        prepared: PreparedKernels,
         compressed: CompressedCovariance | None,
         widening: float,
     ) -> "PredictorCode":
-        """Trace the physics at an example (1, nv) of a state.
-
-        Raises InvalidInput for a system on another device and for operations that a graph cannot hold.
-        """
+        """Trace it at an example (1, nv). Raises InvalidInput on another device, and for what no graph holds."""
         if example[0].device.type != "cpu":
             raise InvalidInput(
                 f"a compiled predictor runs on the CPU, and the model is on {example[0].device}; give compile=False, "
                 "or a model on the CPU."
             )
+        sums = latent_calls(latent, prepared, compressed)
         latents = sum(len(part.latents) for part in sums)
         graph, found = trace(traced, [*example, torch.ones(1, latents, dtype=torch.float64)])
         a, W, *features = (nodes[0].tolist() for nodes in found)
@@ -105,7 +104,7 @@ class PredictorCode:
     def program(self, kind: str) -> Program:
         """The program "mean", "linearize" or "covariance"."""
         graph, f = Graph(3 * self.nv), {}
-        copied = graph.copier(self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
+        copied = Copier(graph, self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
         features = [copied(self.features[part.latents[0]]) for part in self.sums]
         for part, z in zip(self.sums, features, strict=True):
             f |= dict(zip(part.latents, part.call(graph, z, kind == "linearize"), strict=True))
@@ -170,10 +169,7 @@ class PredictorCode:
     def loops(
         self, integrator: str, latent: LatentPosterior, samples: int = 0, seed: int = 0
     ) -> list[FusedLoop] | None:
-        """A loop over the mean, or one over each function drawn from the posterior.
-
-        None where a drawn function has no form in pieces. Raises CompilerError where loops cannot be compiled.
-        """
+        """Over the mean or each drawn function; None where one has no form in pieces. Raises CompilerError."""
         if not samples or not self.sums:
             return [FusedLoop(self.library(integrator), self.tables)] * max(1, samples)
         drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)

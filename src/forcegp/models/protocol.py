@@ -137,7 +137,15 @@ class Posterior(Summary, ABC):
             for block in [slice(start, start + ROWS_PER_BLOCK)]
         ]
         predicted = join_predictions(blocks, batch)
-        _require_finite_prediction(predicted)
+        # lost where a state is so large, or a system so singular, that nothing is left of the numbers
+        variance = predicted.mean if predicted.covariance is None else predicted.variance
+        finite = torch.isfinite(predicted.mean.detach() + variance.detach()).reshape(-1, variance.shape[-1]).all(-1)
+        if not bool(finite.all()):
+            raise NumericalError(
+                f"the prediction of row {int((~finite).nonzero()[0])} is not finite: q, v or u is too large for "
+                "float64 there, the mass matrix is singular, or a surface has no normal; check q, v and u of that "
+                "row, and the system by MechanicalSystem.check_states."
+            )
         return predicted
 
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
@@ -180,7 +188,14 @@ class Posterior(Summary, ABC):
         """
         nv = self.system.robot.nv
         device = self.system.robot.device
-        states = _broadcast(_tensor("q", q, nv, device), _tensor("v", v, nv, device), _tensor("u", u, nv, device))
+        given = [_tensor(name, values, nv, device) for name, values in (("q", q), ("v", v), ("u", u))]
+        try:
+            states = torch.broadcast_tensors(*given)
+        except RuntimeError:
+            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", given, strict=True))
+            raise InvalidInput(
+                f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state."
+            ) from None
         return [x.reshape(-1, nv) for x in states], states[0].shape[:-1]
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
@@ -437,18 +452,6 @@ class Model(ABC):
         """Names and shapes of the parameters that a posterior on these points needs."""
 
 
-def _require_finite_prediction(predicted: Prediction) -> None:
-    """Raise NumericalError for a state so large, or a system so singular, that the numbers were lost on the way."""
-    variance = predicted.mean if predicted.covariance is None else predicted.variance
-    lost = ~torch.isfinite(predicted.mean.detach() + variance.detach()).reshape(-1, predicted.mean.shape[-1]).all(-1)
-    if bool(lost.any()):
-        raise NumericalError(
-            f"the prediction of row {int(lost.nonzero()[0])} is not finite: q, v or u is too large for float64 there, "
-            "the mass matrix is singular, or a surface has no normal; check q, v and u of that row, and the system by "
-            "MechanicalSystem.check_states."
-        )
-
-
 def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
 
@@ -461,11 +464,3 @@ def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
         )
     require_finite(name, tensor)
     return tensor
-
-
-def _broadcast(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-    try:
-        return list(torch.broadcast_tensors(q, v, u))
-    except RuntimeError:
-        shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
-        raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state.") from None

@@ -13,7 +13,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
+from forcegp.data import Dataset, Windows, farthest_rows
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import (
     DataWarning,
@@ -42,10 +42,7 @@ QUIET = 1e-3
 
 
 def check_system_and_noise(model: Any) -> None:
-    """What every constructor asks: `system` is a MechanicalSystem, and a bare number as `noise` becomes a `Noise`.
-
-    Raises InvalidInput for another system.
-    """
+    """Check `system`, and make a bare number as `noise` a `Noise`. Raises InvalidInput for another system."""
     require_type("system", model.system, MechanicalSystem, ", for example system=dataset.system")
     if model.noise is not None and not isinstance(model.noise, Noise):
         object.__setattr__(model, "noise", Noise(model.noise))
@@ -70,16 +67,6 @@ def training_rows(joint_names: Sequence[str], dataset: Dataset, points: int | No
         return dataset
     points = whole_number("points", points, 2, len(dataset), "the rows of the dataset")
     return dataset if points == len(dataset) else farthest_rows(dataset, points)
-
-
-def training_windows(
-    joint_names: Sequence[str], dataset: Dataset, points: int | None, observe: WindowObservation | str
-) -> Windows:
-    """The `points` windows of the dataset that lie farthest apart; all of them for None.
-
-    Raises InvalidInput for other joints, names and numbers out of range, DatasetError for logs without windows.
-    """
-    return observation_of(observe).windows(checked_rows(joint_names, dataset), points)
 
 
 def noise_of_windows(noise: Noise | None, windows: Windows) -> Noise | None:
@@ -164,20 +151,14 @@ def described_rows(rows: Dataset | Windows, dataset: Dataset) -> dict[str, Any]:
 
 
 RESTART_SPREAD = 0.7
-"""Standard deviation of the random factors (natural log) on the start values of restarts 1, 2, ...; restart 0 has
-none.
-"""
+"""Standard deviation of the random factors (natural log) on the start values of restarts from 1 on."""
 
 SMOOTHER = 4.0
-"""Factor on the length scales of odd restarts. On one seed of the benchmark, without a mean, one start and three
-restarts around the moments all ended at an error of .1266, the smoother start at .109.
-"""
+"""Factor on the length scales of odd restarts: on one seed of the benchmark, without a mean, starts around the moments
+ended at an error of .1266, the smoother one at .109."""
 
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
-
-KERNELS = "kernels."
-"""How the names of kernel parameters begin (`LatentKernels.initial_parameters`)."""
 
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
@@ -194,17 +175,13 @@ Outcome = TypeVar("Outcome")
 
 
 AT_ONCE = 2
-"""Starts that run at once where later ones are dropped that fall behind. Behind a single poor one, others were dropped
-that end 22 nats lower (docs/solvers.md).
-"""
+"""Starts at once, behind which later ones are dropped: behind a single poor one, 22 nats go lost (docs/solvers.md)."""
 
 SMALL = OptimizerOptions(slow=0.02, patience=100)
 """The search on so few rows: to hundredths of a nat, which no prediction shows."""
 
 LARGE = OptimizerOptions(tolerance=1e-6, slow=3.0)
-"""The search on more rows than that, where an evaluation takes seconds, and three nats of hundreds over several
-iterations change nothing that is predicted.
-"""
+"""On more rows, where an evaluation takes seconds, and three nats of hundreds change nothing that is predicted."""
 
 
 def default_options(points: int) -> OptimizerOptions:
@@ -226,7 +203,7 @@ def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, T
     shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
     shifted = {}
     for name, value in start.items():
-        if not name.startswith(KERNELS):
+        if not name.startswith("kernels."):  # as in `LatentKernels.initial_parameters`
             shifted[name] = value
             continue
         shift = next((shift for part, shift in shifts.items() if name.endswith(part)), 0.0)

@@ -33,11 +33,19 @@ from forcegp.priors import prior_from_dict, prior_to_dict
 
 @dataclass(frozen=True)
 class StoredKind:
-    """One kind of model: its fields as plain JSON values, and back."""
+    """One kind of model, whose constructor takes the system and these fields."""
 
     model: type[Model]
-    to_dict: Callable[[Any], dict[str, Any]]
-    from_dict: Callable[[MechanicalSystem, Mapping[str, Any]], Model]
+    fields: tuple[str, ...]
+
+    def to_dict(self, given: Any) -> dict[str, Any]:
+        """The fields as plain JSON values."""
+        return {name: _write(name, getattr(given, name)) for name in self.fields}
+
+    def from_dict(self, system: MechanicalSystem, stored: Mapping[str, Any]) -> Model:
+        """The model that `to_dict` stored."""
+        make = cast("Callable[..., Model]", self.model)
+        return make(system, **{name: _read(name, stored[name]) for name in self.fields})
 
 
 def kind_of(model: Model) -> str:
@@ -48,49 +56,34 @@ def kind_of(model: Model) -> str:
     raise FileFormatError(f"a {type(model).__name__} cannot be stored: it has no entry in KINDS ({', '.join(KINDS)})")
 
 
-def _structured_to_dict(model: StructuredGP) -> dict[str, Any]:
-    return {"mean": model.mean, "prior": prior_to_dict(model.prior), "noise": _noise_to_dict(model.noise)}
+def _write(name: str, value: Any) -> Any:
+    if name == "prior":
+        return prior_to_dict(value)
+    return value.to_dict() if isinstance(value, Noise) else value
 
 
-def _structured_from_dict(system: MechanicalSystem, stored: Mapping[str, Any]) -> StructuredGP:
-    noise = _noise_from_dict(stored["noise"])
-    return StructuredGP(system, prior_from_dict(stored["prior"]), stored["mean"], noise)
+def _read(name: str, value: Any) -> Any:
+    if name == "prior":
+        return prior_from_dict(value)
+    if name == "noise":
+        return None if value is None else Noise.from_dict(value)
+    return tuple(value) if isinstance(value, list) else value
 
 
-def _plain_kind(model: type[Model], *fields: str) -> StoredKind:
-    """A kind whose constructor takes the system, `noise` and fields that JSON can hold."""
-
-    def to_dict(given: Any) -> dict[str, Any]:
-        values = {name: getattr(given, name) for name in fields}
-        return {"noise": _noise_to_dict(given.noise), **values}
-
-    def from_dict(system: MechanicalSystem, stored: Mapping[str, Any]) -> Model:
-        values = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
-        make = cast("Callable[..., Model]", model)
-        return make(system, **{**values, "noise": _noise_from_dict(stored["noise"])})
-
-    return StoredKind(model, to_dict, from_dict)
-
-
-def _noise_to_dict(noise: Noise | None) -> dict[str, Any] | None:
-    return None if noise is None else noise.to_dict()
-
-
-def _noise_from_dict(stored: Mapping[str, Any] | None) -> Noise | None:
-    return None if stored is None else Noise.from_dict(stored)
-
-
-KINDS: dict[str, StoredKind] = {
-    "forcegp structured posterior": StoredKind(StructuredGP, _structured_to_dict, _structured_from_dict),
-    "forcegp independent posterior": _plain_kind(IndependentGP, "inputs"),
-    "forcegp neural network": _plain_kind(NeuralNetwork, "width", "steps", "batch", "rate"),
-    "forcegp network ensemble": _plain_kind(
-        NetworkEnsemble, *("members", "width", "depth", "steps", "batch", "rate", "weight_decay", "beta", "held_out")
+NETWORK = ("noise", "width", "steps", "batch", "rate")
+KINDS = {
+    "forcegp structured posterior": StoredKind(StructuredGP, ("mean", "prior", "noise")),
+    "forcegp independent posterior": StoredKind(IndependentGP, ("noise", "inputs")),
+    "forcegp neural network": StoredKind(NeuralNetwork, NETWORK),
+    "forcegp network ensemble": StoredKind(
+        NetworkEnsemble, (*NETWORK, "members", "depth", "weight_decay", "beta", "held_out")
     ),
 }
 """Name in `model.json` -> how a model of that kind is stored."""
 
 
+RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
+"""What is stored of a search."""
 FORMAT_VERSION = 7
 WITH_DIGESTS = 7
 """The first format whose files have digests."""
@@ -138,7 +131,6 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     system = posterior.model.system.to_dict()
     target = None if posterior.target is None else posterior.target.to_dict()
     robots = {ROBOT: system.pop("urdf")} | ({} if target is None else {TARGET: target.pop("urdf")})
-    result = posterior.result
     document = {
         "kind": kind,
         "format_version": FORMAT_VERSION,
@@ -151,14 +143,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         "system": system,
         **({} if target is None else {"target": target, "target_urdf_sha256": _sha256(robots[TARGET])}),
         "model": KINDS[kind].to_dict(posterior.model),
-        "result": {
-            "value": result.value,
-            "history": list(result.history),
-            "status": result.status,
-            "converged": result.converged,
-            "evaluations": result.evaluations,
-            "cpu_seconds": result.cpu_seconds,
-        },
+        "result": {name: getattr(posterior.result, name) for name in RESULT},
         "engine": None if posterior.engine is None else posterior.engine.to_dict(),
         "settings": dict(posterior.settings),
     }
@@ -222,16 +207,8 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             training = replace(training, reference=_rows(REFERENCE, tensors))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
-        result = document["result"]
-        optimization = OptimizationResult(
-            parameters,
-            float(result["value"]),
-            tuple(result["history"]),
-            result["status"],
-            bool(result["converged"]),
-            int(result["evaluations"]),
-            float(result["cpu_seconds"]),
-        )
+        found = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
+        optimization = OptimizationResult(parameters, **found)
         names = document["joint_names"]
         if not all(isinstance(name, str) for name in names) or not isinstance(settings.get("data", {}), dict):
             raise ValueError("joint_names or the data of its settings are of another type")
@@ -246,10 +223,17 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         raise FileFormatError(
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
-    _check_tensors(path / "tensors.safetensors", model, training, parameters)
-    solution = tensors.get(SOLUTION)
+    file, solution = path / "tensors.safetensors", tensors.get(SOLUTION)
+    for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
+        if rows is not None:
+            _check_rows(file, model, prefix, rows)
+    for name, value in parameters.items():
+        _check_numbers(file, name, value)
+    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
+    if given != model.parameter_shapes(training):
+        raise FileFormatError(f"{file} does not hold the parameters of its model")
     if solution is not None:
-        _check_numbers(path / "tensors.safetensors", SOLUTION, solution)
+        _check_numbers(file, SOLUTION, solution)
     try:
         posterior = model.condition(training, parameters, optimization, settings, engine, solution)
     except (InvalidInput, RuntimeError) as error:
@@ -307,17 +291,6 @@ def _row_tensors(prefix: str, rows: TrainingData) -> dict[str, torch.Tensor]:
 def _rows(prefix: str, tensors: Mapping[str, torch.Tensor]) -> TrainingData:
     states = (tensors[prefix + name] for name in STATES)
     return TrainingData(*states, noise_std=tensors.get(prefix + NOISE), weights=tensors.get(prefix + WEIGHTS))
-
-
-def _check_tensors(file: Path, model: Model, training: TrainingData, parameters: Mapping[str, torch.Tensor]) -> None:
-    for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
-        if rows is not None:
-            _check_rows(file, model, prefix, rows)
-    for name, value in parameters.items():
-        _check_numbers(file, name, value)
-    given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
-    if given != model.parameter_shapes(training):
-        raise FileFormatError(f"{file} does not hold the parameters of its model")
 
 
 def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> None:

@@ -1,7 +1,7 @@
 """What a model is conditioned on: rows or windows with standardised features, and the noise of their measurements."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -16,9 +16,7 @@ from forcegp.priors import Scaling
 CONSTANT = 1e-12
 """Spread of a feature, relative to 1 plus its size, below which it is constant."""
 RESIDUAL_FLOOR = 1e-6
-"""Smallest start variance of a latent as a fraction of the largest: a latent that the start residual does not
-excite can still grow.
-"""
+"""Smallest start variance of a latent over the largest: one that the start residual misses can still grow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +55,7 @@ class TrainingData:
 
     def to(self, device: torch.device) -> "TrainingData":
         """The same rows on another device."""
-        states = (getattr(self, name).to(device) for name in ("q", "v", "u", "a"))
-        noise_std = None if self.noise_std is None else self.noise_std.to(device)
-        reference = None if self.reference is None else self.reference.to(device)
-        weights = None if self.weights is None else self.weights.to(device)
-        return TrainingData(*states, noise_std=noise_std, reference=reference, weights=weights)
+        return replace(self, **{name: x.to(device) for name, x in vars(self).items() if x is not None})
 
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:
@@ -207,25 +201,13 @@ class Noise:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
-        return {
-            "acceleration": list(self.acceleration) if isinstance(self.acceleration, tuple) else self.acceleration,
-            "force": list(self.force) if isinstance(self.force, tuple) else self.force,
-            "learn": self.learn,
-            "measured_torque": self.measured_torque,
-            "from_data": self.from_data,
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Noise":
         """The noise that `to_dict` stored."""
-        force = stored["force"]
-        return cls(
-            tuple(stored["acceleration"]) if isinstance(stored["acceleration"], list) else stored["acceleration"],
-            tuple(force) if isinstance(force, list) else force,
-            bool(stored["learn"]),
-            bool(stored.get("measured_torque", False)),
-            bool(stored.get("from_data", False)),
-        )
+        given: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items()}
+        return cls(**given)
 
 
 def _positive(name: str, given: object) -> float | tuple[float, ...]:
@@ -271,13 +253,3 @@ def shrunk(
     covariance = torque_noise @ kept.mT
     matrix, offset = kept @ acceleration.matrix, (kept @ acceleration.offset[..., None])[..., 0]
     return AffineMap(offset, matrix), 0.5 * (covariance + covariance.mT)
-
-
-def without_force_noise(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Parameters of what a measured acceleration has left of noise, once that of the torque counts as unknown."""
-    return {name: value for name, value in parameters.items() if name != FORCE}
-
-
-def plus(covariance: Tensor | None, more: Tensor) -> Tensor | None:
-    """The sum, where a covariance was asked for."""
-    return None if covariance is None else covariance + more

@@ -83,8 +83,7 @@ def squared_exponential_kernel(dimension: int, lengthscale: float | Tensor, outp
 
 def squared_exponential(dimension: int, variance: float | Tensor) -> ScaleKernel:
     """k = variance exp(-r^2 / 2), r^2 = sum_d (z_d - z'_d)^2 / l_d^2; smooth forces. Starts at l = sqrt(dimension)."""
-    # Standardised points in d dimensions are about sqrt(2 d) apart: shorter length scales start with a vanishing
-    # gradient.
+    # Standardised points are about sqrt(2 d) apart in d dimensions: gradients of shorter length scales vanish.
     return squared_exponential_kernel(dimension, math.sqrt(dimension), variance)
 
 

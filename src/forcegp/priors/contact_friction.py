@@ -340,7 +340,9 @@ def refined_loads(prior: ForcePrior, robot: Robot, table: Table) -> ForcePrior |
         for joint, latent in zip(term.latent_names(robot), names[which], strict=True)
     )
     refined = tuple(
-        _expecting(term, ExpectedFriction(table(names[which][0]), joints)) if _wants_load(term) else term
+        replace(term, expected=ExpectedFriction(table(names[which][0]), joints))
+        if isinstance(term, ContactFriction) and _wants_load(term)
+        else term
         for term, which in zip(terms, slices, strict=True)
     )
     return refined[0] if len(refined) == 1 else SumPrior(refined)
@@ -351,8 +353,3 @@ def _wants_load(term: ForcePrior) -> bool:
     if not isinstance(term, ContactFriction) or not term.load or term.expected is not None:
         return False
     return term.axes == "isotropic" and term.inputs == ("velocity",) and not term.viscous
-
-
-def _expecting(term: ForcePrior, expected: ExpectedFriction) -> ContactFriction:
-    assert isinstance(term, ContactFriction), "terms with a load are contact frictions"
-    return replace(term, expected=expected)

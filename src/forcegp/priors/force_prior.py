@@ -4,7 +4,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -98,15 +98,14 @@ class ForcePrior(ABC):
         return self if isinstance(other, int) and other == 0 else SumPrior((other, self))  # type: ignore[arg-type]  # refused there
 
 
-# Here because `ForcePrior.__add__` makes sums. Columns of B, features and kernels stand side by side, so one fit learns
-# all terms, and `posterior.components` finds each by its slice of the latents.
+# Here because `ForcePrior.__add__` makes sums.
 @dataclass(frozen=True)
 class SumPrior(ForcePrior):
     """Q_U = sum of what the `terms` describe, independent of each other: `JointFriction() + ContactFriction()`.
 
-    Columns of B, features and kernels stand side by side, so that one fit learns them all and every term can be asked
-    for afterwards. Sums among the terms are taken apart. Raises InvalidInput for fewer than two terms and for two
-    equal ones, which no data could separate.
+    Columns of B, features and kernels stand side by side, so that one fit learns them all and `posterior.components`
+    finds every term by its slice of the latents. Sums among the terms are taken apart. Raises InvalidInput for fewer
+    than two terms and for two equal ones, which no data could separate.
     """
 
     terms: tuple[ForcePrior, ...]
@@ -188,9 +187,7 @@ class SumPrior(ForcePrior):
 
     def slices(self, robot: Robot) -> tuple[slice, ...]:
         """Which of the latents belong to each term."""
-        ends = [0]
-        for term in self.terms:
-            ends.append(ends[-1] + len(term.latent_names(robot)))
+        ends = accumulate((len(term.latent_names(robot)) for term in self.terms), initial=0)
         return tuple(slice(start, stop) for start, stop in pairwise(ends))
 
     def _joined(self, of: Callable[[ForcePrior], tuple[Any, ...]]) -> tuple[Any, ...]:

@@ -159,10 +159,7 @@ _TOKEN = re.compile(r"[()+*]|[^()+*\s]+")
 
 
 class KernelExpression:
-    """One expression, read once; `kernel` makes fresh kernels of it.
-
-    Raises InvalidInput for an unknown name or a wrong expression, with what is allowed.
-    """
+    """An expression, read once. Raises InvalidInput for unknown names or a wrong form, with what is allowed."""
 
     def __init__(self, expression: str, factories: Mapping[str, KernelFactory]) -> None:
         self.expression = expression
@@ -265,8 +262,7 @@ KERNELS: dict[str, KernelFactory] = {
     "deep": deep,
 }
 """Kernels that an expression can name: name -> factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`;
-a name may hold anything but white space, parentheses, "+" and "*".
-"""
+a name may hold anything but white space, parentheses, "+" and "*"."""
 
 
 def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kernel:

@@ -133,20 +133,15 @@ def _one(text: str, expression: str) -> ForcePrior:
     for option in _split(options, ",") if colon else ():
         key, equals, value = (part.strip() for part in option.partition("="))
         if not equals or key not in allowed:
-            raise InvalidInput(_wrong_option(name, option.strip(), key, list(allowed)))
+            close = difflib.get_close_matches(key, allowed, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close and close[0] != key else ""
+            what = f"write FIELD=VALUE with one of: {', '.join(allowed)}" if allowed else "it has no options"
+            raise InvalidInput(f"prior {name!r} cannot take {option.strip()!r}{hint}; {what}")
         given[key] = _value(name, key, value, allowed[key].default)
     missing = [key for key, field in allowed.items() if field.default is Parameter.empty and key not in given]
     if missing:
         raise InvalidInput(f"prior {name!r} needs {', '.join(missing)}: write {name}:{missing[0]}=...")
     return named.prior(**given)
-
-
-def _wrong_option(name: str, option: str, key: str, allowed: list[str]) -> str:
-    if not allowed:
-        return f"prior {name!r} cannot take {option!r}; it has no options"
-    close = difflib.get_close_matches(key, allowed, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close and close[0] != key else ""
-    return f"prior {name!r} cannot take {option!r}{hint}; write FIELD=VALUE with one of: {', '.join(allowed)}"
 
 
 def _value(name: str, key: str, text: str, default: Any) -> Any:

@@ -39,10 +39,7 @@ def real_array(name: str, given: Any, kinds: str = "fiu", error: type[ForceGPErr
 
 
 def real_tensor(name: str, given: Any, device: torch.device) -> Tensor:
-    """`given` in float64: a tensor where it is, with its graph, anything else as a copy on `device`.
-
-    Raises InvalidInput for what is no real number.
-    """
+    """In float64: a tensor stays, with its graph, else a copy on `device`. Raises InvalidInput for no real numbers."""
     if type(given) is Tensor and given.dtype is torch.float64 and given.layout is torch.strided:
         return given
     if not isinstance(given, Tensor):
@@ -67,10 +64,7 @@ def require_finite(name: str, values: Tensor) -> None:
 
 
 def whole_number(name: str, given: Any, least: int, most: int = LARGEST, why: str = "") -> int:
-    """`given` as an int within these limits, of which `why` explains the upper one.
-
-    Raises InvalidInput for anything else, booleans, text and 1.0 included.
-    """
+    """`given` as an int in these limits; `why` explains the upper. Raises InvalidInput, also for booleans and 1.0."""
     try:
         value = operator.index(given)
     except TypeError:
@@ -82,27 +76,20 @@ def whole_number(name: str, given: Any, least: int, most: int = LARGEST, why: st
 
 
 def usable_device(device: torch.device | str) -> torch.device:
-    """``device`` itself, if tensors of float64 can be made there.
-
-    Raises :class:`~forcegp.errors.InvalidInput` that names the devices which are there.
-    """
+    """``device`` if float64 can be there. Raises InvalidInput that names the devices which are there."""
     try:
         asked = torch.device(device)
         torch.zeros(1, dtype=torch.float64, device=asked)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError):  # as torch's backends happen to raise
         raise InvalidInput(
-            f"device {str(device)!r} cannot be used here; there is {', '.join(available_devices())}{_why()}."
+            f"device {str(device)!r} cannot be used here; there is {', '.join(['cpu', *_gpus()])}{_why()}."
         ) from None
     return asked
 
 
-def available_devices() -> tuple[str, ...]:
-    """Names of the CPU and of every GPU that torch can compute on in float64."""
-    return ("cpu", *(f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(_gpus())))
-
-
-def _gpus() -> int:
-    return torch.cuda.device_count() if torch.cuda.is_available() else 0
+def _gpus() -> list[str]:
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    return [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(count)]
 
 
 def _why() -> str:
@@ -134,14 +121,6 @@ def checked_tensor(name: str, value: object, size: int, meaning: str, device: to
             f"or {name}.to({str(device)!r})."
         )
     return real_tensor(name, value, device)
-
-
-def check_mapping(inertials: object) -> None:
-    """:class:`~forcegp.errors.InvalidInput` unless inertials are given by link name."""
-    if not isinstance(inertials, Mapping):
-        raise InvalidInput(
-            f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
-        )
 
 
 def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, check_mapping
+from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch
 from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request, compiled_program
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.structure import RobotStructure
@@ -119,7 +119,7 @@ class CompiledRobot:
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
         nv, given = self.robot.nv, list(arguments.values())
-        parameters = self._checked_parameters(inertials) if inertials else []
+        parameters = [*self.robot.checked_inertials(inertials).values()] if inertials else []
         plain = are_plain(given, nv)
         if not plain:
             given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
@@ -146,12 +146,6 @@ class CompiledRobot:
         else:
             results, _ = values_of(self, call, tensors)
         return _shaped(results, batch, function, nv)  # type: ignore[arg-type]  # torch does not type `apply`
-
-    def _checked_parameters(self, inertials: Inertials) -> list[Tensor]:
-        check_mapping(inertials)
-        for name in inertials:
-            self.robot.layout.require_moving(name, self.robot.name)
-        return [self.robot.checked_parameters(name, values) for name, values in inertials.items()]
 
 
 def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:

@@ -31,7 +31,6 @@ from forcegp.robots.unrolled import (
     factorize,
     scalars,
     solve_factorized,
-    symmetric,
 )
 
 # Arguments of each function, and the shapes of its results in joints.
@@ -143,7 +142,9 @@ def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
     else:
         inertias = None
         if request.free_inertias:
-            inertias = [_symmetric(given["inertias"][10 * body : 10 * body + 10]) for body in range(n)]
+            inertias = [scalars([[0.0] * 4 for _ in range(4)]) for _ in range(n)]
+            for body, P in enumerate(inertias):
+                P[COLUMNS, ROWS] = P[ROWS, COLUMNS] = given["inertias"][10 * body : 10 * body + 10]
         at = UnrolledKinematics(unrolled, given["q"], given.get("v"))
         if request.function == KEEPING:  # for derivatives [l, a] are held, and inverse dynamics taken at a
             if kept is None:
@@ -205,20 +206,11 @@ def _results(
             return [getattr(at, function)(inertias)]
 
 
-def _symmetric(entries: list[Expression]) -> Scalars:
-    P = scalars([[0.0] * 4 for _ in range(4)])
-    P[COLUMNS, ROWS] = entries
-    return symmetric(P)
-
-
 PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the robot itself")
 
 
 def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) -> RowFunction:
-    """The program of a request: from ``folder`` if it is there, else compiled into it.
-
-    Raises :class:`~forcegp.errors.CompilerError` as `load_library`.
-    """
+    """From ``folder`` if it is there, else compiled into it. Raises CompilerError as `load_library`."""
 
     def write(unit: VectorUnit) -> str:
         return write_program(trace_dynamics(unrolled, request), unit.lanes)

@@ -111,13 +111,13 @@ class Robot(RobotStructure):
                 )
             mass, center, inertia = (value.detach().cpu().numpy() for value in physical_from_parameters(parameters))
             text = replace_inertial(text, name, float(mass), center, inertia, source=self.source)
-        return self._rebuilt(text, self.armature)
+        return self.with_text(text)
 
     def with_armature(self, armature: Vector | Mapping[str, float | int]) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
         if isinstance(armature, Mapping):
             armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True)) | dict(armature)
-        return self._rebuilt(self.urdf_text, armature)
+        return self.with_text(self.urdf_text, armature)
 
     def to(self, device: torch.device | str) -> "Robot":
         """The same robot with its constants on ``device``, for instance "cuda"."""
@@ -129,10 +129,11 @@ class Robot(RobotStructure):
         """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""
         return CompiledRobot(self, folder)
 
-    def _rebuilt(self, text: str, armature: Vector | Mapping[str, float | int]) -> "Robot":
-        robot = Robot.from_urdf_text(
-            text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked
-        )
+    def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
+        """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
+        armature = self.armature if armature is None else armature
+        how = {"source": self.source, "gravity": self.gravity, "armature": armature, "locked": self.locked}
+        robot = Robot.from_urdf_text(text, **how)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def to_urdf(self, path: str | Path | None = None) -> str:

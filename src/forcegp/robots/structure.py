@@ -1,5 +1,6 @@
 """What a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
-from forcegp.robots.arguments import Inertials, check_mapping, checked_tensor
+from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
 from forcegp.robots.urdf import InertialDescription, JointDescription, RobotDescription
@@ -209,11 +210,17 @@ class RobotStructure(Summary):
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
-        check_mapping(inertials)
+        return merged_inertias(self.tree, self.layout, self.checked_inertials(inertials))
+
+    def checked_inertials(self, inertials: Inertials) -> dict[str, Tensor]:
+        """In float64; :class:`~forcegp.errors.InvalidInput` unless they are parameters of moving links by name."""
+        if not isinstance(inertials, Mapping):
+            raise InvalidInput(
+                f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
+            )
         for name in inertials:
             self.layout.require_moving(name, self.name)
-        checked = {name: self.checked_parameters(name, parameters) for name, parameters in inertials.items()}
-        return merged_inertias(self.tree, self.layout, checked)
+        return {name: self.checked_parameters(name, parameters) for name, parameters in inertials.items()}
 
     def checked_parameters(self, link: str, parameters: object) -> Tensor:
         """In float64; :class:`~forcegp.errors.InvalidInput` unless they can be log-Cholesky parameters of ``link``."""

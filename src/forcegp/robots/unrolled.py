@@ -1,9 +1,8 @@
 """One given robot as constants, and its rigid-body algorithms at given states, unrolled into scalars.
 
-Where :mod:`forcegp.robots.kinematics` computes with (n, 4, 4, batch) tensors for any tree, here every entry is a scalar
-of its own: a float, or an expression from which code is written (:mod:`forcegp.codegen.graph`). Everything that the
-robot's structure makes zero or one vanishes while the computation is written down. Arrays of NumPy hold the scalars as
-objects, so that their operators write down products and sums entry by entry.
+Every entry is a scalar of its own: a float, or an expression from which code is written (:mod:`forcegp.codegen.graph`).
+What the robot's structure makes zero or one vanishes while the computation is written down. Arrays of NumPy hold the
+scalars as objects, so that their operators write down products and sums entry by entry.
 
 Body frames have their joint along z (:mod:`forcegp.robots.layout`), so that in body axes a joint is a rotation by q
 about z. Quantities of body i are written in its own axes about its own origin. With w, w' and a the angular velocity,
@@ -13,7 +12,7 @@ angular acceleration and acceleration of the origin, and P the pseudo-inertia,
 
 which is the recursive Newton-Euler algorithm; the mass matrix is the composite-rigid-body algorithm, whose column j is
 the wrench of the composite body under A of one unit of joint j (Featherstone, "Rigid Body Dynamics Algorithms", 2008,
-ch. 5 and 6), carried to the joints above. Being linear in P, both are polynomials of degree one in the inertias.
+ch. 5 and 6), carried to the joints above.
 """
 
 import math
@@ -31,8 +30,7 @@ from forcegp.robots.structure import RobotStructure
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
 """Floats and expressions; the operators of NumPy are theirs, entry by entry."""
 
-# What is smaller in a rotation matrix or an inertia is rounding, for example of the turn onto the joint axis: sin(pi) =
-# 1e-16.
+# What is smaller in a rotation matrix or an inertia is rounding, as of the turn onto the joint axis: sin(pi) = 1e-16.
 ROUNDING = 1e-15
 
 

@@ -79,20 +79,25 @@ def parse_urdf(text: str, *, source: str) -> RobotDescription:
         raise MalformedUrdf(f"{source}: the root element is <{root.tag}>, not <robot>; give a URDF file.")
     _refuse_xacro(root, source)
     links: dict[str, InertialDescription | None] = {}
-    for element in root.findall("link"):
-        name = _name(element, "link", source)
-        if name in links:
-            raise DuplicateName(f"{source}: two links are called {name!r}; link names must be unique, rename one.")
+    for name, element in _named(root, "link", source).items():
         links[name] = _inertial(element, _Place(f"link {name!r}", source))
     if not links:
         raise MalformedUrdf(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
-    joints: dict[str, JointDescription] = {}
-    for element in root.findall("joint"):
-        name = _name(element, "joint", source)
-        if name in joints:
-            raise DuplicateName(f"{source}: two joints are called {name!r}; joint names must be unique, rename one.")
-        joints[name] = _joint(element, name, links, _Place(f"joint {name!r}", source))
-    return RobotDescription(_name(root, "robot", source), source, links, tuple(joints.values()))
+    joints = tuple(
+        _joint(element, name, links, _Place(f"joint {name!r}", source))
+        for name, element in _named(root, "joint", source).items()
+    )
+    return RobotDescription(_name(root, "robot", source), source, links, joints)
+
+
+def _named(root: Element, kind: str, source: str) -> dict[str, Element]:
+    found: dict[str, Element] = {}
+    for element in root.findall(kind):
+        name = _name(element, kind, source)
+        if name in found:
+            raise DuplicateName(f"{source}: two {kind}s are called {name!r}; {kind} names must be unique, rename one.")
+        found[name] = element
+    return found
 
 
 @dataclass(frozen=True)

@@ -146,15 +146,16 @@ class IndependentGP(Model):
                 raise FitError(f"none of {len(outcomes)} restarts could be evaluated for joint {name} ({causes})")
             best.append(min(found, key=lambda result: result.value))
         every = [result for each in outcomes for result in each if isinstance(result, OptimizationResult)]
+        steps, kept = (max(len(getattr(result, name)) for result in best) for name in ("history", "iterates"))
         return OptimizationResult(
             parameters=_all_joints([result.parameters for result in best]),
             value=sum(result.value for result in best),
-            history=_summed([result.history for result in best]),
+            history=tuple(sum(_at(result.history, k) for result in best) for k in range(steps)),
             status=_sentence(self.system.robot.joint_names, best, len(outcomes)),
             converged=all(result.converged for result in best),
             evaluations=sum(result.evaluations for result in every),
             cpu_seconds=sum(result.cpu_seconds for result in every),
-            iterates=_iterates(best),
+            iterates=tuple(_all_joints([_at(result.iterates, k) for result in best]) for k in range(kept)),
         )
 
     @override
@@ -244,18 +245,6 @@ def _all_joints(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     if ACCELERATION in parts[0]:
         joined[ACCELERATION] = torch.cat([part[ACCELERATION] for part in parts])
     return joined
-
-
-def _summed(histories: Sequence[Sequence[float]]) -> tuple[float, ...]:
-    """The sum of the objectives after every iteration."""
-    longest = max(len(history) for history in histories)
-    return tuple(sum(_at(history, k) for history in histories) for k in range(longest))
-
-
-def _iterates(results: Sequence[OptimizationResult]) -> tuple[dict[str, Tensor], ...]:
-    """The parameters of all joints that belong to the summed history; empty where they were not kept."""
-    longest = max(len(result.iterates) for result in results)
-    return tuple(_all_joints([_at(result.iterates, k) for result in results]) for k in range(longest))
 
 
 def _at(values: Sequence[Value], k: int) -> Value:

@@ -61,10 +61,7 @@ class IndependentLikelihood:
         return self.standardization([self._columns(q, v, u)])[0]
 
     def kernels(self) -> LatentKernels:
-        """One kernel per joint with start values: the mean square of its acceleration, and lengths as in JointForces.
-
-        Raises InvalidInput if all accelerations are zero.
-        """
+        """One per joint; variances start at mean squares. Raises InvalidInput if all accelerations are zero."""
         variances = self.training.a.square().mean(0)
         largest = float(variances.max())
         if not largest > 0.0:
@@ -77,29 +74,18 @@ class IndependentLikelihood:
     def __call__(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood of one joint, at parameters named as by `joint_part`."""
         matrices = kernels.matrices(parameters, [self._training_features])
-        return negative_log_likelihood(*self._terms(joint, parameters), matrices)
+        return negative_log_likelihood(*self.terms(joint, parameters), matrices)
 
     def condition(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> ExactPosterior:
         """The posterior of one joint's function at fixed parameters."""
-        terms = self._terms(joint, parameters)
+        terms = self.terms(joint, parameters)
         return ExactPosterior.condition(kernels.at(parameters), [self._training_features], *terms)
-
-    def leave_out(
-        self,
-        joint: int,
-        latent: ExactPosterior,
-        parameters: Mapping[str, Tensor],
-        blocks: Sequence[Sequence[int]] | None,
-    ) -> LeaveOut:
-        """Left-out accelerations of one joint; `latent` is its posterior at `parameters`."""
-        *_, noise = self._terms(joint, parameters)
-        return leave_blocks_out(latent.system, noise, blocks)
 
     @cached_property
     def _training_features(self) -> Tensor:
         return self.features(self.training.q, self.training.v, self.training.u)
 
-    def _terms(self, joint: int, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    def terms(self, joint: int, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Mixing W = 1, residual and noise variance of one joint."""
         target = self.training.a[:, joint : joint + 1]
         variance = (2.0 * parameters[ACCELERATION]).exp()[None]
@@ -152,15 +138,13 @@ class IndependentPosterior(Posterior):
 
             return acceleration
 
-        def mean() -> AccelerationFunction:
-            return through([StackedFunctions.mean_of(latent) for latent in self.latents])
-
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             seeds = np.random.SeedSequence(seed).generate_state(len(self.latents))  # joints are independent
             each = zip(self.latents, seeds, strict=True)
             return through([draw_functions(latent, samples, int(own)) for latent, own in each])
 
-        return AccelerationModel(base.system, None, mean, sampled)
+        stacked = StackedFunctions.mean_of
+        return AccelerationModel(base.system, None, lambda: through([*map(stacked, self.latents)]), sampled)
 
     @property
     @override
@@ -179,12 +163,10 @@ class IndependentPosterior(Posterior):
 
     @override
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
+        noises = [self.likelihood.terms(j, joint_part(self.parameters, j))[-1] for j in range(len(self.latents))]
         with blas_threads(len(self.training.q)):
-            parts = [
-                self.likelihood.leave_out(joint, latent, joint_part(self.parameters, joint), blocks)
-                for joint, latent in enumerate(self.latents)
-            ]
-        return LeaveOut.of_independent_outputs(parts)
+            each = zip(self.latents, noises, strict=True)
+            return LeaveOut.of_independent_outputs([leave_blocks_out(x.system, noise, blocks) for x, noise in each])
 
     @override
     def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:

@@ -1,7 +1,6 @@
 """`NetworkEnsemble`: several residual networks that predict a mean and a variance, and differ where data are few."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -165,10 +164,7 @@ class _Training:
                     return
 
     def _loss(self, chosen: Tensor, beta: float) -> Float[Tensor, " members"]:
-        """Seitzer et al. (2022), eq. 5: the Gaussian negative log likelihood, weighted by variance^beta as a constant.
-
-        Means over rows and joints, without the constant log(2 pi)/2.
-        """
+        """Seitzer et al. (2022), eq. 5: NLL times variance^beta as a constant, mean over rows, less log(2 pi)/2."""
         mean, variance = self.model.layers(self.weights, self.x[chosen])
         loss = 0.5 * ((self.y[chosen] - mean).square() / variance + variance.log())
         return (loss * variance.detach() ** beta).mean(dim=(1, 2)) if beta else loss.mean(dim=(1, 2))
@@ -181,10 +177,7 @@ class _Training:
         better = loss < self.best_loss
         self.best_loss = torch.where(better, loss, self.best_loss)
         self.best_step[better] = self.step
-        self._keep(self.weights, better)
-        self.history.append(float(loss.mean()))
-
-    def _keep(self, weights: Mapping[str, Tensor], members: Tensor) -> None:
-        for name, value in weights.items():
-            here = members.to(value.device)
+        for name, value in self.weights.items():
+            here = better.to(value.device)
             self.best[name][here] = value.detach()[here]
+        self.history.append(float(loss.mean()))

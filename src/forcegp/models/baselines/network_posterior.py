@@ -61,12 +61,6 @@ class NetworkModel(Model):
     ) -> "NetworkPosterior":
         return NetworkPosterior(self, training, dict(parameters), result, dict(settings))
 
-    def resolved_noise(self, rows: Dataset) -> Noise | None:
-        """The noise given, else the level that the training rows state, else None: it is estimated."""
-        if self.noise is None and rows.noise_std is None:
-            return None
-        return resolved_noise(self.noise, rows)
-
     def prepared(self, dataset: Dataset, points: int | None, seed: int) -> tuple[Dataset, TrainingData]:
         """The rows to train on, as a Dataset and as tensors."""
         rows = training_rows(self.system.robot.joint_names, dataset, points)
@@ -77,7 +71,8 @@ class NetworkModel(Model):
         self, rows: Dataset, dataset: Dataset, training: TrainingData, seed: int, result: OptimizationResult
     ) -> "NetworkPosterior":
         """The posterior of a training, whose settings hold every field that is a plain number."""
-        noise = self.resolved_noise(rows)
+        estimated = self.noise is None and rows.noise_std is None
+        noise = None if estimated else resolved_noise(self.noise, rows)
         settings = described_rows(rows, dataset) | {"seed": seed, "noise": None if noise is None else noise.to_dict()}
         settings |= {name: value for name, value in vars(self).items() if name not in ("system", "noise")}
         fitted = replace(self, noise=noise)  # type: ignore[type-var]  # every network is a dataclass

@@ -196,7 +196,8 @@ class NeuralNetwork(NetworkModel):
         self, dataset: Dataset, *, points: int | None = None, seed: int = 0, progress: FitProgress | None = None
     ) -> NetworkPosterior:
         rows, training = self.prepared(dataset, points, seed)
-        (x,) = _standardized(training)
+        columns = [inputs(training.q, training.v, training.u)]
+        (x,) = Standardization.of(columns)(columns)
         generator = torch.Generator().manual_seed(seed)
         start_time = time.process_time()
         shapes = SigmoidLayer(self.width).shapes(1, x.shape[-1], training.a.shape[-1])
@@ -252,8 +253,3 @@ class NeuralNetwork(NetworkModel):
     def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
         mean = SigmoidLayer(self.width)(posterior.parameters, x[None])[0]
         return mean, torch.zeros_like(mean), posterior.parameters[RESIDUAL].square().expand_as(mean)
-
-
-def _standardized(training: TrainingData) -> list[Tensor]:
-    columns = [inputs(training.q, training.v, training.u)]
-    return Standardization.of(columns)(columns)

@@ -44,8 +44,7 @@ SADDLE = -0.1
 """Curvature in the other parameters below which the search has not ended at a minimum; above it may be rounding."""
 
 NEGATIVE = -0.01
-"""The same for the physical parameters, as a fraction of the largest curvature before the others follow
-(at least 1)."""
+"""The same for the physical ones, as a fraction of the largest curvature (at least 1) before others follow."""
 
 NO_INFORMATION = 1e-4
 """Curvature, or information, below which a physical direction is not known: its standard deviation, 100 times the value
@@ -71,11 +70,6 @@ class Curvature:
     lowest: float
     lowest_other: float
     tolerated: float
-
-    @classmethod
-    def unknown(cls, like: Float[Tensor, "k"]) -> "Curvature":
-        """No information about parameters of this shape, and no optimum."""
-        return cls(like.new_zeros(len(like), len(like)), float("inf"), 0.0, 0.0, 0.0)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -152,9 +146,7 @@ def curvature_about(
 
 
 WEAK = 0.3
-"""Standard deviation beyond which a direction counts as not identified: 30 % of a mass or of a coefficient, or 0.3 of
-a link's radius of gyration.
-"""
+"""Standard deviation of what is not identified: 30 % of a mass or coefficient, or 0.3 radii of gyration of a link."""
 
 NAMED_SHARE = 0.1
 """Smallest share of a direction with which a parameter is named in it."""
@@ -244,7 +236,8 @@ class Identification(Summary):
                 NumericalWarning,
                 stacklevel=2,
             )
-            return Curvature.unknown(self.physical.zero)
+            unknown = torch.zeros_like(self.physical.transform)
+            return Curvature(unknown, float("inf"), 0.0, 0.0, 0.0)
 
     @property
     def decrement(self) -> float:
@@ -316,21 +309,15 @@ class Identification(Summary):
     @property
     def verdict(self) -> str:
         """What the data do not identify, as a sentence, after what the search did not reach."""
-        if not self.at_optimum:
-            doubts = "; ".join(self.curvature.doubts)
-            return f"The search has not ended at a minimum ({doubts}): let it go on. {self._identified}"
-        return self._identified
-
-    @property
-    def _identified(self) -> str:
+        doubts = "; ".join(self.curvature.doubts)
+        begin = f"The search has not ended at a minimum ({doubts}): let it go on. " if doubts else ""
         if not self.weak_directions:
-            return "The data identify every parameter that was learned."
-        listed = "; ".join(map(str, self.weak_directions))
-        count = len(self.weak_directions)
+            return f"{begin}The data identify every parameter that was learned."
+        named, count = "; ".join(map(str, self.weak_directions)), len(self.weak_directions)
         noun = "combination" if count == 1 else f"{count} combinations"
         return (
-            f"The data do not identify the {noun} {listed}, where logarithms stand for factors and r for the link's "
-            f"radius of gyration: fix one of its parameters, give a prior, or move the robot in other ways."
+            f"{begin}The data do not identify the {noun} {named}, where logarithms stand for factors and r for the "
+            "link's radius of gyration: fix one of its parameters, give a prior, or move the robot in other ways."
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -9,11 +9,11 @@ Every parameter has a scaled form s with s = 0 at its start value:
 V does not depend on the mass, so a link whose inertia is not learned keeps it about its centre of mass whatever mass
 and centre become. In the log-Cholesky parameters of Rucker & Wensing (2022), whose factor carries e^alpha, that reads
 alpha = alpha0 + s/2, d_i = log V_ii + alpha0 - alpha and s_ij = V_ij e^(alpha0 - alpha). Every s gives a body that can
-exist. The search moves z with s = T z; T makes its steps comparable (`models.physical_scaling`).
+exist. The search moves z with s = T z; T makes its steps comparable (`structured.physical_start`).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -154,7 +154,7 @@ class _Coefficients:
 
 @dataclass(frozen=True, eq=False)
 class PhysicalParameters:
-    """What is learned of a system, as a function of free numbers z (k,), which are 0 at the start values.
+    """What is learned of a system, as a function of free numbers z (k,), 0 at the start values; s = `transform` z.
 
     `names` such as 'tool.mass', 'tool.com.x' or 'viscous-joint-friction.A1' and `units` have the order of `values(z)`.
     """
@@ -182,10 +182,6 @@ class PhysicalParameters:
             raise InvalidInput(f"{twice} is named twice in learn; name it once")
         identity = torch.eye(len(names), dtype=torch.float64, device=system.robot.device)
         return cls(system, groups, identity)
-
-    def with_transform(self, transform: Float[Tensor, "k k"]) -> "PhysicalParameters":
-        """The same with s = transform z."""
-        return replace(self, transform=transform)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows
+from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.models.identification.identification import Identification
@@ -18,14 +18,14 @@ from forcegp.models.search import (
     ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
     FitProgress,
+    checked_rows,
     described_rows,
     noise_of_windows,
     resolved_noise,
     training_rows,
-    training_windows,
     with_steps_before,
 )
-from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
+from forcegp.models.structured.marginal_likelihood import StructuredModel
 from forcegp.models.structured.physical_start import PhysicalStart
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts
@@ -187,13 +187,16 @@ class StructuredGP(StructuredModel):
 
         All other arguments, and what is raised, as for `fit`. Loads of friction under load are not refined.
         """
-        if not 0.0 <= prior_strength < float("inf"):
-            raise InvalidInput(f"prior_strength is {prior_strength}; it must be finite and at least 0")
-        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
-        if observe is not None:
-            _require_exact(engine, learning_points)
-            return self._fit_windows(dataset, observe, points, search, learn, prior_strength)
-        return self._fit_rows(dataset, points, search, engine, learning_points, learn, prior_strength)
+        how = (restarts, seed, hyperprior, options, start, progress, learn, prior_strength)
+        search = Search(backend_for(backend, jobs), *how)
+        if observe is None:
+            return self._fit_rows(dataset, points, search, engine, learning_points)
+        if not isinstance(engine_of(engine) or Exact(), Exact) or learning_points is not None:
+            raise InvalidInput(
+                "engine and learning_points are for rows with accelerations; windows (observe=...) are conditioned on "
+                "exactly, and all are learned from: leave both out, and give fewer points if it takes too long"
+            )
+        return self._fit_windows(dataset, observe, points, search)
 
     @override
     def condition(
@@ -214,14 +217,7 @@ class StructuredGP(StructuredModel):
         return StructuredPosterior(self, likelihood, kernels, dict(parameters), result, dict(settings), latent, engine)
 
     def _fit_rows(
-        self,
-        dataset: Dataset,
-        points: int | None,
-        search: Search,
-        engine: Engine | str,
-        learning_points: int | None,
-        learn: Learned | Sequence[Learned] | None = None,
-        prior_strength: float = 0.0,
+        self, dataset: Dataset, points: int | None, search: Search, engine: Engine | str, learning_points: int | None
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
         chosen = engine_of(engine)
@@ -229,36 +225,23 @@ class StructuredGP(StructuredModel):
         if chosen is not None:
             # now, not after the search
             chosen.require_memory(self.problem_size(len(all_rows)), self.system.robot.device)
-        if learn is not None and learning_points is None:
+        if search.learn is not None and learning_points is None:
             learning_points = len(all_rows)
         rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
-        if learn is None:
-            search = replace(search, start=self._continuation(rows, dataset, search))
-            fitted = self._with_refined_loads(self._fit(rows, dataset, search), rows, dataset, search)
-        else:
-            fitted = self._identify(rows, dataset, search, learn, prior_strength)
-        fitted = widened(fitted, search.hyperprior)
+        search = replace(search, start=self._continuation(rows, dataset, search))
+        fitted = widened(self._fit_with_loads(rows, dataset, search), search.hyperprior)
         warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
         described = described_rows(all_rows, dataset)
         return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
 
     def _fit_windows(
-        self,
-        dataset: Dataset,
-        observe: WindowObservation | str,
-        points: int | None,
-        search: Search,
-        learn: Learned | Sequence[Learned] | None = None,
-        prior_strength: float = 0.0,
+        self, dataset: Dataset, observe: WindowObservation | str, points: int | None, search: Search
     ) -> StructuredPosterior:
         """From windows: parameters and the posterior from all of them."""
-        windows = training_windows(self.system.robot.joint_names, dataset, points, observe)
+        windows = observation_of(observe).windows(checked_rows(self.system.robot.joint_names, dataset), points)
         model = replace(self, noise=noise_of_windows(self.noise, windows))
-        if learn is None:
-            fitted = model._with_refined_loads(model._fit(windows, dataset, search), windows, dataset, search)
-        else:
-            fitted = model._identify(windows, dataset, search, learn, prior_strength)
+        fitted = model._fit_with_loads(windows, dataset, search)
         reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
         described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
         return widened(fitted, search.hyperprior).with_settings(
@@ -267,7 +250,8 @@ class StructuredGP(StructuredModel):
 
     def _continuation(self, rows: Dataset, dataset: Dataset, search: Search) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
-        if search.start is not None or len(rows) <= MOST_POINTS_FOR_RESTARTS or search.restarts not in (None, 1):
+        given = search.start is not None or search.learn is not None
+        if given or len(rows) <= MOST_POINTS_FOR_RESTARTS or search.restarts not in (None, 1):
             return search.start
         _, options = search.resolved(len(rows))
         stages = [stage for stage in CONTINUE_FROM if 1.5 * stage < len(rows)]
@@ -280,10 +264,11 @@ class StructuredGP(StructuredModel):
                 start = self._fit(ordered.rows(slice(stage)), dataset, begin).parameters
         return start
 
-    def _with_refined_loads(
-        self, first: StructuredPosterior, rows: Dataset | Windows, dataset: Dataset, search: Search
-    ) -> StructuredPosterior:
-        """`first`, or a fit with the normal force under the friction that was found."""
+    def _fit_with_loads(self, rows: Dataset | Windows, dataset: Dataset, search: Search) -> StructuredPosterior:
+        """One search or, unless physical parameters are learned, more under the normal force that friction changes."""
+        first = self._fit(rows, dataset, search)
+        if search.learn is not None:
+            return first
 
         def again(prior: ForcePrior, last: StructuredPosterior) -> StructuredPosterior:
             with warnings.catch_warnings():
@@ -295,72 +280,37 @@ class StructuredGP(StructuredModel):
 
     def _fit(self, rows: Dataset | Windows, dataset: Dataset, search: Search) -> StructuredPosterior:
         """One search on these rows or windows of the dataset with the prior as it is, and the exact posterior there."""
-        fitted, likelihood = self._checked(rows)
-        described = fitted._settings(rows, dataset)  # before the search: a prior of one's own may fail there
+        fitted = replace(self, noise=resolved_noise(self.noise, rows))
+        training, noise = TrainingData.of(rows, self.system.robot.device), fitted.known_noise
+        likelihood = fitted.likelihood(training)
+        self.system.check_states(training.q, training.v, training.u)
+        check_distance(self.system, training)
+        check_prior(likelihood)
+        require_memory_to_learn(likelihood)
+        described = described_rows(rows, dataset) | {"mean": self.mean, "noise": noise.to_dict()}
+        described["prior"] = described_prior(self.prior)  # before the search: a prior of one's own may fail there
         learned_noise, fixed = fitted.split_noise
-        kernels = likelihood.kernels()
-        objective = FitObjective(likelihood, kernels, fitted.known_noise, fixed, search.hyperprior)
-        result, of_search = search.best(objective, kernels.initial_parameters() | learned_noise)
-        return fitted.condition(likelihood.training, result.parameters | fixed, result, {**described, **of_search})
-
-    def _identify(
-        self,
-        rows: Dataset | Windows,
-        dataset: Dataset,
-        search: Search,
-        learn: Learned | Sequence[Learned],
-        prior_strength: float,
-    ) -> StructuredPosterior:
-        """One search for physical parameters and all others on these rows or windows of the dataset."""
-        fitted, likelihood = self._checked(rows)
-        described = fitted._settings(rows, dataset)  # before the search: a prior of one's own may fail there
-        learned_noise, fixed = fitted.split_noise
-        begin = PhysicalStart.of(learn, likelihood, learned_noise | fixed, prior_strength)
+        if search.learn is None:
+            kernels = likelihood.kernels()
+            objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior)
+            result, of_search = search.best(objective, kernels.initial_parameters() | learned_noise)
+            return fitted.condition(training, result.parameters | fixed, result, {**described, **of_search})
+        strength = search.prior_strength
+        begin = PhysicalStart.of(search.learn, likelihood, learned_noise | fixed, strength)
         kernels = with_variance_priors(begin.kernels) if search.hyperprior else begin.kernels
-        objective = FitObjective(
-            likelihood, kernels, fitted.known_noise, fixed, search.hyperprior, begin.physical, prior_strength
-        )
+        objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior, begin.physical, strength)
         result, of_search = search.best(objective, begin.path[-1] | learned_noise, keep_iterates=True)
         # the steps before the search are its first iterations
         result = with_steps_before(result, objective, [point | learned_noise for point in begin.path[:-1]])
         settings = described | {
             **of_search,
             "learned": learn_to_list(begin.physical),
-            "prior_strength": prior_strength,
+            "prior_strength": strength,
             "log_variance_spread": LOG_VARIANCE_SPREAD if search.hyperprior else None,
         }
-        identification = Identification.of(begin.physical, objective, result, likelihood.training.q.numel())
+        identification = Identification.of(begin.physical, objective, result, training.q.numel())
         parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
-        posterior = replace(fitted, system=identification.system).condition(
-            likelihood.training, parameters | fixed, replace(result, parameters=parameters), settings
-        )
+        result = replace(result, parameters=parameters)
+        fitted = replace(fitted, system=identification.system)
+        posterior = fitted.condition(training, parameters | fixed, result, settings)
         return replace(posterior, identification=identification)
-
-    def _checked(self, rows: Dataset | Windows) -> "tuple[StructuredGP, MarginalLikelihood]":
-        """The model with its noise resolved, and its likelihood of these rows, which have passed every check."""
-        fitted = replace(self, noise=resolved_noise(self.noise, rows))
-        likelihood = fitted.likelihood(TrainingData.of(rows, self.system.robot.device))
-        training = likelihood.training
-        self.system.check_states(training.q, training.v, training.u)
-        check_distance(self.system, training)
-        check_prior(likelihood)
-        require_memory_to_learn(likelihood)
-        return fitted, likelihood
-
-    def _settings(self, rows: Dataset | Windows, dataset: Dataset) -> dict[str, Any]:
-        """The resolved configuration of a fit as plain JSON values, all but its search."""
-        return {
-            **described_rows(rows, dataset),
-            "mean": self.mean,
-            "prior": described_prior(self.prior),
-            "noise": self.known_noise.to_dict(),
-        }
-
-
-def _require_exact(engine: Engine | str, learning_points: int | None) -> None:
-    """Raises InvalidInput for what windows cannot use."""
-    if not isinstance(engine_of(engine) or Exact(), Exact) or learning_points is not None:
-        raise InvalidInput(
-            "engine and learning_points are for rows with accelerations; windows (observe=...) are conditioned on "
-            "exactly, and all are learned from: leave both out, and give fewer points if it takes too long"
-        )

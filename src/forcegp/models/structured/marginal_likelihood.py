@@ -56,15 +56,6 @@ def checked_values(prior: ForcePrior, dynamics: ConstrainedDynamics) -> tuple[Te
     return B, features
 
 
-def checked_kernels(prior: ForcePrior, kernels: Any, latents: int) -> tuple[Kernel, ...]:
-    """One GPyTorch kernel per latent. Raises InvalidInput for anything else; that they are float64 is checked later."""
-    if not isinstance(kernels, list | tuple) or not all(isinstance(kernel, Kernel) for kernel in kernels):
-        raise InvalidInput(f"{type(prior).__name__}.kernels must give a tuple of GPyTorch kernels, one per latent")
-    if len(kernels) != latents:
-        raise InvalidInput(f"{type(prior).__name__}.kernels gives {len(kernels)} kernels for {latents} latents")
-    return tuple(kernels)
-
-
 def _one_per_latent(what: str, given: Any, names: Any) -> tuple[Any, ...]:
     if not isinstance(given, list | tuple):
         raise InvalidInput(f"{what} gives a {type(given).__name__}; it must give a tuple with an entry per latent")
@@ -194,11 +185,16 @@ class MarginalLikelihood:
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         dimensions = tuple(z.shape[-1] for z in features)
         kernels = self.prior.kernels(self.system.robot, dimensions, variances)
+        own = type(self.prior).__name__
+        if not isinstance(kernels, list | tuple) or not all(isinstance(kernel, Kernel) for kernel in kernels):
+            raise InvalidInput(f"{own}.kernels must give a tuple of GPyTorch kernels, one per latent")
+        if len(kernels) != len(dimensions):
+            raise InvalidInput(f"{own}.kernels gives {len(kernels)} kernels for {len(dimensions)} latents")
         for kernel, z in zip(kernels, features, strict=True):
             for part in kernel.modules():
                 if hasattr(part, "visit"):
                     part.visit(z)
-        return LatentKernels(checked_kernels(self.prior, kernels, len(dimensions))).to(variances.device)
+        return LatentKernels(kernels).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood, exact and differentiable in every parameter.

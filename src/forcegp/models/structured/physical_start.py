@@ -23,7 +23,7 @@ the search moves z, s = L^-T z. None of this changes what the objective is.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -34,6 +34,7 @@ from forcegp.errors import FitError, NumericalError
 from forcegp.inference import LatentKernels
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, PhysicalParameters, inertials_of
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.search import relative_inertia
 from forcegp.robots import pseudo_inertia_from_parameters
 
 STEP = 1e-4
@@ -80,7 +81,7 @@ class PhysicalStart:
         identity = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
         each = [rows.kernels(s) for s in scaled]
         path = tuple(k.initial_parameters() | {PHYSICAL: lower.mT @ s} for k, s in zip(each, scaled, strict=True))
-        whitened = physical.with_transform(torch.linalg.solve_triangular(lower.mT, identity, upper=True))
+        whitened = replace(physical, transform=torch.linalg.solve_triangular(lower.mT, identity, upper=True))
         return cls(whitened, each[-1], path)
 
 
@@ -126,12 +127,7 @@ def _ridge(physical: PhysicalParameters, prior_strength: float) -> Float[Tensor,
 
     def whitened(s: Tensor) -> Tensor:
         inertias = inertials_of(physical.tensors(s))
-        halves = {
-            link: torch.linalg.solve_triangular(factors[link], pseudo_inertia_from_parameters(value), upper=False)
-            for link, value in inertias.items()
-        }
-        each = [torch.linalg.solve_triangular(factors[link], half.mT, upper=False) for link, half in halves.items()]
-        return torch.stack(each).flatten()
+        return torch.stack([relative_inertia(value, factors[link]) for link, value in inertias.items()]).flatten()
 
     if not factors:  # coefficients alone
         return torch.eye(len(physical.zero), dtype=physical.zero.dtype, device=physical.zero.device)

@@ -24,9 +24,8 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
-from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
-from forcegp.inference.prepared_kernels import PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
@@ -44,16 +43,7 @@ from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
 from forcegp.models.structured.update import Keep, learn_more_rows
-from forcegp.models.training_data import (
-    ACCELERATION,
-    FORCE,
-    Noise,
-    TrainingData,
-    plus,
-    second_moments,
-    shrunk,
-    without_force_noise,
-)
+from forcegp.models.training_data import ACCELERATION, FORCE, Noise, TrainingData, second_moments, shrunk
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots.arguments import real_tensor
 
@@ -131,10 +121,13 @@ class StructuredPosterior(Posterior):
 
         acceleration, torque_noise = self.acceleration_map(dynamics)
         predicted = through(acceleration)
-        noise = self.parameters if torque_noise is None else without_force_noise(self.parameters)
+        noise, spread = dict(self.parameters), predicted.covariance
+        if torque_noise is not None:  # it counts as unknown, not as noise of the measured acceleration
+            del noise[FORCE]
+            spread = None if spread is None else spread + torque_noise
         return Prediction(
             predicted.mean,
-            predicted.covariance if torque_noise is None else plus(predicted.covariance, torque_noise),
+            spread,
             multiplier=through(dynamics.multiplier_map(known)),
             contact_force=through(dynamics.contact_force_map(known)),
             unknown_force=latents.through(B),
@@ -346,17 +339,18 @@ class StructuredPosterior(Posterior):
 
         return AccelerationModel(system, baumgarte, mean, sampled, compiled)
 
-    def code(self, system: MechanicalSystem | None = None) -> PredictorCode:
+    def code(
+        self, system: MechanicalSystem | None = None, compressed: CompressedCovariance | None = None
+    ) -> PredictorCode:
         """The mean as a graph, from which programs are written, in another system if one is given.
 
         Raises InvalidInput for operations that no graph holds, models on another device, and noisy torques.
         """
         system = self.system if system is None else system
         self._require_commanded_torques()
-        prepared = PreparedKernels.of(self.latent)
         example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
-        calls = latent_calls(self.latent, prepared, None)
-        return PredictorCode.of(self._physics(system).traced, example, calls, None, self.widening)
+        traced, prepared = self._physics(system).traced, PreparedKernels.of(self.latent)
+        return PredictorCode.of(traced, example, self.latent, prepared, compressed, self.widening)
 
     def _require_commanded_torques(self) -> None:
         noise = self.model.noise

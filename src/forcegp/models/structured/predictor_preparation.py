@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.inference.one_input_calls import latent_calls
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels, Sample, compress
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
@@ -112,7 +111,8 @@ def prepared_predictor(
     code = None
     if compile:
         example = [x[:1] for x in (training.q, training.v, training.u)]
-        code = KeptCode(nv, partial(_traced, physics, example, latent, prepared, compressed, widening), key)
+        given = (physics.traced, example, latent, prepared, compressed, widening)
+        code = KeptCode(nv, partial(PredictorCode.of, *given), key)
     made = Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, 0.0)
     first = "mean" if compressed is None else "covariance"
     if made.compiled(first) and code is not None and not code.is_traced:
@@ -124,29 +124,11 @@ def prepared_predictor(
     return replace(made, prepare_seconds=time.perf_counter() - begin)
 
 
-def _traced(
-    physics: PredictorPhysics,
-    example: list[Tensor],
-    latent: LatentPosterior,
-    prepared: PreparedKernels,
-    compressed: CompressedCovariance | None,
-    widening: float,
-) -> PredictorCode:
-    calls = latent_calls(latent, prepared, compressed)
-    return PredictorCode.of(physics.traced, example, calls, compressed, widening)
-
-
 def _numbers(latent: LatentPosterior, training: TrainingData, physics: PredictorPhysics) -> list[Tensor]:
     """All that decide a predictor of a described system and prior."""
-    found = [
-        training.q,
-        training.v,
-        training.u,
-        *latent.features,
-        *latent.weights,
-        *latent.kernels.state_dict().values(),
-    ]
-    found += [*physics.standardization.shift, *physics.standardization.scale, *(physics.inertials or {}).values()]
+    found = [training.q, training.v, training.u, *latent.features, *latent.weights]
+    found += [*latent.kernels.state_dict().values(), *physics.standardization.shift, *physics.standardization.scale]
+    found += (physics.inertials or {}).values()
     return [*found, latent.data_factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
 
 

@@ -12,7 +12,6 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, checked_values
 from forcegp.models.training_data import CONSTANT, TrainingData
-from forcegp.priors import ForcePrior
 
 INVISIBLE = 1e-9
 """|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
@@ -44,15 +43,12 @@ def check_prior(likelihood: MarginalLikelihood) -> None:
         return
     _check_features(likelihood, names, features)
     effect = dynamics.H @ B
-    terms = [number for number, (*_, which) in enumerate(_terms(likelihood)) for _ in range(which.stop - which.start)]
+    slices = [which for *_, which in term_slices(likelihood.prior, likelihood.system.robot)]
+    terms = [number for number, which in enumerate(slices) for _ in range(which.stop - which.start)]
     shows = _check_visible(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
     _check_distinct(names, terms, shows, effect, likelihood.standardization(features))
     if likelihood.mean == "zero":
         _check_known_forces(effect, (dynamics.H @ dynamics.Q_K[..., None])[..., 0])
-
-
-def _terms(likelihood: MarginalLikelihood) -> list[tuple[str, ForcePrior, slice]]:
-    return term_slices(likelihood.prior, likelihood.system.robot)
 
 
 def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
@@ -68,12 +64,14 @@ def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], featur
         known = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
         which = tuple(label for label, flat in zip(known, constant.tolist(), strict=True) if flat)
         if bool(constant.all()):
+            values = ", ".join(f"{value:.4g}" for value in z[0].tolist()[:4])
             raise InvalidInput(
                 f"latent {name!r} depends on {', '.join(which)}, which is the same in all {len(z)} training rows "
-                f"({_values(z[0])}), so its function cannot be learned; give data in which it changes, or leave this "
+                f"({values}), so its function cannot be learned; give data in which it changes, or leave this "
                 "prior (or this joint) out"
             )
-        if which and any(way != "none" for way in _ways(scalings[index], z)):
+        ways = scalings[index]
+        if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
             idle.setdefault(which, []).append(name)
     for which, latents in idle.items():
         some = f"{', '.join(which[:4])}{' ...' if len(which) > 4 else ''}"
@@ -157,14 +155,6 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
             DataWarning,
             stacklevel=5,
         )
-
-
-def _ways(scaling: Sequence[str] | str, z: Tensor) -> Sequence[str]:
-    return (scaling,) * z.shape[-1] if isinstance(scaling, str) else scaling
-
-
-def _values(row: Tensor) -> str:
-    return ", ".join(f"{value:.4g}" for value in row.tolist()[:4])
 
 
 def _few(names: Sequence[str]) -> str:

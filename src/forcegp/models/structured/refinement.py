@@ -1,11 +1,7 @@
 """Fitting again: on all rows from what some rows gave, and with the normal force that a fit has found.
 
-`StructuredGP.fit` takes `learning_rows` (all, or those farthest apart) to the search; `on_all_rows` then lets the
-engine condition on all rows at the same hyper-parameters, with features prepared as for the rows that gave them. There
-hyper-parameters are improved by the collapsed bound or mini-batches. Friction that is proportional to the normal force
-changes that force. Solved for, Q_U would no longer be affine in the latent functions, and inference no longer exact.
-Fitted again under an expected friction, every round is an exact fit of a legitimate prior. `python -m
-benchmarks.force_pictures contact-friction` draws the curve with and without.
+docs/large-data.md describes the first. Solved for the second, Q_U would no longer be affine in the latent functions,
+and inference no longer exact (`python -m benchmarks.force_pictures contact-friction` draws the curve with and without).
 """
 
 import math
@@ -24,7 +20,6 @@ from forcegp.inference import (
     Exact,
     Inducing,
     InducingPosterior,
-    LatentPosterior,
     OptimizationResult,
     OptimizerOptions,
     ProblemSize,
@@ -113,33 +108,17 @@ def on_all_rows(
         return replace(fitted, settings=settings)
     with blas_threads(training.q.numel()):
         latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine, report=report)
-        if engine is None and _leaves_too_much_out(latent, choice.engine):
-            choice, latent = _another(choice, latent, size, fitted, likelihood, report)
+        left_out = latent.left_out if isinstance(latent, InducingPosterior) else 0.0
+        if engine is None and isinstance(choice.engine, Inducing) and left_out > choice.engine.tolerance:
+            few = size.rows <= MOST_ITERATIVE_ROWS  # for an engine without inducing points
+            choice = choose_engine(size, training.q.device, inducing=False) if few else choice
+            short = f"inducing points leave out {left_out:.2g} of the noise variance of a row"
+            choice = Choice(choice.engine, f"{choice.reason}; {short}")
+            if few:
+                latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine, report=report)
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
         return refined(posterior, hyperprior, report)
-
-
-def _leaves_too_much_out(latent: LatentPosterior, engine: Engine) -> bool:
-    return isinstance(latent, InducingPosterior) and isinstance(engine, Inducing) and latent.left_out > engine.tolerance
-
-
-def _another(
-    choice: Choice,
-    latent: LatentPosterior,
-    size: ProblemSize,
-    fitted: StructuredPosterior,
-    likelihood: MarginalLikelihood,
-    report: Iteration | None,
-) -> tuple[Choice, LatentPosterior]:
-    """An engine without inducing points, where these leave too much out and there are not too many rows for it."""
-    assert isinstance(latent, InducingPosterior)
-    short = f"inducing points leave out {latent.left_out:.2g} of the noise variance of a row"
-    if size.rows > MOST_ITERATIVE_ROWS:
-        return Choice(choice.engine, f"{choice.reason}; {short}"), latent
-    other = choose_engine(size, likelihood.training.q.device, inducing=False)
-    other = Choice(other.engine, f"{other.reason}; {short}")
-    return other, likelihood.condition(fitted.kernels, fitted.parameters, other.engine, report=report)
 
 
 TOLERANCE = 1e-6
@@ -250,39 +229,34 @@ def fit_with_refined_loads(
     (NumericalWarning) where the normal forces have not settled after `rounds` fits, and where friction as the last one
     expects it nearly jams a contact.
     """
-    with warnings.catch_warnings():  # what an early round expects may jam without meaning anything
-        warnings.filterwarnings("ignore", JAMMING, NumericalWarning)
-        kept = _refined(first, again, rounds)
-    if kept is not first:
-        with torch.no_grad():
-            kept.model.prior.mixing(kept.likelihood.dynamics())  # warns where the friction that was found jams
-    return kept
-
-
-def _refined(
-    first: StructuredPosterior, again: Callable[[ForcePrior, StructuredPosterior], StructuredPosterior], rounds: int
-) -> StructuredPosterior:
     given = first.model.prior  # whose terms hold the expectations of the user
     best = last = first
-    for fits in range(rounds + 1):
-        prior = refined_loads(given, last.model.system.robot, lambda name, p=last: _table(p, name))
-        if prior is None:
-            return first
-        change = _change(last, prior)
-        if change < SETTLED:
-            # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
-            return last if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE else best
-        if fits == rounds:
-            warnings.warn(
-                f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
-                "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
-                NumericalWarning,
-                stacklevel=4,
-            )
-            break
-        last = again(prior, last).with_settings(load_refinements=fits + 1)
-        if last.negative_log_likelihood < best.negative_log_likelihood:
-            best = last
+    with warnings.catch_warnings():  # what an early round expects may jam without meaning anything
+        warnings.filterwarnings("ignore", JAMMING, NumericalWarning)
+        for fits in range(rounds + 1):
+            prior = refined_loads(given, last.model.system.robot, lambda name, p=last: _table(p, name))
+            if prior is None:
+                return first
+            change = _change(last, prior)
+            if change < SETTLED:
+                # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
+                if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE:
+                    best = last
+                break
+            if fits == rounds:
+                warnings.warn(
+                    f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
+                    "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
+                    NumericalWarning,
+                    stacklevel=3,
+                )
+                break
+            last = again(prior, last).with_settings(load_refinements=fits + 1)
+            if last.negative_log_likelihood < best.negative_log_likelihood:
+                best = last
+    if best is not first:
+        with torch.no_grad():
+            best.model.prior.mixing(best.likelihood.dynamics())  # warns where the friction that was found jams
     return best
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.errors import FitError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, best_of, minimize_objective
-from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters, inertials_of
+from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, PhysicalParameters, inertials_of
 from forcegp.models.search import (
     SMALL,
     FitProgress,
@@ -104,15 +104,19 @@ def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "
     "Geometric robot dynamic identification: a convex programming approach", T-RO 2020). It is the same in every frame
     and unit: a body of twice the mass and inertia is 2 log 2 away, wherever it is.
     """
-    lower = torch.linalg.cholesky(pseudo_inertia_from_parameters(reference))
+    relative = relative_inertia(parameters, torch.linalg.cholesky(pseudo_inertia_from_parameters(reference)))
+    return torch.linalg.eigvalsh(0.5 * (relative + relative.mT)).log().square().sum()
+
+
+def relative_inertia(parameters: Float[Tensor, "10"], lower: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """L^-1 P L^-T of the pseudo-inertia P of these log-Cholesky parameters."""
     half = torch.linalg.solve_triangular(lower, pseudo_inertia_from_parameters(parameters), upper=False)
-    whitened = torch.linalg.solve_triangular(lower, half.mT, upper=False)
-    return torch.linalg.eigvalsh(0.5 * (whitened + whitened.mT)).log().square().sum()
+    return torch.linalg.solve_triangular(lower, half.mT, upper=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """How a fit searches: what the three ways to fit share. The fields are documented at `StructuredGP.fit`.
+    """How a fit searches: what the three ways to fit share, documented at `StructuredGP.fit` and `identify`.
 
     Raises InvalidInput for numbers out of range and a start in units of another fit.
     """
@@ -124,9 +128,13 @@ class Search:
     options: OptimizerOptions | None
     start: Mapping[str, Tensor] | None
     progress: FitProgress | None
+    learn: Learned | Sequence[Learned] | None = None
+    prior_strength: float = 0.0
 
     @usable_arguments("fit")
     def __post_init__(self) -> None:
+        if not 0.0 <= self.prior_strength < float("inf"):
+            raise InvalidInput(f"prior_strength is {self.prior_strength}; it must be finite and at least 0")
         check_search_numbers(1 if self.restarts is None else self.restarts, self.seed)
         require_type("hyperprior", self.hyperprior, bool)
         if self.options is not None:
@@ -182,10 +190,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class _OneStart:
-    """The optimisation from start number `index`: 0 begins at `first`, the others around the moments.
-
-    A class so that other processes can receive it.
-    """
+    """From start `index`: 0 is `first`, others lie around the moments. A class, so that processes receive it."""
 
     objective: FitObjective
     moments: Mapping[str, Tensor]

@@ -1,7 +1,7 @@
 """A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +43,9 @@ def learn_more_rows(
 
     `latent` is the posterior on the rows of `likelihood` at `parameters`, `noise` that of the model.
     """
-    _check(likelihood.system.robot.joint_names, rows, budget)
+    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
+    require_rows("rows", rows, likelihood.system.robot.joint_names, "the model", example)
+    budget = None if budget is None else whole_number("budget", budget, 2)
     training = likelihood.training
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
     _require_memory(latent, len(rows), height, budget)
@@ -67,14 +69,6 @@ def learn_more_rows(
                 kept = keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
     return replace(standardized, training=replace(training, reference=reference)), latent
-
-
-def _check(joints: Sequence[str], rows: Dataset, budget: int | None) -> None:
-    """Raises InvalidInput for rows of other joints and a budget below 2."""
-    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
-    require_rows("rows", rows, joints, "the model", example)
-    if budget is not None:
-        whole_number("budget", budget, 2)
 
 
 def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:

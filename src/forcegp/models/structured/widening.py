@@ -1,22 +1,16 @@
-"""How much wider than the posterior at the fitted hyper-parameters the intervals of a fit have to be.
+"""How much wider than the posterior at the fitted hyper-parameters the intervals of a fit have to be (docs/forces.md).
 
-Two things are missing from that posterior, and one factor on its standard deviations, found at the training states,
-makes up for both:
+Two things are missing from that posterior; one factor on its standard deviations, found at the training states, makes
+up for both. Means do not change.
 
-* Hyper-parameters count as known. Every kind of them (the length scales of all latents, their variances, ...) is moved
-  up and down together by its standard deviation (Laplace's approximation, Rasmussen & Williams 2006, section 3.4; at
-  most `LARGEST_STEP`), and the variance of the mixture of these posteriors stands for the whole, as with the sigma
-  points of Rue, Martino & Chopin (2009, "Approximate Bayesian inference for latent Gaussian models", J. R. Stat. Soc. B
-  71, section 6.5). Moved one by one, the factor was 1.09 instead of 1.04 (medians of 42 fits), for up to half of the
-  time of a fit.
-* An interval of 95 % is right on average over all functions that the data leave open, not for the one that is true.
-  Where these functions differ in a few numbers only (the offset and the slopes of a friction curve), all intervals of
-  one fit miss together: drawn from its own posterior, 15 % of the functions have less than 90 % of their states in
-  their 95 % intervals, some 40 %. The factor is that of a tolerance interval (Krishnamoorthy & Mathew 2009,
-  "Statistical tolerance regions", section 1.2): of the functions drawn from the posterior, `CONFIDENCE` have at least
-  `CONTENT` of their states inside.
-
-What was measured is in docs/forces.md. Means do not change.
+* Hyper-parameters count as known. Every kind of them (the length scales of all latents, ...) is moved up and down
+  together by its standard deviation (Laplace's approximation, Rasmussen & Williams 2006, section 3.4), and the variance
+  of the mixture of these posteriors stands for the whole, as with the sigma points of Rue, Martino & Chopin (2009,
+  "Approximate Bayesian inference for latent Gaussian models", J. R. Stat. Soc. B 71, section 6.5). Moved one by one,
+  the factor was 1.09 instead of 1.04 (medians of 42 fits), for up to half of the time of a fit.
+* Where the functions that the data leave open differ in a few numbers only, all intervals of one fit miss together. The
+  factor is that of a tolerance interval (Krishnamoorthy & Mathew 2009, "Statistical tolerance regions", section 1.2):
+  of the functions drawn from the posterior, `CONFIDENCE` have at least `CONTENT` of their states inside.
 """
 
 import math
