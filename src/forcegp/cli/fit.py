@@ -71,7 +71,8 @@ class Fit(ModelOptions):
         if command.model == "structured" and not command.prior:
             command, prior_note = self._with_prior(command, dataset, system)
         model = make_model(command, system.to(self.device), dataset)
-        if command.points is None and observe is None and learns_from_all_rows(command, model):
+        few = observe is None and command.points is None and learns_from_all_rows(command, model)
+        if few and isinstance(model, forcegp.StructuredGP):
             dataset, independent_note = forcegp.evaluation.independent_rows(model, dataset, command.seed)
             command = replace(command, points=len(dataset))
         rows = len(dataset) if observe is None else observe.count(dataset)

@@ -17,7 +17,7 @@ from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
-from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
+from forcegp.models.motion_models import MotionModel
 from forcegp.models.prediction import Prediction, Rows, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
@@ -36,7 +36,7 @@ AnyPosterior = TypeVar("AnyPosterior", bound="Posterior")  # beartype cannot che
 Array = Tensor | np.ndarray | Sequence[Any]
 
 
-class Posterior(Summary, ABC):
+class Posterior(MotionModel, Summary, ABC):
     """What a fitted model has learned, as a frozen value.
 
     `model` made it; `parameters` are the fitted numbers by name; `settings` is the resolved configuration of the fit
@@ -264,11 +264,6 @@ class Posterior(Summary, ABC):
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed, "grad": grad}
         return replace(roll_out(model, q0, v0, u, dt, **how, progress=progress), intervals=self.motion_intervals)
 
-    @property
-    def motion_intervals(self) -> MotionIntervals | None:
-        """Widths of the intervals of motions, where they were calibrated; a rollout carries them."""
-        return None
-
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
         """How well training rows are predicted from those outside their block: in closed form, without another fit.
 
@@ -305,60 +300,6 @@ class Posterior(Summary, ABC):
         raise InvalidInput(
             f"a {self.description} cannot learn from more rows without another fit: fit it again to all rows, or use "
             "a StructuredGP with engine='exact'."
-        )
-
-    def refined_on_motions(
-        self: AnyPosterior,
-        dataset: Dataset,
-        seconds: float = 1.0,
-        *,
-        inertias: bool = True,
-        report: Callable[[int, float], None] | None = None,
-    ) -> AnyPosterior:
-        """Known forces, inertias and latent functions fitted to the recorded positions, beginning from this posterior.
-
-        Parameters
-        ----------
-        dataset: a recording in equal steps of time, also in several episodes. Of each row q and u count, and v where a
-            window begins.
-        seconds: length of the windows that motions are computed over: some tenths of a second to some seconds.
-        inertias: also those of the bodies, near the ones that the system has.
-        report: called as report(step, rms of q in rad or m).
-
-        The result predicts for the refined system, `posterior.system`: friction and rotors that it lists are refined.
-        Its `settings["motions"]` hold what was found, with standard errors, and what the motions did not tell.
-        Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
-        NumericalError where no motion is found near the recorded one.
-        """
-        raise InvalidInput(
-            f"a {self.description} has no forces that motions could refine; fit a StructuredGP or an analytical model."
-        )
-
-    def calibrated_on_motions(
-        self: AnyPosterior,
-        dataset: Dataset,
-        horizons: Sequence[float] = HORIZONS,
-        *,
-        integrator: str = "rk4",
-        report: Callable[[int, int], None] | None = None,
-    ) -> AnyPosterior:
-        """The same model with intervals of motions that hold: of stretches of the training time, left out in turn.
-
-        For each of four stretches the model is made again from the other rows at the same hyper-parameters (refined on
-        their motions if it was), and predicts motions in the stretch. `rollout(...).interval()` then uses the widths.
-
-        Parameters
-        ----------
-        dataset: the recording that the model learned from, in equal steps of time.
-        horizons: lengths of the motions in s, at which widths are found.
-        integrator: of these motions, as for `rollout`.
-        report: called as report(stretch, stretches).
-
-        Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
-        """
-        raise InvalidInput(
-            f"a {self.description} would have to be trained again for every stretch that is left out; take a "
-            "StructuredGP or an analytical model."
         )
 
     def with_system(self: AnyPosterior, system: MechanicalSystem) -> AnyPosterior:

@@ -207,7 +207,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
             training = replace(training, reference=_rows(REFERENCE, tensors))
         prefix = "parameters."
         parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
-        found = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
+        found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
         optimization = OptimizationResult(parameters, **found)
         names = document["joint_names"]
         if not all(isinstance(name, str) for name in names) or not isinstance(settings.get("data", {}), dict):

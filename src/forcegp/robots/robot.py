@@ -132,8 +132,9 @@ class Robot(RobotStructure):
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
         armature = self.armature if armature is None else armature
-        how = {"source": self.source, "gravity": self.gravity, "armature": armature, "locked": self.locked}
-        robot = Robot.from_urdf_text(text, **how)
+        robot = Robot.from_urdf_text(
+            text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked
+        )
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def to_urdf(self, path: str | Path | None = None) -> str:

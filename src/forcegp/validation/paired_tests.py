@@ -113,7 +113,7 @@ def paired_test(
     nats = score == "nlpd"
 
     def difference(seeds: np.ndarray, stretches: np.ndarray) -> float:
-        a, b = (each[np.ix_(seeds, range(each.shape[1]), stretches)].mean(axis=(0, 2)) for each in (one, other))
+        a, b = (each[seeds][..., stretches].mean(axis=(0, 2)) for each in (one, other))
         return float((a - b if nats else 0.5 * (np.log(a) - np.log(b))).mean())
 
     if not one.size or (not nats and bool((np.minimum(one, other).mean(axis=(0, 2)) <= 0.0).any())):
@@ -238,11 +238,11 @@ def compared(score: str, challenger: str, baseline: str, runs: Runs, margin: flo
     seeds = [k for k in dict.fromkeys(seed for _, seed in shared) if all((split, k) in shared for split in splits)]
     if not seeds:
         return None
-    sides = (
+    a, b = (
         np.concatenate([np.stack([side[split, seed] for seed in seeds]) for split in splits], axis=2)
         for side in (one, other)
     )
-    return paired_test(score, challenger, baseline, *sides, margin)
+    return paired_test(score, challenger, baseline, a, b, margin)
 
 
 def _errors(

@@ -192,8 +192,9 @@ class MarginalLikelihood:
             raise InvalidInput(f"{own}.kernels gives {len(kernels)} kernels for {len(dimensions)} latents")
         for kernel, z in zip(kernels, features, strict=True):
             for part in kernel.modules():
-                if hasattr(part, "visit"):
-                    part.visit(z)
+                visit: Any = getattr(part, "visit", None)
+                if visit is not None:
+                    visit(z)
         return LatentKernels(kernels).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
