@@ -9,7 +9,7 @@ from tests.models.arm import arm_data
 from forcegp.cli.main import main
 from forcegp.models import load_posterior
 
-FIT = ("fit", "arm.h5", "--points", 10, "--iterations", 3, "--restarts", 2)
+FIT = ("fit", "arm.h5", "--prior", "joint", "--points", 10, "--iterations", 3, "--restarts", 2)
 
 
 @pytest.fixture

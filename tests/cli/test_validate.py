@@ -84,7 +84,9 @@ def test_the_page_says_what_was_done(found, folder):
     assert {name: stored[name] for name in found if name != "out"} == {k: v for k, v in found.items() if k != "out"}
     assert len(stored["source"]["sha256"]) == 64
     assert stored["configuration"]["points"] == 40
-    assert len(list((folder / "results" / "jobs").glob("*/job.json"))) == 2 * (1 + len(MODELS))
+    assert (
+        len(list((folder / "results" / "jobs").glob("*/job.json"))) == 2 * (1 + len(MODELS)) - 1
+    )  # one seed of what uses all rows
     for name in ("errors", "calibration", "motions"):
         assert f"({name}.png)" in page
         assert (folder / "results" / f"{name}.png").stat().st_size > 5000

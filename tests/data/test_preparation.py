@@ -130,6 +130,14 @@ def test_a_delay_is_found_to_a_fraction_of_a_sample(delay):
     np.testing.assert_allclose(prepared.dataset.u, _at(prepared.dataset, low_pass(arm_log(0.0), 20.0)).u, atol=0.2)
 
 
+@pytest.mark.parametrize("delay", [-0.08, 0.12])
+def test_a_long_delay_is_found_where_no_short_one_fits(delay):
+    found = estimate_delay(arm_log(delay))
+    assert found.common == pytest.approx(delay, abs=2e-3)
+    assert found.significant == found.common
+    assert np.isnan(estimate_delay(arm_log(delay), largest=0.05).common)
+
+
 def test_a_delay_is_common_to_episodes_of_different_length():
     data = arm_log(0.02)
     found = estimate_delay(replace(data, episode=(data.time > 5.0).astype(data.episode.dtype)))

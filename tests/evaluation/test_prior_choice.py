@@ -8,7 +8,7 @@ from tests.models.arm import arm_data, arm_system
 from tests.models.test_motion_fit import bump, recording, slide
 
 from forcegp import JointFriction, MechanicalSystem, Noise, StructuredGP
-from forcegp.evaluation import choose_prior, independent_rows, usual_prior
+from forcegp.evaluation import allowing_for_correlation, choose_prior, usual_prior
 from forcegp.mechanics import Actuation, RigidBodyBias
 
 
@@ -51,13 +51,17 @@ def test_in_contact_it_is_the_tool_and_too_few_rows_are_no_look():
     assert "could not be compared with it" in why
 
 
-def test_rows_that_resemble_each_other_are_thinned(log, bare):
+def test_rows_that_resemble_each_other_are_worth_less(log, bare):
     model = StructuredGP(bare, JointFriction(), noise=Noise(0.5))
-    own = independent_rows(model, log)
-    assert own[0] is log, "white noise"
-    assert own[1] is None
+    fitted = model.fit(log, restarts=1)
+    assert allowing_for_correlation(fitted, log) == (fitted, None), "white noise"
     smooth = np.convolve(np.random.default_rng(0).standard_normal(len(log) + 8), np.ones(9) / 3.0, "valid")
     slow = replace(log, a=log.a + 4.0 * smooth[:, None])
-    kept, note = independent_rows(model, slow)
-    assert len(kept) == pytest.approx(len(log) / 3, rel=0.4), "limited by the fewest rows that are kept"
-    assert f"{len(kept)} in all" in note
+    wide, note = allowing_for_correlation(model.fit(slow, restarts=1), slow)
+    k = wide.settings["correlated_rows"]
+    assert 3.0 < k < 12.0, "of 9 rows that share their noise"
+    assert f"over {k:.0f} rows" in note
+    plain = wide.with_settings(widening=wide.widening / np.sqrt(k))
+    state = log.q[:5], log.v[:5], log.u[:5]
+    np.testing.assert_allclose(wide.predict(*state).covariance, k * plain.predict(*state).covariance)
+    np.testing.assert_array_equal(wide.predict(*state).mean, plain.predict(*state).mean)

@@ -34,7 +34,7 @@ def at_once(posterior, data):
     first = posterior.training
     whole = type(first).of(data, torch.device("cpu"))
     whole = dataclasses.replace(whole, reference=first)
-    settings = {"widening": posterior.widening}
+    settings = {"widening": posterior.widening, "beyond_visited": True}
     return posterior.model.condition(whole, posterior.parameters, posterior.result, settings)
 
 

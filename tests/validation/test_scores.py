@@ -18,6 +18,7 @@ from forcegp.validation.scores import (
     force_errors,
     mass_matrices,
     normalized_error,
+    outside_range,
     over_joints,
 )
 
@@ -144,3 +145,24 @@ def test_what_a_reader_has_to_know_comes_with_the_scores(test_rows):
     inside = np.mean(scores["coverage"][LEVELS.index(0.95)])
     assert inside < 0.9
     assert any(f"the 95 % intervals hold {inside:.0%} of the measurements" in sentence for sentence in doubted)
+
+
+def test_rows_outside_the_training_range_are_scored_apart(test_rows):
+    system, train = given_system(), test_rows.rows(slice(0, 20))
+    outside = outside_range(train, test_rows)
+    assert not outside[:20].any()
+    for row in range(20, 40):
+        beyond = [
+            not getattr(train, name)[:, joint].min() <= getattr(test_rows, name)[row, joint] <= seen.max()
+            for name in ("q", "v")
+            for joint, seen in enumerate(getattr(train, name).T)
+        ]
+        assert outside[row] == any(beyond)
+    model = StructuredGP(system, NoForces(), "analytical", tuple(SIGMA)).fit(test_rows, points=5)
+    found = acceleration_scores(model, test_rows, mass_matrices(test_rows, system), outside)[0]["range"]
+    error, spread = predicted(test_rows) - test_rows.a, test_rows.a.std(axis=0)
+    for side, rows in (("inside", ~outside), ("outside", outside)):
+        assert found[side]["rows"] == rows.sum() > 0
+        assert found[side]["nrmse"] == pytest.approx(np.mean(np.sqrt(np.square(error[rows]).mean(0)) / spread))
+        inside = np.abs(error[rows]) <= norm.ppf(0.975) * SIGMA
+        assert found[side]["coverage_95"] == pytest.approx(inside.mean())

@@ -67,24 +67,28 @@ class Fit(ModelOptions):
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
             dataset, rows_note = self._rows(dataset, system)
         observe = window_observation(command.learn_from, command.window)
-        prior_note, independent_note, intervals_note = None, None, None
+        prior_note, correlation_note, intervals_note = None, None, None
         if command.model == "structured" and not command.prior:
             command, prior_note = self._with_prior(command, dataset, system)
         model = make_model(command, system.to(self.device), dataset)
-        few = observe is None and command.points is None and learns_from_all_rows(command, model)
-        if few and isinstance(model, forcegp.StructuredGP):
-            dataset, independent_note = forcegp.evaluation.independent_rows(model, dataset, command.seed)
-            command = replace(command, points=len(dataset))
+        # of functions of few inputs, inducing points stand for any number of rows
+        few = isinstance(model, forcegp.StructuredGP) and forcegp.priors.has_few_inputs(model.prior, system.robot)
+        all_rows = few and observe is None and command.points is None and command.engine in ("auto", "inducing")
         rows = len(dataset) if observe is None else observe.count(dataset)
-        points = min(POINTS if command.points is None else command.points, rows)
+        points = rows if all_rows else min(POINTS if command.points is None else command.points, rows)
         command = replace(command, points=points)
-        posterior = fit_with_progress(terminal, model, dataset, points=points, **search_arguments(command, points))
+        how = search_arguments(command, points)
+        if all_rows and command.learning_points is None:
+            how |= forcegp.evaluation.all_rows_at_once(points)
+        posterior = fit_with_progress(terminal, model, dataset, points=points, **how)
+        if all_rows:
+            posterior, correlation_note = forcegp.evaluation.allowing_for_correlation(posterior, dataset)
         if self.motions is not None:
             posterior = refined_with_progress(terminal, posterior, recording, self.motions)
             posterior, intervals_note = calibrated_with_progress(terminal, posterior, recording)
         summary = fit_summary(posterior, time.monotonic() - start)
         command._write(posterior)
-        for note in (rows_note, prior_note, independent_note, intervals_note):
+        for note in (rows_note, prior_note, correlation_note, intervals_note):
             if note is not None:
                 terminal.note(note)
         for doubt in forcegp.evaluation.unfinished_search(posterior):
@@ -103,12 +107,6 @@ class Fit(ModelOptions):
         options = replace(forcegp.models.default_options(forcegp.evaluation.LOOK), iterations=command.iterations)
         name, why = forcegp.evaluation.choose_prior(dataset, system, noise=noise, seed=command.seed, options=options)
         return replace(command, prior=(name,)), f"prior: {why}"
-
-
-def learns_from_all_rows(command: Fit, model: Any) -> bool:
-    """Whether its functions have so few inputs that inducing points stand for any number of rows."""
-    few = command.model == "structured" and command.engine in ("auto", "inducing")
-    return few and forcegp.priors.has_few_inputs(model.prior, model.system.robot)
 
 
 def fit_with_progress(

@@ -14,7 +14,7 @@ from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 
-LARGEST_DELAY = 0.05  # s
+USUAL_DELAY, LARGEST_DELAY = 0.05, 0.2  # s
 STEPS = 100
 """Shifts that are tried to either side."""
 
@@ -77,13 +77,24 @@ def estimate_delay(
     in the joint needs: inertial, centrifugal and gravity torques of `robot` (default: that of `dataset.system`), each
     with a factor of its own, acceleration, velocity and sign of the velocity of the joint, and a constant. So the delay
     does not rest on the robot's parameters being right. The best shift has the least sum of squares, by a parabola
-    through the three smallest; its standard deviation comes from leaving out each eighth of the log in turn (block
-    jackknife; Kuensch 1989, "The jackknife and the bootstrap for general stationary observations").
+    through the three smallest: among shifts up to 50 ms and, where it lies at their end, up to `largest`. Its standard
+    deviation comes from leaving out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and
+    the bootstrap for general stationary observations").
 
     Filter first: q, v, u and a must be those of one filter. Raises InvalidInput without a robot, or with contacts,
-    whose forces are not known; DatasetError for a log shorter than eight times `largest`.
+    whose forces are not known; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
+    near = _estimated(dataset, robot, min(largest, USUAL_DELAY))
+    if np.isfinite(near.common) or largest <= USUAL_DELAY:
+        return near
+    try:
+        return _estimated(dataset, robot, largest)
+    except DatasetError:  # too short for that
+        return near
+
+
+def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -> Delay:
     parts = _shifted(dataset, largest)
     features = _features(robot, dataset.rows(parts.rows))
     nv = dataset.nv

@@ -21,7 +21,8 @@ from .prior_comparison import (
     PriorComparison as PriorComparison, PriorScore as PriorScore, compare_priors as compare_priors,
 )
 from .prior_choice import (
-    LOOK as LOOK, choose_prior as choose_prior, independent_rows as independent_rows, usual_prior as usual_prior,
+    LOOK as LOOK, all_rows_at_once as all_rows_at_once, allowing_for_correlation as allowing_for_correlation,
+    choose_prior as choose_prior, usual_prior as usual_prior,
 )
 from .rollout_scores import (
     RolloutErrors as RolloutErrors, rollout_errors as rollout_errors,

@@ -1,7 +1,7 @@
-"""What to learn where nobody says it: which prior, by a look at a few rows, and which of all rows are independent."""
+"""What to learn where nobody says it: which prior, by a look at a few rows, and what all rows of a log are worth."""
 
+import math
 import warnings
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,36 +10,20 @@ from forcegp.analytical.least_squares import correlation_time
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError
 from forcegp.evaluation.prior_comparison import compare_priors
-from forcegp.inference import Inducing
-from forcegp.mechanics import (
-    CoulombJointFriction,
-    DirectionalJointFriction,
-    LoadJointFriction,
-    MechanicalSystem,
-    StribeckJointFriction,
-    ViscousJointFriction,
-)
-from forcegp.models import Noise, StructuredGP, TrainingData
+from forcegp.mechanics import KNOWN_FORCES, MechanicalSystem
+from forcegp.models import Noise, StructuredPosterior
+from forcegp.models.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.priors import named_prior
 
 FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
 IN_CONTACT = "tool-friction", "joint", "tool-friction + joint-friction"
 """Priors that are looked at, the one that is taken without a look first."""
 
-FRICTION = (
-    CoulombJointFriction,
-    DirectionalJointFriction,
-    LoadJointFriction,
-    StribeckJointFriction,
-    ViscousJointFriction,
-)
+FRICTION = tuple(kind for name, kind in KNOWN_FORCES.items() if name.endswith("joint-friction"))
 
-LOOK = 100
-"""Rows of the look."""
-RESIDUALS = 20_000
-"""Rows whose residuals show how long errors resemble each other."""
-FEWEST = 400
-"""Rows that thinning leaves, if there are so many."""
+LOOK = 100  # rows
+RESIDUALS = 20_000  # rows whose residuals show how long errors resemble each other
+NOTICEABLE = 1.5  # rows over which they must for intervals to change
 
 
 def usual_prior(system: MechanicalSystem) -> str:
@@ -83,27 +67,30 @@ def choose_prior(
     return chosen, f"{chosen} {where}; by {by} it is better than {names[0]}, by {gain:.3g} nats per row"
 
 
-def independent_rows(model: StructuredGP, dataset: Dataset, seed: int = 0) -> tuple[Dataset, str | None]:
-    """Every k-th row, so that what the model leaves of the acceleration is about independent; and a note if k > 1.
+def all_rows_at_once(count: int) -> dict[str, Any]:
+    """Arguments for the `fit` of functions of few inputs to so many rows: exact up to `MOST_POINTS_FOR_RESTARTS`."""
+    most = MOST_POINTS_FOR_RESTARTS
+    return {} if count <= most else {"engine": "inducing", "learning_points": most}
+
+
+def allowing_for_correlation(
+    posterior: StructuredPosterior, dataset: Dataset
+) -> tuple[StructuredPosterior, str | None]:
+    """The posterior from all rows of a log, as wide as its independent rows allow; and a note where that matters.
 
     Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would
-    count as 20,000 facts. k is the integrated correlation time, in rows, of what is left after the forces are learned
-    from all of them, at hyper-parameters from `LOOK` rows: what the forces still lack would not be noise.
+    count as 20,000 facts. With the integrated correlation time k of the residuals, in rows, variances are k times as
+    large (`analytical.least_squares.correlation_time`); means stay, for rows that are left out would be missed at
+    reversals, where friction changes within a few of them.
     """
-    if len(dataset) <= FEWEST or not dataset.time_ordered:
-        return dataset, None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # the fit gives it
-        rough = model.fit(dataset, points=LOOK, restarts=1, seed=seed)
-        some = dataset.rows(slice(RESIDUALS))
-        given = replace(TrainingData.of(some, rough.training.q.device), reference=rough.training)
-        rough = rough.model.condition(given, rough.parameters, rough.result, rough.settings, Inducing())
-    residual = rough.predict(some.q, some.v, some.u).mean.cpu().numpy() - some.a
+    if not dataset.time_ordered:
+        return posterior, None
+    some = dataset.rows(slice(RESIDUALS))
+    residual = posterior.predict(some.q, some.v, some.u, covariance=False).mean.cpu().numpy() - some.a
     spread = residual.std(axis=0)
-    time = correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)
-    every = max(1, min(round(float(np.median(time))), len(dataset) // FEWEST))
-    if every == 1:
-        return dataset, None
-    kept = dataset.rows(slice(0, None, every))
-    note = f"errors resemble each other over {every} rows: every {every}th row was learned from, {len(kept)} in all"
-    return replace(kept, system=dataset.system), note
+    times = correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)
+    k = max(1.0, float(np.median(times)))
+    if k < NOTICEABLE:
+        return posterior, None
+    note = f"errors resemble each other over {k:.0f} rows, for which intervals are {math.sqrt(k):.1f} times as wide"
+    return posterior.with_settings(widening=math.sqrt(k) * posterior.widening, correlated_rows=k), note

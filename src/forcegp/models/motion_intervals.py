@@ -20,10 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-HORIZONS = (0.1, 0.25, 0.5, 1.0)
-"""Lengths in s at which widths are found by default."""
-DEVIATIONS = 1.959963984540054
-"""Standard deviations of a normal distribution that hold 95 % of it."""
+HORIZONS = (0.1, 0.25, 0.5, 1.0)  # s, by default
+DEVIATIONS = 1.959963984540054  # of a normal distribution, which hold 95 % of it
 
 
 @dataclass(frozen=True, eq=False)

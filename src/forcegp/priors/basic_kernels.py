@@ -166,8 +166,7 @@ WIDTH = 0.1
 """Start value of the velocity at which dry friction is developed, as a fraction of the rms velocity."""
 
 WIDTH_LOG_SPREAD = 1.0
-NOWHERE = 1e9
-"""Largest velocity before any is visited."""
+NOWHERE = 1e9  # the largest velocity before any is visited
 
 
 def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:

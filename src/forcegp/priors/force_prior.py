@@ -217,10 +217,7 @@ def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Te
     )
 
 
-FEW_INPUTS = 2
-
-
 def has_few_inputs(prior: ForcePrior, robot: Robot) -> bool:
     """Whether every function of the prior has one or two inputs: then some dozens of points stand for all rows."""
     names = prior.feature_names(robot)
-    return names is not None and all(0 < len(inputs) <= FEW_INPUTS for inputs in names)
+    return bool(names) and all(0 < len(inputs) <= 2 for inputs in names)

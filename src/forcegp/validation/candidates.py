@@ -16,7 +16,7 @@ from typing import Literal, get_args
 from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
-from forcegp.evaluation import independent_rows
+from forcegp.evaluation import all_rows_at_once, allowing_for_correlation
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
@@ -136,8 +136,9 @@ def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
     if training.all_rows is not None and has_few_inputs(forces, system.robot):
         # held-out noise contains the misfit that the forces are to learn; so many rows show their own
         model = StructuredGP(system, forces, "analytical", replace(training, levels=None).noise)
-        rows, _ = independent_rows(model, training.all_rows, training.seed)
-        return model.fit(rows, seed=training.seed, restarts=training.restarts)
+        how = all_rows_at_once(len(training.all_rows))
+        fitted = model.fit(training.all_rows, seed=training.seed, restarts=training.restarts, **how)
+        return allowing_for_correlation(fitted, training.all_rows)[0]
     model = StructuredGP(system, forces, "analytical", training.noise)
     return model.fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
 

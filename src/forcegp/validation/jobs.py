@@ -22,7 +22,7 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.parallel import Shared
 from forcegp.validation.candidates import Candidate, Training
 from forcegp.validation.comparison import IDENTIFICATIONS, Comparison, Identification, training_subset
-from forcegp.validation.scores import acceleration_scores, mass_matrices, motion_scores
+from forcegp.validation.scores import acceleration_scores, mass_matrices, motion_scores, outside_range
 from forcegp.validation.splits import Split
 
 IDENTIFICATION, MODEL = "identification", "model"
@@ -165,7 +165,7 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
     posterior = work.fit(training)
     seconds = before + time.process_time() - start
     mass, whose = reference_mass(store, comparison, spec["mass_matrix"], test)
-    scores, doubted = acceleration_scores(posterior, test, mass)
+    scores, doubted = acceleration_scores(posterior, test, mass, outside_range(training.all_rows or rows, test))
     for sentence in doubted:
         warnings.warn(sentence, DataWarning, stacklevel=1)  # the page shows what was warned of in a job
     scores["motions"] = motion_scores(posterior, motions, comparison.integrator)

@@ -28,6 +28,7 @@ def page(document: Mapping[str, Any]) -> str:
     if finished:
         parts += ["## All joints", _overall(finished, document)]
         parts += [f"![{ALT_TEXTS[name]}]({name}.png)" for name in document["figures"]]
+        parts += _range(finished)
         parts += ["## By joint", *_by_joint(finished, document)]
         parts += ["## Predicted motions", _motions(finished, document)]
     parts += ["## Models", _models(models)]
@@ -178,6 +179,23 @@ def _by(models: Mapping[str, Any], value: Callable[[Any, str], float | None]) ->
         return min(found, key=lambda number: abs(number - level), default=None)
 
     return best
+
+
+def _range(models: Mapping[str, Any]) -> list[str]:
+    """Held-out rows beyond the positions or velocities of all training rows, apart from the others."""
+    apart = {name: model["range"] for name, model in models.items() if "outside" in model["range"]}
+    if not apart:
+        return ["## Outside the training range", "No held-out row has a position or velocity beyond all training rows."]
+    sides = [side for side in ("inside", "outside") if all(side in found for found in apart.values())]
+    header = ["model", *(f"{word}, {side}" for word in ("nRMSE", "in 95 %") for side in sides)]
+    rows = [
+        [name, *(formatted(found[side]["nrmse"], 3) for side in sides)]
+        + [_percent(found[side]["coverage_95"]) for side in sides]
+        for name, found in apart.items()
+    ]
+    count = next(iter(apart.values()))["outside"]["rows"]["median"]
+    text = f"{count:g} held-out rows have a joint position or velocity beyond all training rows."
+    return ["## Outside the training range", text, markdown_table(header, rows)]
 
 
 def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:

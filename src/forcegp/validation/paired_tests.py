@@ -17,10 +17,8 @@ from jaxtyping import Float
 from scipy.stats import t as student
 
 CERTAINTY = 0.95
-MARGIN = 0.02
-"""Of a ratio: a difference below it matters to nobody, however sure it is."""
-MOST_LOG = 700.0
-"""Of a ratio that is still a finite number."""
+MARGIN = 0.02  # of a ratio: a difference below it matters to nobody, however sure it is
+MOST_LOG = 700.0  # of a ratio that is still a finite number
 
 SCORES: Mapping[str, str] = {
     "motion": "error of predicted motions",

@@ -132,6 +132,14 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
             for place in range(len(levels))
         ],
     }
+    apart = [result["range"] for result in results]
+    out["range"] = {
+        name: {
+            score: median_and_range(each[name][score] for each in apart) for score in ("rows", "nrmse", "coverage_95")
+        }
+        for name in ("inside", "outside")
+        if all(name in each for each in apart)
+    }
     out["motions"] = _motions([result["motions"] for result in results])
     return out
 

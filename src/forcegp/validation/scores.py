@@ -55,10 +55,12 @@ def force_errors(predicted: Rows, target: Rows, mass: Matrices) -> Rows:
     return (mass @ (predicted - target)[..., None])[..., 0]
 
 
-def acceleration_scores(posterior: Posterior, test: Dataset, mass: Matrices) -> tuple[dict[str, Any], tuple[str, ...]]:
+def acceleration_scores(
+    posterior: Posterior, test: Dataset, mass: Matrices, outside: Bool[np.ndarray, " rows"] | None = None
+) -> tuple[dict[str, Any], tuple[str, ...]]:
     """All scores of the held-out rows, and what a reader has to know beside them (`evaluation.doubts`).
 
-    `mass` is the same for every model (`mass_matrices`).
+    `mass` is the same for every model (`mass_matrices`); rows `outside` of the training range are scored apart, too.
 
     Intervals and densities are those of a measurement: with the noise of the model, or of the Dataset where that is
     larger. What is not a number (a constant target) is None.
@@ -81,6 +83,7 @@ def acceleration_scores(posterior: Posterior, test: Dataset, mass: Matrices) -> 
         "levels": list(LEVELS),
         "coverage": [plain(each) for each in covered],
         "stretches": _by_stretch(predicted, test, forces),
+        "range": {} if outside is None else _apart(predicted, test, outside),
         "noise_std": plain(posterior.noise_std.detach().cpu().numpy()),
     }
     shared = {
@@ -107,6 +110,27 @@ def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[s
         "force_rms": plain(np.array([np.sqrt((forces[block] ** 2).mean()) for block in blocks])),
         "nlpd": plain(np.array([predicted.negative_log_density[block].mean() for block in blocks])),
     }
+
+
+def outside_range(train: Dataset, test: Dataset) -> Bool[np.ndarray, " rows"]:
+    """Rows of `test` in which a joint's position or velocity lies beyond all of `train`."""
+    out = np.zeros(len(test), dtype=bool)
+    for name in ("q", "v"):
+        seen, here = getattr(train, name), getattr(test, name)
+        out |= ((here < seen.min(axis=0)) | (here > seen.max(axis=0))).any(axis=-1)
+    return out
+
+
+def _apart(predicted: PredictedRows, test: Dataset, outside: Bool[np.ndarray, " rows"]) -> dict[str, Any]:
+    """Rows, normalised error and coverage over all joints, `inside` and `outside` of the training range."""
+    spread, found = test.a.std(axis=0), {}
+    for name, rows in (("inside", ~outside), ("outside", outside)):
+        if rows.any():
+            mean, variance, a = predicted.mean[rows], predicted.measurement_variance[rows], test.a[rows]
+            error = metrics.root_mean_square_error(mean, a)[spread > 0.0] / spread[spread > 0.0]
+            covered = metrics.interval_coverage(mean, variance, a, 0.95)
+            found[name] = {"rows": int(rows.sum()), "nrmse": float(error.mean()), "coverage_95": float(covered.mean())}
+    return found
 
 
 def over_joints(score: str, values: Sequence[float | None]) -> float | None:

@@ -16,10 +16,8 @@ from forcegp.models.training_data import TrainingData
 
 FOLDS = 4
 SAMPLES = 16
-STEP = 0.005
-"""Longest step in s, of several rows where the recording has shorter ones."""
-STARTS = 4
-"""Motions that begin within one longest horizon."""
+STEP = 0.005  # s, the longest; of several rows where the recording has shorter ones
+STARTS = 4  # motions that begin within one longest horizon
 LEVEL = 0.95
 Structured = Any
 """A `StructuredPosterior`, whose module imports this one."""

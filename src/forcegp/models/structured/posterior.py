@@ -382,7 +382,7 @@ class StructuredPosterior(Posterior):
         if z is not None and self.identification is not None:
             model = replace(model, system=self.identification.physical.system_at(z))
         likelihood = model.likelihood(self.training)
-        kernels = likelihood.kernels()
+        kernels = likelihood.kernels(beyond=bool(self.settings.get("beyond_visited")))
         latent = likelihood.condition(kernels, point, self.engine)
         return StructuredPosterior(
             model, likelihood, kernels, point, self.result, self.settings, latent, self.engine, target=self.target
