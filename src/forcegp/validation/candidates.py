@@ -28,12 +28,8 @@ Kind = Literal["given", "identified", "residual", "black box", "force prior"]
 physics, and Gaussian processes on unknown forces.
 """
 
-MEAN = "@"
-"""Between a prior and the system that the mean takes, in the name of a model."""
-
-
-MOTIONS = "/motions"
-"""At the end of a name: the model refined on motions."""
+MEAN = "@"  # between a prior and the system that the mean takes, in the name of a model
+MOTIONS = "/motions"  # at the end of a name: the model refined on motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +173,7 @@ CANDIDATES: dict[str, Candidate] = {
 """Models by name. Identified systems and Gaussian processes on forces need no entry, see `candidate`."""
 
 IDENTIFIED = "identified-"
-RESIDUAL = "joint-accelerations"
-"""The prior that is a Gaussian process on the acceleration, one per joint."""
+RESIDUAL = "joint-accelerations"  # one Gaussian process per joint on the acceleration
 
 DEFAULT_MODELS = (
     "analytical",

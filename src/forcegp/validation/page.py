@@ -187,12 +187,11 @@ def _range(models: Mapping[str, Any]) -> list[str]:
     if not apart:
         return ["## Outside the training range", "No held-out row has a position or velocity beyond all training rows."]
     sides = [side for side in ("inside", "outside") if all(side in found for found in apart.values())]
-    header = ["model", *(f"{word}, {side}" for word in ("nRMSE", "in 95 %") for side in sides)]
-    rows = [
-        [name, *(formatted(found[side]["nrmse"], 3) for side in sides)]
-        + [_percent(found[side]["coverage_95"]) for side in sides]
-        for name, found in apart.items()
-    ]
+    header = ["model", *(f"{word}, {side}" for side in sides for word in ("nRMSE", "in 95 %"))]
+    rows = []
+    for name, found in apart.items():
+        shown = [(formatted(found[side]["nrmse"], 3), _percent(found[side]["coverage_95"])) for side in sides]
+        rows.append([name, *(cell for pair in shown for cell in pair)])
     count = next(iter(apart.values()))["outside"]["rows"]["median"]
     text = f"{count:g} held-out rows have a joint position or velocity beyond all training rows."
     return ["## Outside the training range", text, markdown_table(header, rows)]

@@ -188,8 +188,8 @@ class Unknowns:
 
 
 def _space(posterior: Structured) -> WeightSpace:
-    """Weights of the latents that the posterior has, or of as many inducing points as its features need."""
-    if isinstance(posterior.latent, InducingPosterior):
+    """Weights of as many inducing points as the latents' features need; of a refined model, those that it has."""
+    if isinstance(posterior.engine, InducingWeights):
         return posterior.latent.space
     with torch.no_grad():
         terms = posterior.likelihood.terms(posterior.parameters)
