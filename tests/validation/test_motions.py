@@ -17,7 +17,7 @@ def test_refined_models_move_better(tmp_path):
     compared = Comparison(data, data, data.system, splits, points=60, horizons=(0.25, 0.5), starts=6, restarts=1)
     found = validate(compared, tmp_path / "out", models=NAMES, seeds=1)
     plain, refined = (found.document["models"][name]["motions"]["rms"][-1]["median"] for name in NAMES)
-    assert refined < 0.2 * plain
+    assert refined < 0.5 * plain
 
 
 @pytest.mark.parametrize("name", ["analytical/motions", "independent-gp/motions", "ensemble/motions"])
