@@ -20,14 +20,14 @@ def log():
     return recording(bump, 1)
 
 
-@pytest.fixture(scope="module", params=["analytical", "friction"])
+@pytest.fixture(scope="module", params=["analytical", "refined", "friction"])
 def calibrated(request, log):
-    """A model that cannot have the bump, and one that learns it from a few rows."""
+    """A model that cannot have the bump, the same refined on motions, and one that learns it from a few rows."""
     system = slide(3.0, 4.0)
-    if request.param == "analytical":
-        fitted = StructuredGP(system, NoForces(), noise=QUIET).fit(log, points=40, restarts=1)
-    else:
-        fitted = StructuredGP(system, JointFriction(), noise=QUIET).fit(log, points=40, restarts=1)
+    prior = JointFriction() if request.param == "friction" else NoForces()
+    fitted = StructuredGP(system, prior, noise=QUIET).fit(log, points=40, restarts=1)
+    if request.param == "refined":
+        fitted = fitted.refined_on_motions(log, 0.5)
     return fitted.calibrated_on_motions(log, HORIZONS)
 
 
@@ -60,9 +60,10 @@ def test_widths_between_horizons_are_linear_and_grow_beyond_the_last():
 
 def test_they_are_stored_and_go_with_the_system(calibrated, tmp_path):
     save_posterior(calibrated, tmp_path / "run")
-    again = load_posterior(tmp_path / "run").motion_intervals
-    for name in ("horizons", "rms", "factors"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(calibrated.motion_intervals, name))
+    for again in (load_posterior(tmp_path / "run"), calibrated.to("cpu")):
+        for name in ("horizons", "rms", "factors"):
+            expected = getattr(calibrated.motion_intervals, name)
+            np.testing.assert_array_equal(getattr(again.motion_intervals, name), expected)
     other = calibrated.with_system(slide(1.0, 1.0))
     assert other.motion_intervals is None, "widths of another robot"
 

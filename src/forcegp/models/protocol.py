@@ -347,7 +347,8 @@ class Posterior(MotionModel, Summary, ABC):
             engine=self.engine,
             solution=None if self.solution is None else self.solution.to(at),
         )
-        return there if self.target is None else there.with_system(self.target.to(device))
+        carried = there if self.target is None else there.with_system(self.target.to(device))
+        return carried.with_settings(**self.settings)
 
     def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
         """The same posterior with more entries in `settings`."""

@@ -240,7 +240,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
     if target is not None:
         try:
-            posterior = posterior.with_system(target)
+            posterior = posterior.with_system(target).with_settings(**settings)  # as it was stored
         except ForceGPError as error:
             raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
     held = set(_features(posterior))
