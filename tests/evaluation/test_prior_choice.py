@@ -4,12 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from tests.models.arm import arm_data, arm_system
 from tests.models.test_motion_fit import bump, recording, slide
 
 from forcegp import JointFriction, MechanicalSystem, Noise, StructuredGP
-from forcegp.evaluation import allowing_for_correlation, choose_prior, usual_prior
+from forcegp.evaluation import allowing_for_correlation, choose_prior, usual_prior, with_force_noise
+from forcegp.inference import Inducing
 from forcegp.mechanics import Actuation, RigidBodyBias
+from forcegp.models import load_posterior, save_posterior
+from forcegp.models.training_data import ACCELERATION, TrainingData
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +55,7 @@ def test_in_contact_it_is_the_tool_and_too_few_rows_are_no_look():
     assert "could not be compared with it" in why
 
 
-def test_rows_that_resemble_each_other_are_worth_less(log, bare):
+def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):
     model = StructuredGP(bare, JointFriction(), noise=Noise(0.5))
     fitted = model.fit(log, restarts=1)
     assert allowing_for_correlation(fitted, log) == (fitted, None), "white noise"
@@ -61,7 +65,38 @@ def test_rows_that_resemble_each_other_are_worth_less(log, bare):
     k = wide.settings["correlated_rows"]
     assert 3.0 < k < 12.0, "of 9 rows that share their noise"
     assert f"over {k:.0f} rows" in note
-    plain = wide.with_settings(widening=wide.widening / np.sqrt(k))
+    # nine rows that share their noise are one: the posterior of rows that are noisier by the root of k
+    noisier = {**wide.parameters, ACCELERATION: wide.parameters[ACCELERATION] + 0.5 * np.log(k)}
+    expected = model.condition(wide.training, noisier, wide.result, {"widening": wide.widening, "beyond_visited": True})
     state = log.q[:5], log.v[:5], log.u[:5]
-    np.testing.assert_allclose(wide.predict(*state).covariance, k * plain.predict(*state).covariance)
-    np.testing.assert_array_equal(wide.predict(*state).mean, plain.predict(*state).mean)
+    np.testing.assert_allclose(wide.predict(*state).mean, expected.predict(*state).mean, rtol=1e-12)
+    np.testing.assert_allclose(wide.predict(*state).covariance, expected.predict(*state).covariance, rtol=1e-12)
+    np.testing.assert_allclose(wide.noise_std, [0.5], rtol=1e-12)
+    save_posterior(wide, tmp_path / "run")
+    again = load_posterior(tmp_path / "run")
+    np.testing.assert_array_equal(again.predict(*state).covariance, wide.predict(*state).covariance)
+
+
+def test_many_rows_learn_hyper_parameters_as_the_independent_rows_that_they_are_worth(log, bare):
+    """The bound of rows that are repeated k times, k of which count as one, is that of the rows themselves."""
+    model = StructuredGP(bare, JointFriction(), noise=Noise(0.5, learn=True))
+    engine = Inducing(points=60, tolerance=0.0, refine=0)
+    fitted = model.fit(log, engine=engine, learning_points=40, restarts=1)
+    points, once = fitted.latent.features, fitted.likelihood
+    rows = (x.repeat_interleave(3, 0) for x in (once.training.q, once.training.v, once.training.u, once.training.a))
+    repeated = TrainingData(*rows, reference=once.training.reference, correlated_rows=3.0)
+    thrice = replace(once, training=repeated)
+    expected = once.bound(fitted.kernels, fitted.parameters, points)
+    torch.testing.assert_close(thrice.bound(fitted.kernels, fitted.parameters, points), expected, rtol=1e-9, atol=0.0)
+
+
+def test_noise_of_forces_is_learned_where_rows_show_it():
+    system = arm_system(contacts=0, baumgarte=None)
+    data = arm_data(60, 0, system)
+    for noise in (None, Noise(0.1), Noise(0.1, 0.2, learn=True)):
+        model = StructuredGP(system, JointFriction(), noise=noise)
+        assert with_force_noise(model, data) is model, "stated, or already there"
+    model = with_force_noise(StructuredGP(system, JointFriction(), noise=Noise(0.1, learn=True)), data)
+    q, v, a = (torch.tensor(x) for x in (data.q, data.v, data.a))
+    lacking = system.robot.inverse_dynamics(q, v, a).numpy() - data.u
+    np.testing.assert_allclose(model.noise.force, lacking.std(axis=0, ddof=1), rtol=1e-8)

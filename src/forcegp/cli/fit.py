@@ -78,11 +78,14 @@ class Fit(ModelOptions):
         points = rows if all_rows else min(POINTS if command.points is None else command.points, rows)
         command = replace(command, points=points)
         how = search_arguments(command, points)
-        if all_rows and command.learning_points is None:
-            how |= forcegp.evaluation.all_rows_at_once(points)
+        if all_rows:
+            model = forcegp.evaluation.with_force_noise(model, dataset)
+            given = {} if command.learning_points is None else {"learning_points": command.learning_points}
+            how |= forcegp.evaluation.all_rows_at_once(points) | given
         posterior = fit_with_progress(terminal, model, dataset, points=points, **how)
         if all_rows:
-            posterior, correlation_note = forcegp.evaluation.allowing_for_correlation(posterior, dataset)
+            found = forcegp.evaluation.allowing_for_correlation(posterior, dataset, command.hyperprior)
+            posterior, correlation_note = found
         if self.motions is not None:
             posterior = refined_with_progress(terminal, posterior, recording, self.motions)
             posterior, intervals_note = calibrated_with_progress(terminal, posterior, recording)

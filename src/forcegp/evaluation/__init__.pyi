@@ -22,6 +22,7 @@ from .prior_comparison import (
 )
 from .prior_choice import (
     LOOK as LOOK, all_rows_at_once as all_rows_at_once, allowing_for_correlation as allowing_for_correlation,
+    with_force_noise as with_force_noise,
     choose_prior as choose_prior, usual_prior as usual_prior,
 )
 from .rollout_scores import (

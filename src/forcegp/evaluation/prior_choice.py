@@ -1,18 +1,21 @@
 """What to learn where nobody says it: which prior, by a look at a few rows, and what all rows of a log are worth."""
 
-import math
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from forcegp.analytical.least_squares import correlation_time
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError
 from forcegp.evaluation.prior_comparison import compare_priors
+from forcegp.inference import Inducing
 from forcegp.mechanics import KNOWN_FORCES, MechanicalSystem
-from forcegp.models import Noise, StructuredPosterior
+from forcegp.models import Noise, StructuredGP, StructuredPosterior
 from forcegp.models.search import MOST_POINTS_FOR_RESTARTS
+from forcegp.models.structured.refinement import refined
 from forcegp.priors import named_prior
 
 FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
@@ -23,7 +26,8 @@ FRICTION = tuple(kind for name, kind in KNOWN_FORCES.items() if name.endswith("j
 
 LOOK = 100  # rows
 RESIDUALS = 20_000  # rows whose residuals show how long errors resemble each other
-NOTICEABLE = 1.5  # rows over which they must for intervals to change
+NOTICEABLE = 1.5  # rows over which they must to count for less
+RESIDUALS_OF_FORCES = 1000  # rows that show where the noise of forces begins
 
 
 def usual_prior(system: MechanicalSystem) -> str:
@@ -68,29 +72,61 @@ def choose_prior(
 
 
 def all_rows_at_once(count: int) -> dict[str, Any]:
-    """Arguments for the `fit` of functions of few inputs to so many rows: exact up to `MOST_POINTS_FOR_RESTARTS`."""
+    """Arguments for the `fit` of functions of few inputs to so many rows: exact up to `MOST_POINTS_FOR_RESTARTS`.
+
+    Beyond, by inducing points that leave out less than what one number adds to the variance of a row, 1 / count: what
+    all rows leave open of a function is small, and intervals of curves hold what is left out, too. Hyper-parameters are
+    improved on all rows afterwards (`allowing_for_correlation`).
+    """
     most = MOST_POINTS_FOR_RESTARTS
-    return {} if count <= most else {"engine": "inducing", "learning_points": most}
+    return {} if count <= most else {"engine": Inducing(tolerance=1.0 / count, refine=0), "learning_points": most}
+
+
+def with_force_noise(model: StructuredGP, dataset: Dataset) -> StructuredGP:
+    """The model with a learned noise of the joint forces beside that of accelerations, where it may learn its noise.
+
+    Forces that are wrong by the same everywhere are accelerations that are wrong by more where the inertia is small:
+    taken for noise of the acceleration, all rows of a two-joint arm made friction worse than none. It begins at the
+    scatter of the forces that the known physics lacks.
+    """
+    noise = model.noise
+    if noise is None or not noise.learn or noise.force is not None or model.system.robot.nv == 1:
+        return model
+    some = dataset.rows(slice(None, None, max(1, len(dataset) // RESIDUALS_OF_FORCES)))
+    q, v, u, a = (torch.tensor(x, device=model.system.robot.device) for x in (some.q, some.v, some.u, some.a))
+    dynamics = model.system.dynamics(q, v, u)
+    residual = (a - dynamics.acceleration_map(known=model.mean == "analytical").offset)[..., None]
+    forces = (torch.linalg.pinv(dynamics.H, rtol=1e-8) @ residual)[..., 0].std(0)
+    if not float(forces.min()) > 0.0:
+        return model
+    return replace(model, noise=replace(noise, force=tuple(forces.tolist())))
 
 
 def allowing_for_correlation(
-    posterior: StructuredPosterior, dataset: Dataset
+    posterior: StructuredPosterior, dataset: Dataset, hyperprior: bool = True
 ) -> tuple[StructuredPosterior, str | None]:
-    """The posterior from all rows of a log, as wide as its independent rows allow; and a note where that matters.
+    """The posterior from all rows of a log, learned from them as the independent rows that they are worth; and a note.
 
     Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would
-    count as 20,000 facts. With the integrated correlation time k of the residuals, in rows, variances are k times as
-    large (`analytical.least_squares.correlation_time`); means stay, for rows that are left out would be missed at
-    reversals, where friction changes within a few of them.
+    count as 20,000 facts. With the integrated correlation time k of the residuals, in rows, every row counts as 1/k
+    (`analytical.least_squares.correlation_time`, `TrainingData`), for the functions and for hyper-parameters, which
+    inducing points then improve on all rows. No row is left out, for friction changes within a few of them at a
+    reversal. The note is None where errors do not resemble each other.
     """
-    if not dataset.time_ordered:
-        return posterior, None
+    k = _correlated_rows(posterior, dataset) if dataset.time_ordered else 1.0
+    if k > 1.0:
+        settings = {**posterior.settings, "correlated_rows": k}
+        given = posterior.training, posterior.parameters, posterior.result, settings, posterior.engine
+        posterior = posterior.model.condition(*given)
+    if isinstance(posterior.engine, Inducing):
+        posterior = refined(replace(posterior, engine=replace(posterior.engine, refine=Inducing.refine)), hyperprior)
+    return posterior, f"errors resemble each other over {k:.0f} rows, which count as one" if k > 1.0 else None
+
+
+def _correlated_rows(posterior: StructuredPosterior, dataset: Dataset) -> float:
     some = dataset.rows(slice(RESIDUALS))
     residual = posterior.predict(some.q, some.v, some.u, covariance=False).mean.cpu().numpy() - some.a
     spread = residual.std(axis=0)
     times = correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)
-    k = max(1.0, float(np.median(times)))
-    if k < NOTICEABLE:
-        return posterior, None
-    note = f"errors resemble each other over {k:.0f} rows, for which intervals are {math.sqrt(k):.1f} times as wide"
-    return posterior.with_settings(widening=math.sqrt(k) * posterior.widening, correlated_rows=k), note
+    k = float(np.median(times))
+    return k if k >= NOTICEABLE else 1.0

@@ -29,6 +29,9 @@ class TrainingData:
     With `weights` (see `forcegp.data.Windows`) the rows are the nodes of windows, one window after the other, and what
     was measured is the weighted sum of the accelerations of each; `a` and `noise_std` of a window are repeated for all
     of its nodes.
+
+    Errors of filtered and resampled logs resemble each other from row to row. Where they do over `correlated_rows`, as
+    many rows count as one: the covariance of each in the likelihood is so many times that of its noise.
     """
 
     q: Float[Tensor, "N nv"]
@@ -38,6 +41,7 @@ class TrainingData:
     noise_std: Float[Tensor, "N nv"] | None = None
     reference: "TrainingData | None" = None
     weights: Float[Tensor, "windows nodes"] | None = None
+    correlated_rows: float = 1.0
 
     def __len__(self) -> int:
         """How many observations there are: rows, or windows."""
@@ -55,7 +59,7 @@ class TrainingData:
 
     def to(self, device: torch.device) -> "TrainingData":
         """The same rows on another device."""
-        return replace(self, **{name: x.to(device) for name, x in vars(self).items() if x is not None})
+        return replace(self, **{name: x.to(device) for name, x in vars(self).items() if hasattr(x, "to")})
 
     @property
     def noise_factors(self) -> Float[Tensor, "N nv"] | None:

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
 from forcegp.errors import FitError, InvalidInput
-from forcegp.evaluation import all_rows_at_once, allowing_for_correlation
+from forcegp.evaluation import all_rows_at_once, allowing_for_correlation, with_force_noise
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
@@ -131,7 +131,8 @@ def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
     forces = named_prior(prior, system)
     if training.all_rows is not None and has_few_inputs(forces, system.robot):
         # held-out noise contains the misfit that the forces are to learn; so many rows show their own
-        model = StructuredGP(system, forces, "analytical", replace(training, levels=None).noise)
+        noise = replace(training.noise, learn=True)
+        model = with_force_noise(StructuredGP(system, forces, "analytical", noise), training.all_rows)
         how = all_rows_at_once(len(training.all_rows))
         fitted = model.fit(training.all_rows, seed=training.seed, restarts=training.restarts, **how)
         return allowing_for_correlation(fitted, training.all_rows)[0]

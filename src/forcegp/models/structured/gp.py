@@ -209,7 +209,7 @@ class StructuredGP(StructuredModel):
         solution: Tensor | None = None,
     ) -> StructuredPosterior:
         """The posterior at given parameters, without optimisation; names as in `MarginalLikelihood`."""
-        likelihood = self.likelihood(training)
+        likelihood = self.likelihood(replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
         # models that were stored before friction widened beyond visited velocities stay as they were
         kernels = likelihood.kernels(beyond=bool(settings.get("beyond_visited")))
         engine = engine or Exact()

@@ -1,5 +1,6 @@
 """Where physics and Gaussian processes meet: from states and a checked prior to (m, W), features, NLL; the model."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -153,7 +154,7 @@ class MarginalLikelihood:
         weights = self.training.weights
         if weights is not None:
             residual = weighted(weights, residual).repeat_interleave(weights.shape[1], dim=0)
-        noise = Noise.covariance(parameters, dynamics.H, self.training.noise_factors)
+        noise = Noise.covariance(parameters, dynamics.H, self.training.noise_factors) * self.training.correlated_rows
         if dynamics is self._nominal_dynamics:
             return Terms(self._nominal_features, self._nominal_mixing, residual, noise)
         # shifted and scaled at these parameters, as a posterior does that has them in its system
@@ -220,9 +221,22 @@ class MarginalLikelihood:
     def bound(
         self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
     ) -> Float[Tensor, ""]:
-        """`collapsed_bound` of the same with these inducing points (prepared features) of every latent."""
+        """`collapsed_bound` of the same with these inducing points (prepared features) of every latent.
+
+        Where k rows count as one, densities N(a | f, R) are taken to the power of 1/k: N(a | f, k R) times
+        |2 pi k R|^(1/2) / |2 pi R|^(1 / (2 k)), so that learned noise stays that of a row.
+        """
         features, W, residual, noise = self.terms(parameters)
-        return collapsed_bound(W, residual, noise, kernels, parameters, features, points)
+        bound, k = (
+            collapsed_bound(W, residual, noise, kernels, parameters, features, points),
+            self.training.correlated_rows,
+        )
+        if k == 1.0:
+            return bound
+        spread = 2.0 * math.pi * noise  # of k R
+        logs = spread.log().sum(-1) if noise.ndim == 2 else torch.linalg.slogdet(spread).logabsdet
+        rows, outputs = residual.shape
+        return bound - 0.5 * ((1.0 - 1.0 / k) * logs.expand(rows).sum() + rows * outputs * math.log(k) / k)
 
     def condition(
         self,
