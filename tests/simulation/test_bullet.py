@@ -9,6 +9,7 @@ from forcegp.errors import MissingExtra, SimulationError
 from forcegp.robots import Robot
 from forcegp.simulation.bullet import BulletArm
 from forcegp.simulation.kuka_motion import TOOL_LINK, kuka_urdf
+from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 
 pytest.importorskip("pybullet")
 
@@ -17,14 +18,7 @@ STEP = 1.0 / 240.0
 
 
 def urdf(**changes: object) -> str:
-    constants = {
-        "base_height": 0.05,
-        "tool_mass": 2.0,
-        "tool_center_of_mass": (0.01, 0.0, 0.02),
-        "tool_inertia": (0.005, 0.0036, 0.0047),
-        "joint_damping": 0.5,  # in the URDF, but not in the steps
-    }
-    return kuka_urdf(**{**constants, **changes})
+    return kuka_urdf(KukaSurfaceConfig(**{"tool_center_of_mass": (0.01, 0.0, 0.02), **changes}))
 
 
 @pytest.fixture(scope="module")

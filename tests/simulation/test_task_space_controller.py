@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from forcegp.simulation.bullet import ArmState
+from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 from forcegp.simulation.trajectory import TaskSpaceController, rotation_vector
 
 
@@ -37,12 +39,13 @@ def test_the_law_is_the_published_one_with_the_pseudo_inverse():
     rng = np.random.default_rng(0)
     orientation = np.array([0.0, -1.0, 0.0, 0.0])
     posture, selected = rng.normal(size=7), np.array([0, 1, 1, 0, 1, 0, 0.0])
-    controller = TaskSpaceController(30.0, 0.7, orientation, posture, selected, 1e4, 100.0)
+    settings = {"controller_omega": 30.0, "controller_zeta": 0.7, "start_degrees": tuple(np.rad2deg(posture).tolist())}
+    controller = TaskSpaceController(KukaSurfaceConfig(**settings, null_space_joints=(2, 3, 5)))
     for _ in range(20):
         q, v, J, bias = rng.normal(size=7), rng.normal(size=7), rng.normal(size=(6, 7)), rng.normal(size=6)
         position, aim = rng.normal(size=3), tuple(rng.normal(size=(3, 3)))
         present = (values := rng.normal(size=4)) / np.linalg.norm(values)
-        found = controller.joint_acceleration(q, v, J, bias, position, present, aim)
+        found = controller.joint_acceleration(ArmState(q, v, None, None, position, present, J, bias), aim)
 
         velocity = J @ v
         task = np.concatenate(

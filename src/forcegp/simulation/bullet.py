@@ -3,6 +3,7 @@
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,26 @@ class BulletArm:
         how = {"forces": torques.tolist(), **self._client}
         self.bullet.setJointMotorControlArray(self.body, self.joints, self.bullet.TORQUE_CONTROL, **how)
         self.bullet.stepSimulation(**self._client)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmState:
+    """The arm before a step, with what its dynamics and its tool point are there (`BulletArm.tool`)."""
+
+    q: Float[np.ndarray, " nv"]
+    v: Float[np.ndarray, " nv"]
+    mass: Float[np.ndarray, "nv nv"]
+    bias: Float[np.ndarray, " nv"]
+    position: Float[np.ndarray, "3"]
+    quaternion: Float[np.ndarray, "4"]
+    jacobian: Float[np.ndarray, "6 nv"]
+    bias_acceleration: Float[np.ndarray, "6"]
+
+    @staticmethod
+    def of(arm: BulletArm) -> "ArmState":
+        """The present one."""
+        q, v = arm.state()
+        return ArmState(q, v, arm.mass_matrix(q), arm.bias_forces(q, v), *arm.tool(v))
 
 
 def _without_limits_and_damping(urdf: str) -> str:

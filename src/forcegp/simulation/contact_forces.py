@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.errors import InvalidInput, SimulationError
-from forcegp.simulation.bullet import BulletArm
+from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.trajectory import FlatTable, Table
 
 
@@ -101,26 +101,6 @@ class RoughPatch:
         """How many times as large friction is at x [m]."""
         inside = 0.5 * (np.tanh((x - self.lower) / self.width) - np.tanh((x - self.upper) / self.width))
         return float(1.0 + (self.factor - 1.0) * inside)
-
-
-@dataclass(frozen=True, eq=False)
-class ArmState:
-    """The arm before a step, with what its dynamics and its tool point are there (`BulletArm.tool`)."""
-
-    q: Float[np.ndarray, " nv"]
-    v: Float[np.ndarray, " nv"]
-    mass: Float[np.ndarray, "nv nv"]
-    bias: Float[np.ndarray, " nv"]
-    position: Float[np.ndarray, "3"]
-    quaternion: Float[np.ndarray, "4"]
-    jacobian: Float[np.ndarray, "6 nv"]
-    bias_acceleration: Float[np.ndarray, "6"]
-
-    @staticmethod
-    def of(arm: BulletArm) -> "ArmState":
-        """The present one."""
-        q, v = arm.state()
-        return ArmState(q, v, arm.mass_matrix(q), arm.bias_forces(q, v), *arm.tool(v))
 
 
 @dataclass(frozen=True, eq=False)

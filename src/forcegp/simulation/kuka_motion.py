@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.errors import MissingExtra, RobotModelError, SimulationError
-from forcegp.simulation.bullet import BulletArm
+from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import (
-    ArmState,
     BulletContact,
     DryFriction,
     IdealContact,
@@ -29,21 +28,18 @@ TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
 
 
-def kuka_urdf(
-    *,
-    base_height: float,
-    tool_mass: float,
-    tool_center_of_mass: Sequence[float],
-    tool_inertia: Sequence[float],
-    joint_damping: float,
-) -> str:
-    """The URDF with the given inertia of link 7 [kg, m, kg m^2], joint damping [Nms/rad] and base height [m].
+def kuka_urdf(config: KukaSurfaceConfig) -> str:
+    """The URDF with the inertia of link 7, the joint damping and the base height of a scenario.
 
     A link `world` with a fixed joint carries the base. Meshes and materials are left out: no file path may go into a
     Dataset, and collisions are off. The base cannot move and is massless. The licence comment of the original stays at
     the head. Raises MissingExtra without PyBullet.
     """
-    path = _original()
+    try:
+        import pybullet_data
+    except ImportError as error:
+        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
+    path = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
     text = path.read_text(encoding="utf-8")
     root = ElementTree.fromstring(text)
     for unused in root.findall("material"):
@@ -53,27 +49,23 @@ def kuka_urdf(
             if child.tag != "inertial":
                 link.remove(child)
     for dynamics in root.iter("dynamics"):
-        dynamics.set("damping", repr(float(joint_damping)))
+        dynamics.set("damping", repr(config.joint_damping))
     tool, base = (root.find(f"link[@name='{name}']/inertial") for name in (TOOL_LINK, BASE_LINK))
     if tool is None or base is None:
         raise RobotModelError(
             f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia; install pybullet 3.2.6 or 3.2.7."
         )
-    _write_inertial(tool, tool_mass, tool_center_of_mass, tool_inertia)
+    _write_inertial(tool, config.tool_mass, config.tool_center_of_mass, config.tool_inertia)
     _write_inertial(base, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    _mount(root, base_height)
+    joint = (
+        f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
+        f'<origin rpy="0 0 0" xyz="{_numbers((0.0, 0.0, config.base_height))}"/></joint>'
+    )
+    root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
     head = text[: text.index("<robot")]
     changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
     return head + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _original() -> Path:
-    try:
-        import pybullet_data
-    except ImportError as error:
-        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
-    return Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
 
 
 def _write_inertial(
@@ -86,19 +78,10 @@ def _write_inertial(
     )
 
 
-def _mount(root: ElementTree.Element, height: float) -> None:
-    joint = (
-        f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
-        f'<origin rpy="0 0 0" xyz="{_numbers((0.0, 0.0, height))}"/></joint>'
-    )
-    root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
-
-
 def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])  # quaternion (x, y, z, w): the tool points straight down
 STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
@@ -132,7 +115,7 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
-    limits, table, controller = np.array(config.torque_limits), table_of(config), _controller(config)
+    limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
     joint_law = joint_friction_of(config)
     columns: dict[str, np.ndarray] = {}
     if config.contact == "bullet":
@@ -151,9 +134,7 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
             state = ArmState.of(arm)
             v = state.v
             try:
-                wanted = controller.joint_acceleration(
-                    state.q, v, state.jacobian, state.bias_acceleration, state.position, state.quaternion, aim
-                )
+                wanted = controller.joint_acceleration(state, aim)
             except np.linalg.LinAlgError as error:
                 raise SimulationError(
                     f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
@@ -187,20 +168,6 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
     columns["a"] = np.diff(columns["v"], axis=0, append=last_v[None]) / config.time_step
     columns["time"] = config.time_step * np.arange(steps)
     return Motion(**{name: values[settle:] for name, values in columns.items()})
-
-
-def _controller(config: KukaSurfaceConfig) -> TaskSpaceController:
-    selected = np.zeros(7)
-    selected[[joint - 1 for joint in config.null_space_joints]] = 1.0
-    return TaskSpaceController(
-        omega=config.controller_omega,
-        zeta=config.controller_zeta,
-        orientation=TOOL_ORIENTATION,
-        posture=np.deg2rad(config.start_degrees),
-        selected=selected,
-        stiffness=config.null_space_stiffness,
-        damping=config.null_space_damping,
-    )
 
 
 def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> NoContact | IdealContact | BulletContact:

@@ -37,13 +37,7 @@ def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None =
     Raises MissingExtra without PyBullet, and SimulationError if the motion diverges, loses the surface, leaves the
     joint limits or saturates the torques, which the published constants do not do.
     """
-    urdf = kuka_urdf(
-        base_height=config.base_height,
-        tool_mass=config.tool_mass,
-        tool_center_of_mass=config.tool_center_of_mass,
-        tool_inertia=config.tool_inertia,
-        joint_damping=config.joint_damping,
-    )
+    urdf = kuka_urdf(config)
     robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
     motions = []
     for episode in range(config.episodes):

@@ -41,12 +41,6 @@ def require_integer(name: str, value: Any, lower: int, upper: int) -> None:
         raise InvalidInput(f"{name} is {value!r}; it must be an integer from {lower} to {upper}.")
 
 
-def require_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    """Raise InvalidInput naming the field for anything but one of the choices."""
-    if value not in choices:
-        raise InvalidInput(f"{name} is {value!r}; it must be one of {', '.join(choices)}.")
-
-
 Friction = Literal["viscous", "coulomb", "stribeck"]
 JointFriction = Literal["none", "coulomb", "stribeck"]
 Surface = Literal["plane", "tilted", "sphere", "none"]
@@ -204,7 +198,9 @@ class KukaSurfaceConfig:
         if self.friction is None:
             object.__setattr__(self, "friction", "coulomb" if self.contact == "bullet" else "viscous")
         for name, choices in _CHOICES.items():
-            require_choice(name, getattr(self, name), get_args(choices))
+            if getattr(self, name) not in get_args(choices):
+                allowed = ", ".join(get_args(choices))
+                raise InvalidInput(f"{name} is {getattr(self, name)!r}; it must be one of {allowed}.")
         self._require_parts_that_fit()
 
     def _require_parts_that_fit(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 import forcegp.mechanics
+from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 
 Heights = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]
@@ -203,46 +204,39 @@ def random_path(
     return SegmentPath(corners, times, accelerations)
 
 
-@dataclass(frozen=True, eq=False)
+TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])  # quaternion (x, y, z, w): the tool points straight down
+
+
 class TaskSpaceController:
     """Resolved-acceleration control (Siciliano et al., Robotics, section 8.6.2) with a null-space posture.
 
     With `e` the error of the tool (translation; rotation vector), the commanded joint acceleration is
     `J^+ (x_ref'' + 2 zeta omega e' + omega^2 e - Jdot v) + (I - J^+ J) S (K (q_0 - q) - D v)`; `S` selects joints.
     It compensates inertia, gravity and joint damping, but neither the surface nor its friction.
-
-    omega [rad/s], zeta: error dynamics; orientation: (4,) quaternion (x, y, z, w) of the tool frame that is held;
-    posture: (nv,) `q_0` [rad]; selected: (nv,) diagonal of `S`; stiffness `K` [1/s^2]; damping `D` [1/s].
     """
 
-    omega: float
-    zeta: float
-    orientation: Float[np.ndarray, "4"]
-    posture: Float[np.ndarray, " nv"]
-    selected: Float[np.ndarray, " nv"]
-    stiffness: float
-    damping: float
+    def __init__(self, config: KukaSurfaceConfig) -> None:
+        self.omega, self.zeta = config.controller_omega, config.controller_zeta
+        self.stiffness, self.damping = config.null_space_stiffness, config.null_space_damping
+        self.posture = np.deg2rad(config.start_degrees)
+        self.selected = np.isin(np.arange(1, 8), config.null_space_joints).astype(np.float64)
 
     def joint_acceleration(
         self,
-        q: Float[np.ndarray, " nv"],
-        v: Float[np.ndarray, " nv"],
-        jacobian: Float[np.ndarray, "6 nv"],
-        bias_acceleration: Float[np.ndarray, "6"],
-        position: Float[np.ndarray, "3"],
-        quaternion: Float[np.ndarray, "4"],
+        state: ArmState,
         reference: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
     ) -> Float[np.ndarray, " nv"]:
         """Commanded joint acceleration [rad/s^2]; `reference` is the aimed position, velocity and acceleration."""
         aim, aim_velocity, aim_acceleration = reference
-        velocity = jacobian @ v
+        jacobian = state.jacobian
+        velocity = jacobian @ state.v
         task = np.empty(6)
         gain = 2.0 * self.zeta * self.omega
-        task[:3] = aim_acceleration + gain * (aim_velocity - velocity[:3]) + self.omega**2 * (aim - position)
-        task[3:] = -gain * velocity[3:] + self.omega**2 * rotation_vector(self.orientation, quaternion)
-        posture = self.selected * (self.stiffness * (self.posture - q) - self.damping * v)
+        task[:3] = aim_acceleration + gain * (aim_velocity - velocity[:3]) + self.omega**2 * (aim - state.position)
+        task[3:] = -gain * velocity[3:] + self.omega**2 * rotation_vector(TOOL_ORIENTATION, state.quaternion)
+        posture = self.selected * (self.stiffness * (self.posture - state.q) - self.damping * state.v)
         # J^+ (task - Jdot v) + (I - J^+ J) posture, with J^+ = J^T (J J^T)^-1
-        residual = task - bias_acceleration - jacobian @ posture
+        residual = task - state.bias_acceleration - jacobian @ posture
         return posture + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, residual)
 
 
