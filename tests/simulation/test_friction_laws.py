@@ -2,16 +2,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from forcegp.errors import SimulationError
+from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import (
     DryFriction,
-    JointStribeckFriction,
     RoughPatch,
     ViscousFriction,
     multiplier_with_friction,
 )
+from forcegp.simulation.joint_friction import OF_VELOCITY, JointFrictionLaw
 
 STRIBECK = DryFriction(coulomb=0.3, static=0.5, stribeck_velocity=0.1, smoothing=1e-6)
 UP = np.array([0.0, 0.0, 1.0])
@@ -28,9 +30,12 @@ def test_dry_friction_at_speeds_known_by_hand():
 
 
 def test_joint_friction_and_the_patch_at_values_known_by_hand():
-    law = JointStribeckFriction(np.array([2.0, 1.0]), np.array([3.0, 1.0]), np.array([0.5, 0.0]), 0.2, 1e-6)
-    np.testing.assert_allclose(law.force(np.array([0.2, -10.0])), [-(2.0 + 1.0 / np.e + 0.1), 1.0], atol=1e-12)
-    np.testing.assert_allclose(law.force(np.array([[-10.0, 0.0]])), [[7.0, 0.0]], atol=1e-12)
+    law = joint_law("stribeck", joint_smoothing=1e-6)
+    np.testing.assert_allclose(law.curve(v := np.full(7, 0.2)), C + (S - C) / np.e + D * v, atol=1e-12)
+    np.testing.assert_allclose(law.curve(np.full((1, 7), -10.0)), [-C - 10.0 * D], atol=1e-12)
+    np.testing.assert_array_equal(law.step(v, U, INERTIA, 3.0), -law.curve(v))
+    law = joint_law("exponential", joint_smoothing=1e-6, joint_stribeck_velocity=0.5)
+    np.testing.assert_allclose(law.curve(np.full(7, -1.0)), -(C + (S - C) * np.exp(-2.0) + D), atol=1e-12)
     patch = RoughPatch(0.0, 0.25, factor=4.0)
     np.testing.assert_allclose([patch.scale(x) for x in (-0.1, 0.0, 0.1, 0.25, 0.4)], [1, 2.5, 4, 2.5, 1], atol=1e-12)
 
@@ -46,8 +51,58 @@ def test_friction_takes_energy_and_dry_friction_is_tangential_with_its_coefficie
     assert abs(force @ normal) < 1e-11
     speed = np.linalg.norm(velocity - (velocity @ normal) * normal)
     assert np.linalg.norm(force) == pytest.approx(float(dry.coefficient(np.array(speed))), abs=1e-11)
-    joints = JointStribeckFriction(np.full(3, 1.0), np.full(3, 2.0), np.full(3, 0.1), 0.2, smoothing)
-    assert (joints.force(velocity) * velocity <= 0.0).all()
+    v = np.resize(velocity, 7)
+    for name in (*OF_VELOCITY, "load", "drift"):
+        assert (joint_law(name, joint_smoothing=smoothing).step(v, U, INERTIA, 1.0) * v <= 0.0).all()
+
+
+def joint_law(name: str, **changes) -> JointFrictionLaw:
+    return JointFrictionLaw(KukaSurfaceConfig(joint_friction=name, **changes))
+
+
+C, S, D = (np.array(getattr(KukaSurfaceConfig(), f"joint_{name}")) for name in ("coulomb", "static", "viscous"))
+U, INERTIA, DT = np.linspace(-30.0, 40.0, 7), np.diag(np.linspace(2.0, 0.1, 7)), KukaSurfaceConfig().time_step
+
+
+def test_a_hard_sign_differs_by_direction_and_stops_a_joint_without_turning_it_round():
+    law = joint_law("asymmetric", joint_asymmetry=0.5)
+    np.testing.assert_allclose(law.step(np.full(7, 2.0), U, INERTIA, 0.0), -C - 2.0 * D)
+    np.testing.assert_allclose(law.step(np.full(7, -2.0), U, INERTIA, 0.0), 0.5 * C + 2.0 * D)
+    slow = np.full(7, 1e-6)
+    stopped = slow + DT * (law.step(slow, U, INERTIA, 0.0) + D * slow) / INERTIA.diagonal()
+    np.testing.assert_allclose(stopped, 0.0, atol=1e-15)
+
+
+def test_friction_under_load_is_larger_where_the_torque_drives():
+    law, v = joint_law("load", joint_load=(0.1, 0.02), joint_smoothing=1e-6), np.full(7, 0.5)
+    expected = C + np.where(U > 0.0, 0.1, 0.02) * np.abs(U) + D * v
+    np.testing.assert_allclose(law.step(v, U, INERTIA, 0.0), -expected, atol=1e-12)
+
+
+def test_friction_falls_as_gears_warm_up():
+    law, v = joint_law("drift", joint_drift=(0.4, 10.0), joint_smoothing=1e-6), np.full(7, -0.5)
+    np.testing.assert_allclose(law.step(v, U, INERTIA, 0.0), C - D * v, atol=1e-12)
+    np.testing.assert_allclose(law.step(v, U, INERTIA, 1e3), 0.6 * C - D * v, atol=1e-12)
+    np.testing.assert_allclose(law.step(v, U, INERTIA, 10.0), C * (1.0 - 0.4 * (1.0 - 1.0 / np.e)) - D * v, atol=1e-12)
+
+
+def test_bristles_are_a_spring_before_they_slide_and_follow_the_curve_afterwards():
+    """Against `solve_ivp` of the same law (Canudas de Wit et al. 1995) at a velocity that changes its sign."""
+    v = 0.05
+    law = joint_law("lugre", joint_presliding=0.02)
+    first = [law.step(np.full(7, v), U, INERTIA, 0.0) for _ in range(3)]
+    np.testing.assert_allclose(first[0], -D * v, atol=1e-12)
+    np.testing.assert_allclose(first[1], -C / 0.02 * v * DT - D * v, rtol=0.02)
+    for _ in range(5000):
+        sliding = law.step(np.full(7, v), U, INERTIA, 0.0)
+    level = C + (S - C) * np.exp(-((v / 0.2) ** 2))
+    np.testing.assert_allclose(sliding, -level - D * v, rtol=1e-9)
+    stiffness = C[0] / 0.02
+    tight = {"rtol": 1e-10, "atol": 1e-14}
+    back = solve_ivp(lambda t, z: -v - stiffness * v / level[0] * z, (0.0, 50 * DT), [level[0] / stiffness], **tight)
+    for _ in range(51):
+        reversing = law.step(np.full(7, -v), U, INERTIA, 0.0)
+    assert reversing[0] == pytest.approx(-stiffness * back.y[0, -1] + D[0] * v, rel=1e-6)
 
 
 def problem(seed: int):

@@ -8,7 +8,8 @@ from tests.data.samples import assert_equal
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, SimulationError
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.simulation.contact_forces import DryFriction, JointStribeckFriction, RoughPatch
+from forcegp.simulation.contact_forces import DryFriction, RoughPatch
+from forcegp.simulation.joint_friction import JointFrictionLaw
 
 pytest.importorskip("pybullet")
 
@@ -93,15 +94,10 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
     assert 10.0 < np.median(load) < 40.0
 
 
-@pytest.mark.parametrize(("scene", "near_rest"), [("none", "joint_static"), ("coulomb-joints", "joint_coulomb")])
-def test_joint_friction_is_its_law(scenes, scene, near_rest):
-    data, made = scenes[scene], config(scene)
-    law = JointStribeckFriction(
-        *map(np.array, (made.joint_coulomb, getattr(made, near_rest), made.joint_viscous)),
-        stribeck_velocity=made.joint_stribeck_velocity,
-        smoothing=made.joint_smoothing,
-    )
-    np.testing.assert_array_equal(data.truth["Q_U.joint-friction"], law.force(data.v))
+@pytest.mark.parametrize("scene", ["none", "coulomb-joints"])
+def test_joint_friction_is_its_law(scenes, scene):
+    data = scenes[scene]
+    np.testing.assert_array_equal(data.truth["Q_U.joint-friction"], -JointFrictionLaw(config(scene)).curve(data.v))
 
 
 def test_the_patch_multiplies_viscous_friction_where_it_lies(scenes):

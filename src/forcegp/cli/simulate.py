@@ -49,8 +49,11 @@ class Simulate(Command):
     coulomb or stribeck. Default: viscous; coulomb with --contact bullet, which has no other."""
     friction_coefficient: Annotated[float | None, arg(metavar="F")] = None
     """Viscous in N/(m/s), default 1; coulomb and stribeck: friction per normal force while sliding, default 0.3."""
-    joint_friction: Literal["none", "coulomb", "stribeck"] = "none"
-    """Friction of the joints that nobody models either: dry and viscous, with stribeck more near rest."""
+    joint_friction: Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"] = (
+        "none"
+    )
+    """Friction of the joints that nobody models either: dry and viscous, with stribeck and exponential more near rest;
+    asymmetric, load, lugre and drift have no kernel of their own."""
     patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """Makes friction so many times as large on the strip 0 < x < 0.25 m of the surface; 1 for none."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"

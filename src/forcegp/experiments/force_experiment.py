@@ -33,6 +33,16 @@ _SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "tilted-joints": ("tilted plane", {"surface": "tilted", "joint_friction": "stribeck"}),
     "sphere-joints": ("sphere", {"surface": "sphere", "joint_friction": "stribeck"}),
     "free-joints": ("free motion", {"surface": "none", "joint_friction": "stribeck"}),
+    **{
+        f"{law}-joints": (label, {"surface": "none", "joint_friction": law})
+        for law, label in {
+            "exponential": "exponential Stribeck friction",
+            "asymmetric": "another dry friction backwards, hard sign",
+            "load": "dry friction that grows with the torque, more where it drives",
+            "lugre": "bristles that yield before they slide (LuGre)",
+            "drift": "dry friction that falls by 30 % as the gears warm up",
+        }.items()
+    },
     "bullet": ("PyBullet's unilateral contact", {"contact": "bullet"}),
     "patch": ("viscous, four times as much on a strip", {"patch_factor": 4.0}),
 }
@@ -156,6 +166,7 @@ COLUMNS = {
     "mae_noise_free": ("MAE noise-free", 4),
     "nlpd": ("NLPD", 2),
     "coverage_95": ("in 95 % band", 3),
+    "coverage_95_noise_free": ("truth in 95 % band", 3),
     "normal_force_error": ("normal force, relative RMSE", 4),
     "normal_force_coverage": ("normal force in 95 % band", 3),
     "component_sum_error": ("sum of components [Nm]", 4),

@@ -1,6 +1,7 @@
 """Jobs of the experiments on force priors: simulate one trajectory, fit one model, score it on several."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,17 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
 from forcegp.experiments.data import farthest, simulated
 from forcegp.experiments.extrapolation_jobs import TEST_X, TRAIN_X, tool_motion
-from forcegp.experiments.fits import MODEL, search_report
+from forcegp.experiments.fits import MODEL, START_FRICTION, search_report
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
-from forcegp.models import IndependentGP, StructuredGP, save_posterior
+from forcegp.mechanics import CoulombJointFriction, ViscousJointFriction
+from forcegp.models import Coefficients, IndependentGP, StructuredGP, save_posterior
 from forcegp.models.structured.components import term_slices
-from forcegp.priors import ContactFriction, JointFriction, named_prior
+from forcegp.priors import ContactFriction, JointFriction, NoForces, named_prior
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
-from forcegp.simulation.kuka_motion import joint_friction_of, tool_friction_of
+from forcegp.simulation.joint_friction import OF_VELOCITY, JointFrictionLaw
+from forcegp.simulation.kuka_motion import tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]
 
@@ -42,7 +45,8 @@ def true_curves(posterior: Any) -> dict[str, Law]:
     for _, term, which in term_slices(prior, system.robot):
         if isinstance(term, JointFriction):
             for joint, name in zip(term.latent_names(system.robot), names[which], strict=True):
-                out[name] = _joint_law(config, system.robot.joint_names.index(joint))
+                law = _joint_law(config, system.robot.joint_names.index(joint))
+                out |= {} if law is None else {name: law}
         elif isinstance(term, ContactFriction) and term.axes == "isotropic" and term.inputs == ("velocity",):
             law = _tool_law(config, term.load)
             if law is not None:
@@ -50,11 +54,13 @@ def true_curves(posterior: Any) -> dict[str, Law]:
     return out
 
 
-def _joint_law(config: KukaSurfaceConfig, joint: int) -> Law:
-    law = joint_friction_of(config)
-    if law is None:
+def _joint_law(config: KukaSurfaceConfig, joint: int) -> Law | None:
+    if config.joint_friction == "none":
         return np.zeros_like
-    return lambda v: -law.force(np.asarray(v)[:, None] * np.ones(len(law.coulomb)))[:, joint]
+    if config.joint_friction not in OF_VELOCITY:
+        return None
+    law = JointFrictionLaw(config)
+    return lambda v: law.curve(np.asarray(v)[:, None] * np.ones(len(law.coulomb)))[:, joint]
 
 
 def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
@@ -69,8 +75,9 @@ def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
 
 
 FILE = "data.h5"
-BLACK_BOX, KNOWN_PHYSICS = "independent-gp", "none"
-"""Models of the trials that are no prior expressions: a Gaussian process per joint, and no unknown force at all."""
+BLACK_BOX, KNOWN_PHYSICS, LAWS = "independent-gp", "none", "joint-laws"
+"""Models of the trials that are no prior expressions: a Gaussian process per joint, no unknown force at all, and
+Coulomb's and viscous friction of every joint by maximum likelihood, with the smooth sign of the scenario."""
 
 
 def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -126,6 +133,12 @@ def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
     how = {"seed": spec["seed"], "restarts": spec["restarts"], "options": options}
     if spec["prior"] == BLACK_BOX:
         return IndependentGP(system).fit(train, **how)
+    if spec["prior"] == LAWS:
+        smoothing = train.metadata["config"]["joint_smoothing"]
+        laws = ViscousJointFriction(START_FRICTION), CoulombJointFriction(START_FRICTION, smoothing)
+        with_laws = replace(system, known_forces=(*system.known_forces, *laws))
+        learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
+        return StructuredGP(with_laws, NoForces()).identify(train, learn, **how)
     return StructuredGP(system, named_prior(spec["prior"], system), spec["mean"]).fit(train, **how)
 
 
@@ -135,7 +148,8 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     if posterior.predicts_forces:
         posterior = posterior.with_system(test.system)
     out = evaluate(posterior, test).to_dict()
-    kept = {name: out[name] for name in ("mae", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae")}
+    names = ("mae", "mae_noise_free", "nlpd", "coverage_95", "coverage_95_noise_free", "known_physics_mae")
+    kept = {name: out[name] for name in names}
     if "a" in test.truth:  # what nothing can be better than on these rows
         kept["mae_of_truth"] = float(np.abs(test.truth["a"] - test.a).mean())
     if "in_contact" in test.truth:

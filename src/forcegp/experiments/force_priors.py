@@ -25,7 +25,7 @@ from forcegp.experiments.force_experiment import (
     trial_name,
     trials_on,
 )
-from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS, MODEL, load
+from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS, LAWS, MODEL, load
 from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 
@@ -160,6 +160,43 @@ class Friction(ForceExperiment):
             ]
             if curves:
                 parts.append(f"Curve in its band: {'; '.join(curves)}.")
+        return "\n\n".join(parts)
+
+
+OTHER_LAWS = tuple(f"{law}-joints" for law in ("exponential", "asymmetric", "load", "lugre", "drift"))
+RIVALS = {
+    "known physics alone": KNOWN_PHYSICS,
+    "Coulomb's and viscous friction of every joint": LAWS,
+    "independent GP": BLACK_BOX,
+    "GP on what known physics leaves": "joint-accelerations",
+    JOINT_FORCES: "joint",
+    "joint friction": "joint-friction",
+}
+
+
+@dataclass(frozen=True)
+class OtherLaws(ForceExperiment):
+    """Friction of the joints by laws that the kernel of `JointFriction` does not contain, and parametric rivals."""
+
+    name, title = "other-laws", "Laws that are not the kernel's"
+
+    @override
+    def trials(self) -> list[Trial]:
+        return [
+            Trial(label, law, prior, n) for law in OTHER_LAWS for label, prior in RIVALS.items() for n in self.points
+        ]
+
+    @override
+    def section(self, summary: Mapping[str, Any]) -> str:
+        parts = [
+            f"Free motion, analytical mean, {', '.join(map(str, self.points))} points, {len(self.seeds)} seeds. The "
+            "Stribeck friction of the tables above is of the form of the kernel, tanh(v / w) times a curve plus d v; "
+            "these laws are not, but for the first. The rival with Coulomb's and viscous friction is fitted by maximum "
+            "likelihood and knows how smooth the sign is."
+        ]
+        columns = ("mae", "mae_noise_free", "nlpd", "coverage_95", "coverage_95_noise_free")
+        for law in OTHER_LAWS:
+            parts += [heading(LABELS[law]), score_table(trials_on(law, summary), columns)]
         return "\n\n".join(parts)
 
 

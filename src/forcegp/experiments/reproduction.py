@@ -21,7 +21,14 @@ from forcegp.experiments.fig2c import Fig2c
 from forcegp.experiments.fig3 import Fig3
 from forcegp.experiments.fig4 import Fig4
 from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.force_priors import DataEfficiency, DeepKernel, Friction, Transfer, UnilateralContact
+from forcegp.experiments.force_priors import (
+    DataEfficiency,
+    DeepKernel,
+    Friction,
+    OtherLaws,
+    Transfer,
+    UnilateralContact,
+)
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
 
@@ -67,13 +74,17 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
     "forces": (
         DataEfficiency(points=(10, 20, 50, 100), **FORCES),
         Friction(points=(200,), **FORCES),
+        OtherLaws(points=(200,), **FORCES),
         Transfer(points=(100,), **FORCES),
         UnilateralContact(points=(200,), **FORCES),
         DeepKernel(points=(200,), **FORCES),
     ),
     "forces-smoke": (
         DataEfficiency(points=(10, 20), region_points=SMOKE_POINTS[0], **FORCES_SMOKE),
-        *(kind(points=(20,), **FORCES_SMOKE) for kind in (Friction, Transfer, UnilateralContact, DeepKernel)),
+        *(
+            kind(points=(20,), **FORCES_SMOKE)
+            for kind in (Friction, OtherLaws, Transfer, UnilateralContact, DeepKernel)
+        ),
     ),
 }
 

@@ -63,28 +63,6 @@ class DryFriction:
 PointFriction = ViscousFriction | DryFriction
 
 
-@dataclass(frozen=True, eq=False)
-class JointStribeckFriction:
-    """`Q_i = -[tanh(v_i / smoothing) (c_i + (s_i - c_i) exp(-(v_i / stribeck_velocity)^2)) + d_i v_i]` [Nm].
-
-    Coulomb, Stribeck and viscous friction of every joint (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, section 2.1;
-    Olsson et al. 1998, section 2.1), tanh for the sign.
-
-    coulomb c, static s: (nv,) [Nm]; viscous d: (nv,) [Nms/rad]; stribeck_velocity, smoothing: [rad/s].
-    """
-
-    coulomb: Float[np.ndarray, " nv"]
-    static: Float[np.ndarray, " nv"]
-    viscous: Float[np.ndarray, " nv"]
-    stribeck_velocity: float
-    smoothing: float
-
-    def force(self, v: Float[np.ndarray, "*batch nv"]) -> Float[np.ndarray, "*batch nv"]:
-        """Joint torques [Nm] at joint velocities [rad/s]; `force_i v_i <= 0`."""
-        level = self.coulomb + (self.static - self.coulomb) * np.exp(-((v / self.stribeck_velocity) ** 2))
-        return -(np.tanh(v / self.smoothing) * level + self.viscous * v)
-
-
 @dataclass(frozen=True)
 class RoughPatch:
     """A strip of the table, `lower < x < upper`, where friction is `factor` times as large; edges some mm wide.

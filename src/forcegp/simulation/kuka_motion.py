@@ -14,13 +14,13 @@ from forcegp.simulation.contact_forces import (
     BulletContact,
     DryFriction,
     IdealContact,
-    JointStribeckFriction,
     NoContact,
     PointFriction,
     RoughPatch,
     ViscousFriction,
     with_tool_sphere,
 )
+from forcegp.simulation.joint_friction import JointFrictionLaw
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
 
@@ -116,7 +116,7 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
-    joint_law = joint_friction_of(config)
+    joint_law = None if config.joint_friction == "none" else JointFrictionLaw(config)
     columns: dict[str, np.ndarray] = {}
     if config.contact == "bullet":
         urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
@@ -145,7 +145,8 @@ def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report:
                 asked = asked - config.pressing_force * (table.normal(state.position) @ state.jacobian[:3])
             commanded = np.clip(asked, -limits, limits)
             u = commanded - config.joint_damping * v
-            joint_torques = np.zeros(7) if joint_law is None else joint_law.force(v)
+            now = step * config.time_step
+            joint_torques = np.zeros(7) if joint_law is None else joint_law.step(v, u, state.mass, now)
             forces = contact.step(arm, state, u + joint_torques)
             row = {"q": state.q, "v": v, "u": u, "joint_torques": joint_torques}
             row |= {"tool_force": forces.friction, "tool_torques": forces.joint_friction_torques}
@@ -185,15 +186,6 @@ def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
         return ViscousFriction(config.viscous_coefficient)
     static = config.static_coefficient if config.friction == "stribeck" else config.coulomb_coefficient
     return DryFriction(config.coulomb_coefficient, static, config.stribeck_velocity, config.friction_smoothing)
-
-
-def joint_friction_of(config: KukaSurfaceConfig) -> JointStribeckFriction | None:
-    """The law of the joints beyond what is subtracted from `u`; None without one."""
-    if config.joint_friction == "none":
-        return None
-    near_rest = config.joint_static if config.joint_friction == "stribeck" else config.joint_coulomb
-    coulomb, static, viscous = map(np.array, (config.joint_coulomb, near_rest, config.joint_viscous))
-    return JointStribeckFriction(coulomb, static, viscous, config.joint_stribeck_velocity, config.joint_smoothing)
 
 
 def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:

@@ -42,7 +42,7 @@ def require_integer(name: str, value: Any, lower: int, upper: int) -> None:
 
 
 Friction = Literal["viscous", "coulomb", "stribeck"]
-JointFriction = Literal["none", "coulomb", "stribeck"]
+JointFriction = Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"]
 Surface = Literal["plane", "tilted", "sphere", "none"]
 ContactKind = Literal["ideal", "bullet"]
 
@@ -129,18 +129,28 @@ class KukaSurfaceConfig:
     """The patch is the strip of the surface with x in this range [m]."""
     joint_friction: JointFriction = "none"
     """Friction of the joints that is not part of `u`, in addition to the force at the tool: Coulomb friction and
-    viscous friction, with "stribeck" more near rest."""
+    viscous friction, with "stribeck" and "exponential" more near rest. Of "asymmetric" (another force backwards, a hard
+    sign), "load", "lugre" (bristles that yield before they slide) and "drift" no kernel of `JointFriction` is the law
+    (`JointFrictionLaw`)."""
     joint_coulomb: tuple[float, float, float, float, float, float, float] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)
     """Coulomb friction of every joint [Nm]; small in the wrist, whose inertia carries no motors here: explicit steps
     would oscillate under more."""
     joint_static: tuple[float, float, float, float, float, float, float] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)
-    """Friction of every joint near rest [Nm] (stribeck only)."""
+    """Friction of every joint near rest [Nm] (stribeck, exponential and lugre)."""
     joint_viscous: tuple[float, float, float, float, float, float, float] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)
     """Viscous friction of every joint [Nms/rad] beyond `joint_damping`."""
     joint_stribeck_velocity: float = 0.2
     """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
     joint_smoothing: float = 0.1
-    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign, see `JointStribeckFriction`."""
+    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign, see `JointFrictionLaw`."""
+    joint_asymmetry: float = 0.7
+    """Coulomb friction backwards over that forwards (asymmetric only)."""
+    joint_load: tuple[float, float] = (0.04, 0.015)
+    """Friction per applied torque of a joint that is driven, and of one that is driven back (load only)."""
+    joint_presliding: float = 0.01
+    """How far a joint gives before it slides [rad] (lugre only)."""
+    joint_drift: tuple[float, float] = (0.3, 60.0)
+    """Share of Coulomb friction that is lost as the gears warm up, and over how many seconds (drift only)."""
     baumgarte_omega: float = 10.0
     """Natural frequency of the constraint's stabilisation [rad/s]."""
     baumgarte_zeta: float = 1.0
@@ -262,12 +272,19 @@ class KukaSurfaceConfig:
 
 _POSITIVE = (
     *("tool_mass", "tool_inertia", "clearance", "stribeck_velocity", "friction_smoothing", "joint_stribeck_velocity"),
-    *("joint_smoothing", "torque_limits", "controller_omega", "least_acceleration"),
+    *("joint_presliding", "joint_smoothing", "torque_limits", "controller_omega", "least_acceleration"),
 )
 _NOT_NEGATIVE = (
     *("noise", "joint_damping", "viscous_coefficient", "coulomb_coefficient", "static_coefficient", "patch_factor"),
     *("press", "lift_height", "joint_coulomb", "joint_static", "joint_viscous", "baumgarte_omega", "baumgarte_zeta"),
-    *("controller_zeta", "null_space_stiffness", "null_space_damping", "waypoint_depth"),
+    *(
+        "joint_asymmetry",
+        "joint_load",
+        "controller_zeta",
+        "null_space_stiffness",
+        "null_space_damping",
+        "waypoint_depth",
+    ),
 )
 _FINITE = (
     *("gravity", "base_height", "tool_center_of_mass", "tool_point", "surface_height", "tilt_axis", "patch_x"),
@@ -280,6 +297,7 @@ _RANGES: dict[str, Range] = {
     "tilt_degrees": ("from -30 to 30", -30.0, 30.0),
     "sphere_radius": ("from 1 to 1e6 m", 1.0, 1e6),
     "lift_share": ("from 0 to 1", 0.0, 1.0),
+    "joint_drift": ("> 0", 1e-12, 1e9),
     "segment_seconds": ("from 0.05 to 100 s", 0.05, 100.0),
     **dict.fromkeys(_POSITIVE, POSITIVE),
     **dict.fromkeys(_NOT_NEGATIVE, NOT_NEGATIVE),
