@@ -89,11 +89,13 @@ def test_prepare_writes_what_it_says(forcegp, folder):
 
 
 REFUSALS = {
-    ("prepare", "noisy.h5", "--out", "x.h5"): "nothing to do: give --cutoff, --delay, --every or --trim",
+    ("prepare", "noisy.h5", "--out", "x.h5"): "nothing to do: give --cutoff, --delay, --lag, --every or --trim",
     ("prepare", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
     ("prepare", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
     ("prepare", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
     ("prepare", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
+    ("prepare", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",
+    ("prepare", "noisy.h5", "--lag", "auto", "--delay", "each", "--out", "x.h5"): "give one of them in s",
     ("prepare", "noisy.h5", "--every", "0", "--out", "x.h5"): "every is 0",
     ("prepare", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("prepare", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 is not a file",

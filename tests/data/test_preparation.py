@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 from scipy.signal import butter
 from tests.data.samples import assert_equal, dataset
 from tests.models.arm import arm_system
@@ -20,6 +21,7 @@ from forcegp.data import (
     low_pass,
     motion_spectrum,
 )
+from forcegp.data.delay import lagged
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 
 RATE = 500.0
@@ -176,6 +178,56 @@ def test_what_a_delay_needs_is_said():
         estimate_delay(noisy()[0], arm_system().robot)
 
 
+# ---------------------------------------------------------------- lag
+
+
+def commanded(*lags: float) -> Dataset:
+    """The log of the arm with commands that actuators of first order follow: u_c = u + T u'."""
+    data = arm_log(noise=0.0)
+    return replace(data, u=data.u + np.array(lags) * np.gradient(data.u, data.time, axis=0))
+
+
+def test_an_actuator_of_first_order_is_that_of_its_differential_equation():
+    time = 0.002 * np.arange(1000)
+    command = np.sin(9.0 * time) + (time > 0.5)
+    exact = solve_ivp(
+        lambda t, x: (np.interp(t, time, command) - x) / 0.07,
+        (0.0, time[-1]),
+        [command[0]],
+        t_eval=time,
+        max_step=0.002,
+    )
+    np.testing.assert_allclose(lagged(command, time, 0.07), exact.y[0], atol=5e-4)
+    assert lagged(command, time, 0.0) is command
+
+
+@pytest.mark.parametrize("lag", [0.01, 0.04, 0.1])
+def test_a_lag_is_found_and_undone(lag):
+    data, given = commanded(lag, lag, lag), arm_log(noise=0.0)
+    found = estimate_delay(data, kind="lag")
+    assert found.significant == pytest.approx(lag, rel=0.08)
+    prepared = Preparation(lag="auto").apply(data)
+    assert prepared.report["lag"] == [found.significant] * 3
+    assert prepared.dataset.time[0] == pytest.approx(5.0 * found.significant, abs=0.006)
+    shown = np.abs(prepared.dataset.u - _at(prepared.dataset, given).u)
+    assert float(np.median(shown)) < 0.15 * float(np.median(np.abs(data.u - given.u)))
+
+
+def test_joints_lag_and_are_late_each_for_itself():
+    found = Preparation(lag="each").apply(commanded(0.1, 0.0, 0.03)).report
+    np.testing.assert_allclose(found["lag"], [0.1, 0.0, 0.03], atol=4e-3)
+    data = arm_log(0.0)
+    late = replace(
+        data, u=np.stack([data.u[:, 0], np.interp(data.time - 0.06, data.time, data.u[:, 1]), data.u[:, 2]], 1)
+    )
+    np.testing.assert_allclose(Preparation(delay="each").apply(late).report["delay"], [0.0, 0.06, 0.0], atol=2e-3)
+
+
+def test_no_lag_is_found_without_one():
+    for seed in range(4):
+        assert estimate_delay(arm_log(0.0, seed=seed), kind="lag").significant == 0.0
+
+
 # ---------------------------------------------------------------- preparation
 
 
@@ -229,10 +281,12 @@ def test_the_price_is_the_noise_that_is_left():
     np.testing.assert_allclose(prepared.report["power_removed"]["a"], removed)
 
 
-@pytest.mark.parametrize(("cutoff", "delay", "seed"), [(6.0, 0.013, 0), (20.0, -0.0037, 1), (80.0, 0.0, 2)])
-def test_pieces_with_their_halo_are_the_whole(cutoff, delay, seed):
+@pytest.mark.parametrize(
+    ("cutoff", "late", "seed"), [(6.0, {"delay": 0.013}, 0), (20.0, {"delay": -0.0037}, 1), (80.0, {"lag": 0.02}, 2)]
+)
+def test_pieces_with_their_halo_are_the_whole(cutoff, late, seed):
     data, _ = noisy(4.0, seed)
-    preparation = Preparation(cutoff=cutoff, delay=delay)
+    preparation = Preparation(cutoff=cutoff, **late)
     whole = preparation.apply(data).dataset
     reach = round(preparation.halo * RATE) + 24
     first, last = 900, 1100

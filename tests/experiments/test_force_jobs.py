@@ -102,7 +102,9 @@ def test_black_boxes_are_scored_on_accelerations_alone(rubbing):
     _, test = rubbing
     black_box = IndependentGP(test.system).fit(test, options=OptimizerOptions(iterations=0))
     found = force_jobs.scores(black_box, test)
-    assert set(found) == {"mae", "mae_of_truth", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae"} | {"coverage_95_noise_free"}
+    assert set(found) == {"mae", "mae_of_truth", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae"} | {
+        "coverage_95_noise_free"
+    }
     assert force_jobs.curve_scores(black_box) == {}
 
 

@@ -34,7 +34,7 @@ class Import(PreparationOptions, RobotOptions):
     State which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or
     in a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
     pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered unless
-    --cutoff, --delay, --every or --trim is given.
+    --cutoff, --delay, --lag, --every or --trim is given.
 
     For instance:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
@@ -176,7 +176,7 @@ def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[s
     import torch  # 2 s that only a preparation costs
 
     required = COPIES * path.stat().st_size
-    remedy = "import without --cutoff, --delay, --every and --trim, or fewer logs at once."
+    remedy = "import without --cutoff, --delay, --lag, --every and --trim, or fewer logs at once."
     forcegp.inference.require_memory(required, f"preparing {rows} rows", remedy, torch.device("cpu"))
     prepared = preparation.apply(forcegp.Dataset.load(path))
     prepared.dataset.save(path)
@@ -215,10 +215,10 @@ def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
         )
     if "preparation" in done:
         report = done["preparation"]
-        for name in ("cutoff", "delay"):
+        for name in ("cutoff", "delay", "lag"):
             if name in report["why"]:
                 terminal.note(f"{name}: {report['why'][name]}")
-        settings = ", ".join(f"{name} {report[name]}" for name in ("cutoff", "delay", "every", "trim"))
+        settings = ", ".join(f"{name} {report[name]}" for name in ("cutoff", "delay", "lag", "every", "trim"))
         terminal.note(f"prepared: {settings}; {report['rows'][0]} rows became {report['rows'][1]}")
     how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
     if done.get("preparation", {}).get("cutoff") is not None:

@@ -205,9 +205,11 @@ class CutoffOptions(Command):
 class PreparationOptions(CutoffOptions):
     """What every command asks that makes rows to learn from out of a raw log."""
 
-    delay: Annotated[str, arg(metavar="S|auto")] = "0"
+    delay: Annotated[str, arg(metavar="S|auto|each")] = "0"
     """How much later than it acts u was logged, in s: one number, or one per joint with commas. auto: estimated for all
-    joints together, which needs the robot."""
+    joints together, each: for each, which need the robot."""
+    lag: Annotated[str, arg(metavar="S|auto|each")] = "0"
+    """Time constant in s with which actuators of first order follow u: as for --delay."""
     every: Annotated[int, arg(metavar="N")] = 1
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0
@@ -215,9 +217,12 @@ class PreparationOptions(CutoffOptions):
 
     @override
     def _preparation(self) -> forcegp.Preparation:
-        delay: float | tuple[float, ...] | Literal["auto"] = "auto"
-        if self.delay != "auto":
-            wrong = "--delay is {!r}; give seconds, one per joint with commas, or auto.".format
-            each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in self.delay.split(","))
-            delay = each[0] if len(each) == 1 else each
-        return replace(super()._preparation(), delay=delay, every=self.every, trim=self.trim)
+        late: dict[str, Any] = {}
+        for name in ("delay", "lag"):
+            given = getattr(self, name)
+            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, auto or each.".format
+            if given not in ("auto", "each"):
+                each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in given.split(","))
+                given = each[0] if len(each) == 1 else each
+            late[name] = given
+        return replace(super()._preparation(), every=self.every, trim=self.trim, **late)

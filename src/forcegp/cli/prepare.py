@@ -49,7 +49,7 @@ class Prepare(PreparationOptions, RobotOptions):
 
         preparation = self._preparation()
         if preparation.changes_nothing:
-            raise InvalidInput("nothing to do: give --cutoff, --delay, --every or --trim.")
+            raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --every or --trim.")
         dataset = forcegp.Dataset.load(self.data)
         if self.robot is not None or self.identified is not None or dataset.system is not None:
             dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
@@ -77,12 +77,13 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
     cutoff = report["cutoff"]
     filtered = "none" if cutoff is None else f"{cutoff:.3g} Hz, order {report['order']}, forwards and backwards"
     values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
-    delays = report["delay"]
-    if any(delays) or "delay" in report["why"]:
-        milliseconds = ", ".join(f"{1e3 * delay:.1f}" for delay in (delays if len(set(delays)) > 1 else delays[:1]))
-        values["delay of u"] = f"{milliseconds} ms" + (
-            f"; {report['why']['delay']}" if "delay" in report["why"] else ""
-        )
+    for name in ("delay", "lag"):
+        seconds, why = report[name], report["why"].get(name)
+        if any(seconds) or why is not None:
+            milliseconds = ", ".join(
+                f"{1e3 * each:.1f}" for each in (seconds if len(set(seconds)) > 1 else seconds[:1])
+            )
+            values[f"{name} of u"] = f"{milliseconds} ms{'' if why is None else f'; {why}'}"
     tables: list[Any] = [facts(f"{out}: prepared", values)]
     if cutoff is None:
         return tables

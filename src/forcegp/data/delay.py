@@ -1,12 +1,17 @@
-"""How much later than the motion a torque was logged: the shift of u at which inverse dynamics fits it best."""
+"""How late torques are: logged later than they act (a delay), or acting later than they are commanded (a lag).
+
+Of both, the number of seconds is taken at which inverse dynamics fits the torques best.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 import forcegp.robots
 from forcegp.data.dataset import Dataset
@@ -30,8 +35,9 @@ WORTH = 0.8
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delay:
-    """Delay of the logged torque behind the motion [s], with standard deviations [s]; NaN where the log shows none.
+    """Delay or lag of the torque and the motion [s], with standard deviations [s]; NaN where the log shows none.
 
+    `kind` is "delay" or "lag".
     `common` is the one delay that suits all joints best: what a bus or a filter does to all of them alike. `seconds`
     (nv,) is that of each joint alone; where friction makes up most of a torque it can be a property of the friction.
     `residual` (2, nv) is the share of the torque's variance that inverse dynamics leaves unexplained, without a shift
@@ -45,6 +51,13 @@ class Delay:
     std: Float[np.ndarray, " nv"]
     residual: Float[np.ndarray, "2 nv"]
     remains: float
+    kind: str = "delay"
+
+    @property
+    def each(self) -> Float[np.ndarray, " nv"]:
+        """That of each joint where it is more than three standard deviations from zero and explains a fifth, else 0."""
+        remains = self.residual[1] / np.maximum(self.residual[0], TINY)
+        return np.where((np.abs(self.seconds) > SIGNIFICANT * self.std) & (remains < WORTH), self.seconds, 0.0)
 
     @property
     def significant(self) -> float:
@@ -59,7 +72,7 @@ class Delay:
     def reason(self) -> str:
         """The common delay and what became of it, for people."""
         if not np.isfinite(self.common):
-            return "the torques show no common delay"
+            return f"the torques show no common {self.kind}"
         size = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms"
         if self.significant:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
@@ -69,7 +82,11 @@ class Delay:
 
 
 def estimate_delay(
-    dataset: Dataset, robot: forcegp.robots.Robot | None = None, *, largest: float = LARGEST_DELAY
+    dataset: Dataset,
+    robot: forcegp.robots.Robot | None = None,
+    *,
+    kind: Literal["delay", "lag"] = "delay",
+    largest: float = LARGEST_DELAY,
 ) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
@@ -77,25 +94,36 @@ def estimate_delay(
     in the joint needs: inertial, centrifugal and gravity torques of `robot` (default: that of `dataset.system`), each
     with a factor of its own, acceleration, velocity and sign of the velocity of the joint, and a constant. So the delay
     does not rest on the robot's parameters being right. The best shift has the least sum of squares, by a parabola
-    through the three smallest: among shifts up to 50 ms and, where it lies at their end, up to `largest`. Its standard
+    through the three smallest: among shifts up to 50 ms and, where it lies at their end, up to `largest`, for each
+    joint and for all together. Its standard
     deviation comes from leaving out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and
     the bootstrap for general stationary observations").
+
+    `kind="lag"` finds the time constant T of an actuator of first order instead: u(t) acts with T u_a' + u_a = u.
 
     Filter first: q, v, u and a must be those of one filter. Raises InvalidInput without a robot, or with contacts,
     whose forces are not known; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
-    near = _estimated(dataset, robot, min(largest, USUAL_DELAY))
-    if np.isfinite(near.common) or largest <= USUAL_DELAY:
+    near = _estimated(dataset, robot, min(largest, USUAL_DELAY), kind)
+    open_ones = np.isnan(near.seconds) & np.isfinite(near.residual[0])
+    if largest <= USUAL_DELAY or not (open_ones.any() or np.isnan(near.common)):
         return near
     try:
-        return _estimated(dataset, robot, largest)
+        far = _estimated(dataset, robot, largest, kind)
     except DatasetError:  # too short for that
         return near
+    if np.isnan(near.common):
+        return far
+    parts = {
+        name: np.where(open_ones, getattr(far, name), getattr(near, name)) for name in ("seconds", "std", "residual")
+    }
+    return replace(near, **parts)
 
 
-def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -> Delay:
-    parts = _shifted(dataset, largest)
+def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, kind: str) -> Delay:
+    parts = _shifted(dataset, largest, kind)
+    zero = int(np.argmin(np.abs(parts.shifts)))
     features = _features(robot, dataset.rows(parts.rows))
     nv = dataset.nv
     profiles = np.full((nv, BLOCKS + 1, len(parts.shifts)), np.nan)  # of all rows, and of all but one block
@@ -106,7 +134,7 @@ def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) ->
         if not spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():
             continue  # a torque that does not change has no delay
         profiles[joint] = _profiles(_orthonormal(features[joint]), shifted)
-        residual[:, joint] = profiles[joint, 0, STEPS] / spread[STEPS], profiles[joint, 0].min() / spread[STEPS]
+        residual[:, joint] = profiles[joint, 0, zero] / spread[zero], profiles[joint, 0].min() / spread[zero]
     seconds = np.array([[lowest(profile, parts.shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
     finite = profiles[np.isfinite(residual[0])]
@@ -119,7 +147,8 @@ def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) ->
         seconds=seconds[:, 0],
         std=_jackknife(seconds[:, 1:]),
         residual=residual,
-        remains=float(np.exp((likelihood.min() - likelihood[STEPS]) / max(len(finite), 1))),
+        remains=float(np.exp((likelihood.min() - likelihood[zero]) / max(len(finite), 1))),
+        kind=kind,
     )
 
 
@@ -148,6 +177,20 @@ def delayed(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"]
     return CubicSpline(time, values)(np.clip(time + seconds, time[0], time[-1]))
 
 
+def lagged(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"], seconds: float) -> np.ndarray:
+    """What an actuator of first order with that time constant makes of `values`, at rest with the first of them.
+
+    By Tustin's rule (trapezoids), exact for values that are linear between equal steps of time up to the square of
+    step over time constant.
+    """
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if seconds <= 0.25 * step:
+        return values
+    ratio = 2.0 * seconds / step
+    moved = lfilter([1.0, 1.0], [1.0 + ratio, 1.0 - ratio], values - values[0])
+    return np.asarray(moved) + values[0]
+
+
 @dataclass(frozen=True)
 class _Shifts:
     """The rows that are compared, and how to shift a torque against them."""
@@ -155,16 +198,21 @@ class _Shifts:
     rows: np.ndarray
     shifts: np.ndarray
     episodes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # rows of the episode, their times, times to compare at
+    kind: str
 
     def torque(self, u: np.ndarray) -> np.ndarray:
-        """(shifts, rows) torque at the rows' times plus each shift."""
+        """(shifts, rows) torque at the rows' times plus each shift, or after each lag."""
         columns = []
         for rows, time, at in self.episodes:
-            columns.append(CubicSpline(time, u[rows])(at + self.shifts[:, None]))
+            if self.kind == "lag":
+                chosen = np.searchsorted(time, at)
+                columns.append(np.stack([lagged(u[rows], time, lag)[chosen] for lag in self.shifts]))
+            else:
+                columns.append(CubicSpline(time, u[rows])(at + self.shifts[:, None]))
         return np.concatenate(columns, axis=1)
 
 
-def _shifted(dataset: Dataset, largest: float) -> _Shifts:
+def _shifted(dataset: Dataset, largest: float, kind: str) -> _Shifts:
     if not 0.0 < largest < np.inf:
         raise InvalidInput(f"the largest delay is {largest} s; it must be positive and finite.")
     thin = max(1, -(-len(dataset) // MOST_ROWS))
@@ -182,7 +230,8 @@ def _shifted(dataset: Dataset, largest: float) -> _Shifts:
             f"{count} rows lie more than {largest} s from the ends of their episodes; a delay needs at least "
             f"{10 * BLOCKS}. Record longer, or give the delay in s."
         )
-    return _Shifts(np.concatenate(rows), np.linspace(-largest, largest, 2 * STEPS + 1), episodes)
+    first, count = (0.0, STEPS + 1) if kind == "lag" else (-largest, 2 * STEPS + 1)
+    return _Shifts(np.concatenate(rows), np.linspace(first, largest, count), episodes, kind)
 
 
 def _features(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows 7"]:

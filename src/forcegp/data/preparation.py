@@ -9,11 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import delayed, estimate_delay
+from forcegp.data.delay import delayed, estimate_delay, lagged
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
+LATE, AUTOMATIC = ("delay", "lag"), ("auto", "each")
+SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""
 
@@ -27,7 +29,10 @@ class Preparation:
         and u as they are.
     order: of the filter; it runs forwards and backwards.
     delay: how much later than it acts u was logged [s], one number or one per joint: `u(t) := u_logged(t + delay)`;
-        "auto" estimates one for all joints (`estimate_delay`), and uses it where it is sure and explains something.
+        "auto" estimates one for all joints, "each" one for each (`estimate_delay`), used where it is sure and explains
+        something.
+    lag: time constant of the actuators [s], one or one per joint: `u` becomes what an actuator of first order makes of
+        it, T u_a' + u_a = u; "auto" and "each" as for the delay. Delay and lag look alike: estimate one of them.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -39,7 +44,8 @@ class Preparation:
 
     cutoff: float | Literal["auto"] | None = None
     order: int = 4
-    delay: float | tuple[float, ...] | Literal["auto"] = 0.0
+    delay: float | tuple[float, ...] | Literal["auto", "each"] = 0.0
+    lag: float | tuple[float, ...] | Literal["auto", "each"] = 0.0
     every: int = 1
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
@@ -50,11 +56,17 @@ class Preparation:
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
         if isinstance(self.order, bool) or not isinstance(self.order, int) or not 1 <= self.order <= 12:
             raise InvalidInput(f"order is {self.order!r}; it must be an integer from 1 to 12.")
-        if isinstance(self.delay, Sequence | np.ndarray) and not isinstance(self.delay, str):
-            object.__setattr__(self, "delay", tuple(self.delay))
-        each = self.delay if isinstance(self.delay, tuple) else (self.delay,)
-        if self.delay != "auto" and not (each and all(_finite(value) for value in each)):
-            raise InvalidInput(f"delay is {self.delay!r}; give seconds, one number per joint, or 'auto'.")
+        for name in LATE:
+            given = getattr(self, name)
+            if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
+                object.__setattr__(self, name, tuple(given))
+            each = seconds_of(getattr(self, name))
+            if given not in AUTOMATIC and not (each and all(_finite(value) for value in each)):
+                raise InvalidInput(f"{name} is {given!r}; give seconds, one number per joint, 'auto' or 'each'.")
+            if name == "lag" and given not in AUTOMATIC and min(each) < 0.0:
+                raise InvalidInput(f"lag is {given!r}; an actuator acts after its command: at least 0 s.")
+        if self.delay in AUTOMATIC and self.lag in AUTOMATIC:
+            raise InvalidInput("delay and lag are both to be estimated, and look alike; give one of them in s.")
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
             raise InvalidInput(f"every is {self.every!r}; it must be an integer of at least 1.")
         if not _finite(self.trim) or self.trim < 0:
@@ -69,10 +81,9 @@ class Preparation:
         A log that is prepared piece by piece needs so much before and after each piece, and 24 rows more for splines
         and differences. Raises InvalidInput while cut-off or delay are "auto": `resolved` finds them first.
         """
-        if self.cutoff == "auto" or self.delay == "auto":
+        if "auto" in (self.cutoff, self.delay, self.lag) or "each" in (self.delay, self.lag):
             raise InvalidInput("the halo of an automatic cut-off or delay is not known; find them first: resolved().")
-        shifts = self.delay if isinstance(self.delay, tuple) else (self.delay,)
-        reach = max(abs(float(shift)) for shift in shifts)
+        reach = max(map(abs, seconds_of(self.delay))) - np.log(FORGOTTEN) * max(seconds_of(self.lag))
         if self.cutoff is not None:
             slowest = 2.0 * np.pi * float(self.cutoff) * np.sin(0.5 * np.pi / self.order)  # slowest Butterworth pole
             reach += -np.log(FORGOTTEN) / slowest
@@ -116,7 +127,7 @@ def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     shapes = {
         "cutoff": lambda value: value is None or (_are_numbers([value]) and 0.0 < value < np.inf),
         **dict.fromkeys(("every", "trim"), lambda value: value is not None and _are_numbers([value])),
-        "delay": lambda value: None not in value and _are_numbers(value),
+        **dict.fromkeys(LATE, lambda value: None not in value and _are_numbers(value)),
         "why": lambda value: isinstance(value, Mapping),
         **dict.fromkeys(("power_removed", "acceleration_noise"), lambda value: all(map(_are_numbers, value.values()))),
     }
@@ -147,8 +158,10 @@ class Prepared:
 
 def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[str, Any]]:
     reasons: dict[str, Any] = {}
-    if isinstance(given.delay, tuple) and len(given.delay) != dataset.nv:
-        raise InvalidInput(f"delay has {len(given.delay)} numbers; the dataset has {dataset.nv} joints.")
+    for name in LATE:
+        value = getattr(given, name)
+        if isinstance(value, tuple) and len(value) != dataset.nv:
+            raise InvalidInput(f"{name} has {len(value)} numbers; the dataset has {dataset.nv} joints.")
     chosen = given
     if given.cutoff == "auto":
         spectrum = motion_spectrum(dataset, given.differentiate)
@@ -158,12 +171,15 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         chosen = replace(given, cutoff=cutoff)
         reasons["cutoff"] = _why(cutoff, spectrum, dataset)
         reasons["cutoff_per_joint"] = _plain(each)
-    if given.delay == "auto":
-        found = estimate_delay(_filtered(replace(chosen, delay=0.0), dataset))
-        chosen = replace(chosen, delay=found.significant)
-        reasons["delay"] = found.reason
-        reasons["delay_common"], reasons["delay_common_std"] = _plain(np.array([found.common, found.common_std]))
-        reasons["delay_per_joint"], reasons["delay_per_joint_std"] = _plain(found.seconds), _plain(found.std)
+    for name in LATE:
+        how = getattr(given, name)
+        if how not in AUTOMATIC:
+            continue
+        found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
+        chosen = replace(chosen, **{name: found.significant if how == "auto" else tuple(found.each)})
+        reasons[name] = found.reason if how == "auto" else "that of each joint where it is sure and explains a fifth"
+        reasons[f"{name}_common"], reasons[f"{name}_common_std"] = _plain(np.array([found.common, found.common_std]))
+        reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = _plain(found.seconds), _plain(found.std)
     return chosen, reasons
 
 
@@ -179,26 +195,36 @@ def _why(cutoff: float | None, spectrum: MotionSpectrum, dataset: Dataset) -> st
 
 def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     """Filtered, differentiated and shifted, with all its rows."""
-    assert chosen.delay != "auto"
     assert chosen.cutoff != "auto"
     if chosen.cutoff is not None:
         signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
         dataset = low_pass(dataset, float(chosen.cutoff), order=chosen.order, signals=signals)
         dataset = differentiated(dataset, chosen.differentiate)
-    shifts = chosen.delay if isinstance(chosen.delay, tuple) else (chosen.delay,) * dataset.nv
-    if not any(shifts):
+    shifts, lags = (_per_joint(given, dataset.nv) for given in (chosen.delay, chosen.lag))
+    if not any((*shifts, *lags)):
         return dataset
     u = dataset.u.copy()
     for number, rows, _ in episodes_in_order(dataset):
-        for joint, shift in enumerate(shifts):
-            u[dataset.episode == number, joint] = delayed(rows.u[:, joint], rows.time, float(shift))
+        for joint, (shift, lag) in enumerate(zip(shifts, lags, strict=True)):
+            acting = lagged(rows.u[:, joint], rows.time, lag)
+            u[dataset.episode == number, joint] = delayed(acting, rows.time, shift)
     return replace(dataset, u=u, truth={})
+
+
+def seconds_of(given: float | tuple[float, ...] | str) -> tuple[float, ...]:
+    """Numbers of a delay or lag, one or one per joint; of text, itself."""
+    return given if isinstance(given, tuple) else (given,)  # type: ignore[return-value]  # text is refused before
+
+
+def _per_joint(given: float | tuple[float, ...] | str, joints: int) -> list[float]:
+    each = seconds_of(given)
+    return [float(value) for value in (each if len(each) == joints else each * joints)]
 
 
 def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
     """Row numbers that stay: not trimmed, with a torque at their shifted time, every so many."""
-    shifts = chosen.delay if isinstance(chosen.delay, tuple) else (chosen.delay,)
-    early, late = max(0.0, -min(map(float, shifts))), max(0.0, *map(float, shifts))
+    shifts = seconds_of(chosen.delay)
+    early, late = max(0.0, -min(shifts), SETTLED * max(seconds_of(chosen.lag))), max(0.0, *shifts)
     if chosen.changes_nothing:
         return np.arange(len(dataset))
     kept = []
@@ -227,12 +253,11 @@ def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
 def _report(
     chosen: Preparation, reasons: dict[str, Any], raw: Dataset, filtered: Dataset, prepared: Dataset
 ) -> dict[str, Any]:
-    assert chosen.delay != "auto"
-    per_joint = list(chosen.delay) if isinstance(chosen.delay, tuple) else [chosen.delay] * raw.nv
+    per_joint = {name: _per_joint(getattr(chosen, name), raw.nv) for name in LATE}
     report: dict[str, Any] = {
         "cutoff": chosen.cutoff,
         "order": chosen.order,
-        "delay": [float(value) for value in per_joint],
+        **per_joint,
         "every": chosen.every,
         "trim": chosen.trim,
         "differentiate": chosen.differentiate if chosen.cutoff is not None else None,
@@ -251,7 +276,7 @@ def _report(
         before = spectrum.acceleration_noise()
         after = spectrum.acceleration_noise(lambda f: low_pass_gain(f, rate, float(chosen.cutoff or 0.0), chosen.order))
     report["acceleration_noise"] = {"before": _plain(before), "after": _plain(after)}
-    unshifted = _filtered(replace(chosen, delay=0.0), raw) if any(per_joint) else filtered
+    unshifted = _filtered(replace(chosen, delay=0.0, lag=0.0), raw) if any(map(any, per_joint.values())) else filtered
     report["power_removed"] = {name: _power_removed(raw, unshifted, name) for name in ("q", "v", "a", "u")}
     return report
 

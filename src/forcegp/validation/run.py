@@ -43,11 +43,11 @@ def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
 
 def _step(report: Mapping[str, Any]) -> str:
     parts = []
-    delay = [float(value) for value in report.get("delay") or []]
-    if any(delay):
-        same = len(set(delay)) == 1
-        delays = f"{1e3 * delay[0]:.3g}" if same else ", ".join(f"{1e3 * value:.3g}" for value in delay)
-        parts.append(f"u taken from {delays} ms later")
+    for name, what in (("delay", "u taken from {} ms later"), ("lag", "u through actuators of first order, {} ms")):
+        each = [float(value) for value in report.get(name) or []]
+        if any(each):
+            shown = each if len(set(each)) > 1 else each[:1]
+            parts.append(what.format(", ".join(f"{1e3 * value:.3g}" for value in shown)))
     cutoff = report.get("cutoff")
     if cutoff is None:
         parts.append("no filter")
