@@ -24,7 +24,7 @@ from forcegp.data.dataset_fields import (
     validated_units,
 )
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message, usable_arguments
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_known, usable_arguments
 from forcegp.summary import Summary, listed, rounded
 
 TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
@@ -134,8 +134,7 @@ class Dataset(Summary):
         if not isinstance(index, str):
             return self.rows([int(index)] if isinstance(index, int | np.integer) else index)
         columns = self._columns()
-        if index not in columns:
-            raise InvalidInput(unknown_name_message("column", index, "this Dataset", columns))
+        require_known("column", index, "this Dataset", columns)
         return columns[index]
 
     def to_pandas(self) -> Any:

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.errors import InvalidInput
 from forcegp.mechanics.gauss_principle import State
 from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.robots import Robot
+from forcegp.robots.arguments import by_joint
 
 PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
 
@@ -283,11 +284,7 @@ def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
 
 def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
     """One finite float64 number per joint, on the robot's device: a copy, in which tensors keep their graph."""
-    if isinstance(given, Mapping):
-        unknown = next((joint for joint in given if joint not in robot.joint_names), None)
-        if unknown is not None:
-            raise UnknownJoint(unknown_name_message("joint", unknown, robot.name, robot.joint_names))
-        given = [given.get(joint, 0.0) for joint in robot.joint_names]
+    given = by_joint(given, robot.joint_names, robot.name)
     try:
         values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
     except (TypeError, ValueError, RuntimeError):

@@ -23,7 +23,7 @@ from forcegp.errors import (
     UnknownJoint,
     UnknownLink,
     UnsupportedJoint,
-    unknown_name_message,
+    require_known,
 )
 from forcegp.robots.arguments import Inertials, broadcast_batch, usable_device
 from forcegp.robots.inertia import (
@@ -71,10 +71,8 @@ class Layout:
 
     def require_moving(self, link: str, robot: str) -> None:
         """Raise where ``link`` has no inertia that matters: it does not exist, or it is fixed in the world."""
-        placement = self.links.get(link)
-        if placement is None:
-            raise UnknownLink(unknown_name_message("link", link, robot, self.links))
-        if placement.body == WORLD:
+        require_known("link", link, robot, self.links, UnknownLink)
+        if self.links[link].body == WORLD:
             raise InvalidInput(
                 f"link {link!r} of {robot} is fixed in the world, so its inertia never enters the dynamics and "
                 f"cannot be a parameter; name a moving link: {', '.join(self.moving)}"
@@ -114,8 +112,7 @@ def lay_out(description: RobotDescription, locked: Mapping[str, float]) -> Layou
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
     by_name = {joint.name: joint for joint in description.joints}
     for name in locked:
-        if name not in by_name:
-            raise UnknownJoint(unknown_name_message("joint", name, description.source, by_name))
+        require_known("joint", name, description.source, by_name, UnknownJoint)
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
     for joint in description.joints:

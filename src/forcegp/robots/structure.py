@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
+from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
@@ -165,18 +165,15 @@ class RobotStructure(Summary):
 
     def link(self, name: str) -> Link:
         """One link by name."""
-        placement = self.layout.links.get(name)
-        if placement is None:
-            raise UnknownLink(unknown_name_message("link", name, self.name, self.layout.links))
-        joint = None if placement.body == WORLD else self.joint_names[placement.body]
+        require_known("link", name, self.name, self.layout.links, UnknownLink)
+        body = self.layout.links[name].body
+        joint = None if body == WORLD else self.joint_names[body]
         return Link.of(name, joint, self.description.links[name])
 
     def joint(self, name: str) -> Joint:
         """One movable joint by name."""
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
-        raise UnknownJoint(unknown_name_message("joint", name, self.name, self.joint_names))
+        require_known("joint", name, self.name, self.joint_names, UnknownJoint)
+        return self.joints[self.joint_names.index(name)]
 
     def inertial_parameters(self, *links: str) -> dict[str, Float[Tensor, "10"]]:
         """Log-Cholesky parameters (10,) of the named links, to start an identification from.
@@ -198,10 +195,8 @@ class RobotStructure(Summary):
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
-        found = self._frames.get(name)
-        if found is None:
-            raise UnknownFrame(unknown_name_message("frame", name, self.name, self._frames))
-        body, offset = found
+        require_known("frame", name, self.name, self._frames, UnknownFrame)
+        body, offset = self._frames[name]
         return body, offset.clone()
 
     def checked_input(self, name: str, value: object) -> Tensor:
