@@ -17,6 +17,7 @@ from forcegp.robots.urdf import InertialDescription, JointDescription, RobotDesc
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
+MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
 ALIASES = {"center_of_mass": "com"}
 
 
@@ -75,19 +76,6 @@ class Link:
     mass: float  # kg; 0 for a massless frame
     center_of_mass: tuple[float, float, float]  # m, in the link frame
     inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
-
-    @classmethod
-    def of(cls, name: str, joint: str | None, inertial: InertialDescription | None) -> "Link":
-        """A link with its inertia; without one it is a massless frame."""
-        if inertial is None:
-            return cls(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
-        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
-        return cls(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
-
-    def log_cholesky(self, owner: str) -> Float[Tensor, "10"]:
-        """Log-Cholesky parameters; ``owner`` is the robot that error messages name. Raises as log_cholesky_of_link."""
-        center, inertia = np.array(self.center_of_mass), np.array(self.inertia)
-        return log_cholesky_of_link(self.mass, center, inertia, f"{self.name!r} of {owner}")
 
     def inertial(self, *parts: str) -> LinkInertia:
         """Parts to learn, for ``StructuredGP.identify``: 'mass', 'com', 'inertia'; all three if none is named.
@@ -168,7 +156,9 @@ class RobotStructure(Summary):
         require_known("link", name, self.name, self.layout.links, UnknownLink)
         body = self.layout.links[name].body
         joint = None if body == WORLD else self.joint_names[body]
-        return Link.of(name, joint, self.description.links[name])
+        inertial = self.description.links[name] or MASSLESS
+        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
+        return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
 
     def joint(self, name: str) -> Joint:
         """One movable joint by name."""
@@ -181,17 +171,19 @@ class RobotStructure(Summary):
         Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
         :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
         """
+        out = {}
         for name in links:
             self.layout.require_moving(name, self.name)
-        return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
+            own = self.description.links[name] or MASSLESS
+            owner = f"{name!r} of {self.name}"
+            out[name] = log_cholesky_of_link(own.mass, own.center_of_mass, own.inertia, owner).to(self.device)
+        return out
 
     @override
     def facts(self) -> dict[str, object]:
         """Name, sizes and joints."""
         kinds = listed((f"{joint.name} ({joint.type})" for joint in self.layout.joints), most=7)
         return {"name": repr(self.name), "nv": self.nv, "links": len(self.layout.links), "joints": kinds}
-
-    # ------------------------------------------------------------------ checks of inputs
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
