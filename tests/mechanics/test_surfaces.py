@@ -10,7 +10,7 @@ from tests.mechanics.surface_conformance import SurfaceConformance
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.mechanics import Cylinder, ImplicitSurface, Plane, Sphere, Surface
-from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 
 
 class TestPlane(SurfaceConformance):
@@ -102,7 +102,8 @@ def test_storing_changes_no_bit(direction, number):
         Sphere(direction, 0.1 + abs(number)),
     )
     for surface in surfaces:
-        assert surface_from_dict(json.loads(json.dumps(surface_to_dict(surface)))) == surface
+        stored = json.loads(json.dumps(surface_to_dict(surface)))
+        assert object_from_dict("surface", SURFACES, stored) == surface
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -177,4 +178,4 @@ def test_a_function_must_return_a_scalar_tensor(function, batch, what):
 )
 def test_damaged_surfaces_are_refused(stored):
     with pytest.raises(FileFormatError, match="surface"):
-        surface_from_dict(stored)
+        object_from_dict("surface", SURFACES, stored)

@@ -195,8 +195,8 @@ def _surfaces(rows: Dataset, robot: Any, frame: str) -> list[forcegp.mechanics.C
     found = []
     for columns in (plane, plane + round_):
         z = np.stack(columns, axis=1)  # (rows, k, nv)
-        z = z / np.maximum(np.sqrt(np.square(z * spread).mean(axis=(0, 2))), 1e-12)[:, None]
-        scale = 1.0 / np.maximum(np.sqrt(np.square(np.stack(columns, axis=1) * spread).mean(axis=(0, 2))), 1e-12)
+        scale = 1.0 / np.maximum(np.sqrt(np.square(z * spread).mean(axis=(0, 2))), 1e-12)
+        z = z * scale[:, None]
         free = np.einsum("rkj,rlj,j->kl", z, z, spread**2) / len(rows)
         moved = np.einsum("rkj,rj->rk", z, rows.v)
         held = moved.T @ moved / len(rows)

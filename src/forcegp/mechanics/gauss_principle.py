@@ -20,7 +20,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.mechanics.surfaces import Surface
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch
 
 
 @dataclass(frozen=True)
@@ -119,11 +119,8 @@ class State:
     ) -> "State":
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
         q, v, u = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v), ("u", u)))
-        try:
-            q, v, u = torch.broadcast_tensors(q, v, u)
-        except RuntimeError:
-            shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
-            raise InvalidInput(f"batch shapes do not broadcast: {shapes}; make them equal, or 1.") from None
+        batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
+        q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
         return cls(q, v, u, robot, robot.kinematics(q, v), inertials)
 
 

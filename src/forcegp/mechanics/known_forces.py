@@ -15,7 +15,6 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics.gauss_principle import State
-from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.robots import Robot
 from forcegp.robots.arguments import by_joint
 
@@ -267,7 +266,7 @@ KNOWN_FORCES: dict[str, type[KnownForce]] = {
 
 
 def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
-    """Plain numbers for `known_force_from_dict`. Raises InvalidInput for a force that has no name in files."""
+    """Plain numbers for `object_from_dict`. Raises InvalidInput for a force that has no name in files."""
     name = next((name for name, kind in KNOWN_FORCES.items() if type(force) is kind), None)
     if name is None:
         raise InvalidInput(f"a {type(force).__name__} cannot be stored; files carry {', '.join(KNOWN_FORCES)}")
@@ -275,11 +274,6 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
     for f in fields(force):  # type: ignore[arg-type]  # every entry of KNOWN_FORCES is a dataclass
         stored[f.name] = torch.as_tensor(getattr(force, f.name)).tolist()
     return stored
-
-
-def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
-    """The force that `known_force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
-    return object_from_dict("known force", KNOWN_FORCES, stored)
 
 
 def _per_joint(name: str, given: object, robot: Robot) -> Tensor:

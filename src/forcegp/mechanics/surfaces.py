@@ -183,10 +183,7 @@ SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinde
 
 
 def surface_to_dict(surface: Surface) -> dict[str, Any]:
-    """Plain numbers that `surface_from_dict` turns back into the surface.
-
-    Raises ContactError for a surface that holds code.
-    """
+    """Plain numbers for `object_from_dict`. Raises ContactError for a surface that holds code."""
     name = next((name for name, kind in SURFACES.items() if type(surface) is kind), None)
     if name is None:
         raise ContactError(
@@ -194,11 +191,6 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
             f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
         )
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
-
-
-def surface_from_dict(stored: dict[str, Any]) -> Surface:
-    """The surface that `surface_to_dict` stored. Raises FileFormatError for an unknown type or missing fields."""
-    return object_from_dict("surface", SURFACES, stored)
 
 
 def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
