@@ -53,7 +53,21 @@ class KnownForce(ABC):
 
     def _bound(self, name: str, robot: Robot) -> Tensor:
         what = f"{type(self).__name__} {name}"
-        values = _per_joint(what, getattr(self, name), robot)
+        given = by_joint(getattr(self, name), robot.joint_names, robot.name)
+        try:
+            values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise InvalidInput(
+                f"{what} is {given!r}; give a number, one per joint, or a mapping from joint names."
+            ) from None
+        values = (values.expand(robot.nv) if values.dim() == 0 else values).clone()  # which keeps the graph
+        if values.shape != (robot.nv,):
+            raise InvalidInput(
+                f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
+                f"{', '.join(robot.joint_names)}"
+            )
+        if not bool(torch.isfinite(values).all()):
+            raise InvalidInput(f"{what} is {values.tolist()}; every joint needs a finite number.")
         if name in self.signed:
             return values
         if name in self.positive and not bool((values > 0).all()):
@@ -274,24 +288,3 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
     for f in fields(force):  # type: ignore[arg-type]  # every entry of KNOWN_FORCES is a dataclass
         stored[f.name] = torch.as_tensor(getattr(force, f.name)).tolist()
     return stored
-
-
-def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
-    """One finite float64 number per joint, on the robot's device: a copy, in which tensors keep their graph."""
-    given = by_joint(given, robot.joint_names, robot.name)
-    try:
-        values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
-    except (TypeError, ValueError, RuntimeError):
-        raise InvalidInput(
-            f"{name} is {given!r}; give a number, one per joint, or a mapping from joint names."
-        ) from None
-    if values.dim() == 0:
-        values = values.expand(robot.nv)
-    if values.shape != (robot.nv,):
-        raise InvalidInput(
-            f"{name} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
-            f"{', '.join(robot.joint_names)}"
-        )
-    if not bool(torch.isfinite(values).all()):
-        raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number.")
-    return values.clone()

@@ -18,6 +18,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.robots.arguments import finite_vector
 
 Kind = TypeVar("Kind")
 
@@ -215,13 +216,7 @@ def _positive(name: str, value: object) -> float:
 
 
 def _vector(name: str, values: object) -> Vector:
-    try:
-        entries = tuple(_number(name, entry) for entry in values)  # type: ignore[attr-defined]  # what is no sequence is an error below
-    except TypeError:
-        entries = ()
-    if len(entries) != 3:
-        raise InvalidInput(f"{name} is {values!r}; give three numbers x, y, z.")
-    return entries  # type: ignore[return-value]  # three of them, as checked
+    return tuple(finite_vector(name, values, 3, " x, y, z").tolist())  # type: ignore[return-value]  # three of them
 
 
 def _direction(name: str, values: object) -> tuple[Vector, float]:

@@ -137,15 +137,15 @@ def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
         ) from None
 
 
-def finite_vector(name: str, values: Vector, size: int) -> np.ndarray:
-    """``size`` finite numbers as an array."""
+def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.ndarray:
+    """``size`` finite numbers as an array; ``meaning`` follows them in the error, " x, y, z" for example."""
     try:
         plain = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
         array = real_array(name, plain).astype(np.float64)
     except InvalidInput:  # text, of which every letter could be a digit
-        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.") from None
+        array = np.full((), np.nan)
     if array.shape != (size,) or not np.isfinite(array).all():
-        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
+        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers{meaning}.")
     return array
 
 
