@@ -134,7 +134,7 @@ def test_an_implicit_surface_may_hold_a_parameter_to_learn():
         (lambda: Plane((0, 0, math.nan), 1), r"Plane normal is \(0, 0, nan\); give 3 finite numbers"),
         (lambda: Plane((0, 0, 1), math.inf), "Plane offset is inf"),
         (lambda: Plane((0, 0, 1), None), "Plane offset is None; give a number"),
-        (lambda: Plane("001", 1.0), "Plane normal is '0'"),
+        (lambda: Plane("001", 1.0), "Plane normal is '001'"),
         (lambda: Plane((0, 0, 1), "1"), "Plane offset is '1'"),
         (lambda: Sphere((0, 0, 0), 0.0), "Sphere radius is 0.0; it must be positive"),
         (lambda: Sphere((0, 0, 0), -1.0), "Sphere radius is -1.0"),

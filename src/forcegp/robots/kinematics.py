@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.arguments import Inertials, Vector, broadcast_batch, checked_point
+from forcegp.robots.arguments import Inertials, JointValues, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD, Tree
 from forcegp.robots.structure import RobotStructure
@@ -206,9 +206,7 @@ class Kinematics:
         at, inertias = self._with_inertias(inertials)
         return at._rows(gravity_forces(self.robot.tree, at.twists, inertias))
 
-    def inverse_dynamics(
-        self, a: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, a: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
         a = self.robot.checked_input("a", a)
         at, inertias = self._expanded("a", a.shape[:-1])._with_inertias(inertials)
@@ -218,9 +216,7 @@ class Kinematics:
         forces = joint_forces(tree, at.twists, accelerations, inertias)
         return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
-    def forward_dynamics(
-        self, tau: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, tau: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
         tau = self.robot.checked_input("tau", tau)
         at, inertias = self._expanded("tau", tau.shape[:-1])._with_inertias(inertials)

@@ -13,34 +13,12 @@ from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink
 from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
-from forcegp.robots.urdf import InertialDescription, JointDescription, RobotDescription
+from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
 ALIASES = {"center_of_mass": "com"}
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
-
-    name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic'
-    parent: str
-    child: str
-    axis: tuple[float, float, float]  # unit vector in the joint frame
-    lower: float
-    upper: float
-    velocity_limit: float
-    effort_limit: float
-    damping: float  # Nms/rad or Ns/m
-    friction: float  # Nm or N
-
-    @classmethod
-    def of(cls, joint: JointDescription) -> "Joint":
-        """A movable joint as a description has it, without its place in the tree."""
-        return cls(**{field.name: getattr(joint, field.name) for field in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -114,7 +92,8 @@ class RobotStructure(Summary):
     @property
     def joints(self) -> tuple[Joint, ...]:
         """Movable joints in the order of q."""
-        return tuple(map(Joint.of, self.layout.joints))
+        names = [field.name for field in fields(Joint)]
+        return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
