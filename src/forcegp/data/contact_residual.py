@@ -104,14 +104,13 @@ def _friction(
     multipliers = dynamics.multiplier_map().offset.abs()
     many = len(v) >= MANY_ROWS
     for index, contact in enumerate(system.contacts):
-        J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
+        J, turning = state.kinematics.frame_jacobian(contact.frame, contact.point).split(3, dim=1)
         velocity = (J @ v[..., None])[..., 0]
         speed = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
         direction = velocity / (speed + SLOW * speed.square().mean().sqrt() + 1e-12)
         tangential = torch.stack([velocity, direction, direction * multipliers[:, [index]]], dim=-1)
         forces.append(J.mT @ tangential)
         if many:  # friction beside the stated point turns the link about the normal
-            turning = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, 3:]
             along = turning.mT @ dynamics.normals[:, index, :, None]
             forces.append(along * torch.cat([velocity, direction * multipliers[:, [index]]], dim=-1)[:, None])
     return torch.cat(forces, dim=-1)

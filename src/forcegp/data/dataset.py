@@ -25,6 +25,7 @@ from forcegp.data.dataset_fields import (
 )
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_known, usable_arguments
+from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
 TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
@@ -258,7 +259,7 @@ def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSyste
 def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.ndarray | None:
     if given is None:
         return None
-    if _is_table(given):
+    if real_array("noise_std", given, error=DatasetError).ndim > 1:
         values = finite_columns("noise_std", given, joint_names, rows)
     else:
         values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
@@ -270,14 +271,6 @@ def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.nda
             "Give None if it is not known or if there is no noise."
         )
     return values
-
-
-def _is_table(given: object) -> bool:
-    """Whether this is meant as (rows, nv); what is no array at all is complained about as a vector."""
-    try:
-        return np.ndim(given) > 1  # type: ignore[arg-type]  # anything may be given
-    except (TypeError, ValueError, RuntimeError):
-        return False
 
 
 def _truth(

@@ -145,15 +145,6 @@ def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor
     return -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
 
 
-def solve_mass_matrix(mass: Float[Tensor, "*batch n n"], force: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-    """``M^-1 force`` by Cholesky; :class:`~forcegp.errors.NumericalError` where M is not positive definite."""
-    try:
-        factor = torch.linalg.cholesky(mass)
-    except torch.linalg.LinAlgError as error:
-        raise NumericalError(NOT_POSITIVE_DEFINITE) from error
-    return torch.cholesky_solve(force[..., None], factor).squeeze(-1)
-
-
 @dataclass(frozen=True, eq=False)
 class Kinematics:
     """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
@@ -221,7 +212,11 @@ class Kinematics:
         tau = self.robot.checked_input("tau", tau)
         at, inertias = self._expanded("tau", tau.shape[:-1])._with_inertias(inertials)
         net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
-        return at._rows(solve_mass_matrix(at._mass_matrix(inertias), net))
+        try:
+            factor = torch.linalg.cholesky(at._mass_matrix(inertias))
+        except torch.linalg.LinAlgError as error:
+            raise NumericalError(NOT_POSITIVE_DEFINITE) from error
+        return at._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
 
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
         """Joint forces per unit of the standard parameters of each body (..., nv, nv, 10), armature left out.
