@@ -2,7 +2,7 @@
 
 import contextlib
 import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TypeVar
 
 Kind = TypeVar("Kind")
@@ -169,18 +169,21 @@ def usable_arguments(of: str) -> Iterator[None]:
         raise InvalidInput(f"{of} was given a value of another kind: {error}; see help({of})") from error
 
 
-def unknown_name_message(
+def require_known(
     kind: str,
-    given: str,
+    given: object,
     owner: str,
-    valid: Iterable[str],
+    valid: Collection[str],
+    error: type[ForceGPError] = InvalidInput,
     *,
     cutoff: float = 0.6,
     synonyms: Mapping[str, str] | None = None,
-) -> str:
-    """`no frame 'tool1' in iiwa7; did you mean 'tool0'? Valid frames: ...`; `cutoff` as in difflib."""
-    names = sorted(valid)
+) -> None:
+    """Raise `no frame 'tool1' in iiwa7; did you mean 'tool0'? Valid frames: ...` for others; `cutoff` as in difflib."""
+    if isinstance(given, str) and given in valid:
+        return
+    names, given = sorted(valid), str(given)
     meant = (synonyms or {}).get(given.lower())
     close = [meant] if meant in names else difflib.get_close_matches(given, names, n=1, cutoff=cutoff)
     hint = f"; did you mean {close[0]!r}?" if close else "."
-    return f"no {kind} {given!r} in {owner}{hint} Valid {kind}s: {', '.join(names) or '(none)'}"
+    raise error(f"no {kind} {given!r} in {owner}{hint} Valid {kind}s: {', '.join(names) or '(none)'}")

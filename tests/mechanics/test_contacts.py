@@ -154,7 +154,7 @@ def test_points_may_come_in_any_form():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("tool", (0, 0), FLOOR), r"Contact point is \(0, 0\); give three finite numbers"),
+        (("tool", (0, 0), FLOOR), r"Contact point is \(0, 0\); give 3 finite numbers"),
         (("tool", (0, 0, math.nan), FLOOR), "Contact point"),
         (("tool", (0, 0, "a"), FLOOR), "Contact point"),
         (("tool", "123", FLOOR), "Contact point is '123'"),

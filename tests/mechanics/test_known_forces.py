@@ -27,7 +27,8 @@ from forcegp.mechanics import (
     StribeckJointFriction,
     ViscousJointFriction,
 )
-from forcegp.mechanics.known_forces import KNOWN_FORCES, known_force_from_dict, known_force_to_dict
+from forcegp.mechanics.known_forces import KNOWN_FORCES, known_force_to_dict
+from forcegp.mechanics.surfaces import object_from_dict
 
 JOINTS = ("slide", "spin", "skew", "tilt")
 NUMBERS = [0.5, 1.5, 0.0, 2.0]
@@ -275,7 +276,8 @@ def test_wrong_numbers_are_named(kind, arguments, error, message):
 @pytest.mark.parametrize("make_and_formula", FORMULAS.values(), ids=FORMULAS)
 def test_they_survive_a_file_exactly(make_and_formula):
     force = make_and_formula[0]().bound_to(chain())
-    again = known_force_from_dict(json.loads(json.dumps(known_force_to_dict(force)))).bound_to(chain())
+    stored = json.loads(json.dumps(known_force_to_dict(force)))
+    again = object_from_dict("known force", KNOWN_FORCES, stored).bound_to(chain())
     assert type(again) is type(force)
     for name in force.per_joint:
         assert torch.equal(getattr(again, name), getattr(force, name))
@@ -301,7 +303,7 @@ def test_every_known_force_of_files_is_tested_here():
 )
 def test_damaged_forces_are_refused(stored):
     with pytest.raises(FileFormatError, match="known force"):
-        known_force_from_dict(stored)
+        object_from_dict("known force", KNOWN_FORCES, stored)
 
 
 # ---------------------------------------------------------------- a force of the user

@@ -10,7 +10,7 @@ from tests.mechanics.surface_conformance import SurfaceConformance
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.mechanics import Cylinder, ImplicitSurface, Plane, Sphere, Surface
-from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 
 
 class TestPlane(SurfaceConformance):
@@ -102,7 +102,8 @@ def test_storing_changes_no_bit(direction, number):
         Sphere(direction, 0.1 + abs(number)),
     )
     for surface in surfaces:
-        assert surface_from_dict(json.loads(json.dumps(surface_to_dict(surface)))) == surface
+        stored = json.loads(json.dumps(surface_to_dict(surface)))
+        assert object_from_dict("surface", SURFACES, stored) == surface
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -129,15 +130,15 @@ def test_an_implicit_surface_may_hold_a_parameter_to_learn():
     [
         (lambda: Plane((0, 0, 0), 1), r"Plane normal is \(0, 0, 0\); give a direction"),
         (lambda: Plane((1.7e308, 1.7e308, 0), 1), "give a direction"),
-        (lambda: Plane((0, 0), 1), "Plane normal is .* three numbers"),
-        (lambda: Plane((0, 0, math.nan), 1), "Plane normal is nan; give a finite number"),
+        (lambda: Plane((0, 0), 1), "Plane normal is .* 3 finite numbers"),
+        (lambda: Plane((0, 0, math.nan), 1), r"Plane normal is \(0, 0, nan\); give 3 finite numbers"),
         (lambda: Plane((0, 0, 1), math.inf), "Plane offset is inf"),
         (lambda: Plane((0, 0, 1), None), "Plane offset is None; give a number"),
-        (lambda: Plane("001", 1.0), "Plane normal is '0'"),
+        (lambda: Plane("001", 1.0), "Plane normal is '001'"),
         (lambda: Plane((0, 0, 1), "1"), "Plane offset is '1'"),
         (lambda: Sphere((0, 0, 0), 0.0), "Sphere radius is 0.0; it must be positive"),
         (lambda: Sphere((0, 0, 0), -1.0), "Sphere radius is -1.0"),
-        (lambda: Sphere(3.0, 1.0), "Sphere center is 3.0; give three numbers"),
+        (lambda: Sphere(3.0, 1.0), "Sphere center is 3.0; give 3 finite numbers"),
         (lambda: Cylinder((0, 0, 0), (0, 0, 0), 1), "Cylinder axis"),
         (lambda: Cylinder((0, 0, 0, 0), (0, 0, 1), 1), "Cylinder point"),
         (lambda: Cylinder((0, 0, 0), (0, 0, 1), math.nan), "Cylinder radius is nan"),
@@ -177,4 +178,4 @@ def test_a_function_must_return_a_scalar_tensor(function, batch, what):
 )
 def test_damaged_surfaces_are_refused(stored):
     with pytest.raises(FileFormatError, match="surface"):
-        surface_from_dict(stored)
+        object_from_dict("surface", SURFACES, stored)

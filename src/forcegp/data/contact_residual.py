@@ -104,14 +104,13 @@ def _friction(
     multipliers = dynamics.multiplier_map().offset.abs()
     many = len(v) >= MANY_ROWS
     for index, contact in enumerate(system.contacts):
-        J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
+        J, turning = state.kinematics.frame_jacobian(contact.frame, contact.point).split(3, dim=1)
         velocity = (J @ v[..., None])[..., 0]
         speed = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
         direction = velocity / (speed + SLOW * speed.square().mean().sqrt() + 1e-12)
         tangential = torch.stack([velocity, direction, direction * multipliers[:, [index]]], dim=-1)
         forces.append(J.mT @ tangential)
         if many:  # friction beside the stated point turns the link about the normal
-            turning = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, 3:]
             along = turning.mT @ dynamics.normals[:, index, :, None]
             forces.append(along * torch.cat([velocity, direction * multipliers[:, [index]]], dim=-1)[:, None])
     return torch.cat(forces, dim=-1)
@@ -195,8 +194,8 @@ def _surfaces(rows: Dataset, robot: Any, frame: str) -> list[forcegp.mechanics.C
     found = []
     for columns in (plane, plane + round_):
         z = np.stack(columns, axis=1)  # (rows, k, nv)
-        z = z / np.maximum(np.sqrt(np.square(z * spread).mean(axis=(0, 2))), 1e-12)[:, None]
-        scale = 1.0 / np.maximum(np.sqrt(np.square(np.stack(columns, axis=1) * spread).mean(axis=(0, 2))), 1e-12)
+        scale = 1.0 / np.maximum(np.sqrt(np.square(z * spread).mean(axis=(0, 2))), 1e-12)
+        z = z * scale[:, None]
         free = np.einsum("rkj,rlj,j->kl", z, z, spread**2) / len(rows)
         moved = np.einsum("rkj,rj->rk", z, rows.v)
         held = moved.T @ moved / len(rows)

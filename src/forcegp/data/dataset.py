@@ -24,7 +24,8 @@ from forcegp.data.dataset_fields import (
     validated_units,
 )
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, unknown_name_message, usable_arguments
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_known, usable_arguments
+from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
 TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
@@ -134,8 +135,7 @@ class Dataset(Summary):
         if not isinstance(index, str):
             return self.rows([int(index)] if isinstance(index, int | np.integer) else index)
         columns = self._columns()
-        if index not in columns:
-            raise InvalidInput(unknown_name_message("column", index, "this Dataset", columns))
+        require_known("column", index, "this Dataset", columns)
         return columns[index]
 
     def to_pandas(self) -> Any:
@@ -259,7 +259,7 @@ def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSyste
 def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.ndarray | None:
     if given is None:
         return None
-    if _is_table(given):
+    if real_array("noise_std", given, error=DatasetError).ndim > 1:
         values = finite_columns("noise_std", given, joint_names, rows)
     else:
         values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
@@ -271,14 +271,6 @@ def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.nda
             "Give None if it is not known or if there is no noise."
         )
     return values
-
-
-def _is_table(given: object) -> bool:
-    """Whether this is meant as (rows, nv); what is no array at all is complained about as a vector."""
-    try:
-        return np.ndim(given) > 1  # type: ignore[arg-type]  # anything may be given
-    except (TypeError, ValueError, RuntimeError):
-        return False
 
 
 def _truth(

@@ -122,7 +122,7 @@ def estimate_delay(
 
 
 def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, kind: str) -> Delay:
-    parts = _shifted(dataset, largest, kind)
+    parts = _Shifts(dataset, largest, kind)
     zero = int(np.argmin(np.abs(parts.shifts)))
     features = _features(robot, dataset.rows(parts.rows))
     nv = dataset.nv
@@ -191,47 +191,38 @@ def lagged(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"],
     return np.asarray(moved) + values[0]
 
 
-@dataclass(frozen=True)
 class _Shifts:
     """The rows that are compared, and how to shift a torque against them."""
 
-    rows: np.ndarray
-    shifts: np.ndarray
-    episodes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # rows of the episode, their times, times to compare at
-    kind: str
+    def __init__(self, dataset: Dataset, largest: float, kind: str) -> None:
+        if not 0.0 < largest < np.inf:
+            raise InvalidInput(f"the largest delay is {largest} s; it must be positive and finite.")
+        thin = max(1, -(-len(dataset) // MOST_ROWS))
+        rows, self.episodes = [np.zeros(0, int)], []
+        for number, part, _ in episodes_in_order(dataset):
+            own = np.flatnonzero(dataset.episode == number)
+            inner = (part.time >= part.time[0] + largest) & (part.time <= part.time[-1] - largest)
+            rows.append(own[inner][::thin])
+            self.episodes.append((own, part.time, dataset.time[rows[-1]]))
+        self.rows = np.concatenate(rows)
+        if len(self.rows) < 10 * BLOCKS:
+            raise DatasetError(
+                f"{len(self.rows)} rows lie more than {largest} s from the ends of their episodes; a delay needs at "
+                f"least {10 * BLOCKS}. Record longer, or give the delay in s."
+            )
+        first, count = (0.0, STEPS + 1) if kind == "lag" else (-largest, 2 * STEPS + 1)
+        self.kind, self.shifts = kind, np.linspace(first, largest, count)
 
     def torque(self, u: np.ndarray) -> np.ndarray:
         """(shifts, rows) torque at the rows' times plus each shift, or after each lag."""
-        columns = []
-        for rows, time, at in self.episodes:
+        parts = []
+        for own, time, at in self.episodes:
             if self.kind == "lag":
-                chosen = np.searchsorted(time, at)
-                columns.append(np.stack([lagged(u[rows], time, lag)[chosen] for lag in self.shifts]))
-            else:
-                columns.append(CubicSpline(time, u[rows])(at + self.shifts[:, None]))
-        return np.concatenate(columns, axis=1)
-
-
-def _shifted(dataset: Dataset, largest: float, kind: str) -> _Shifts:
-    if not 0.0 < largest < np.inf:
-        raise InvalidInput(f"the largest delay is {largest} s; it must be positive and finite.")
-    thin = max(1, -(-len(dataset) // MOST_ROWS))
-    rows, episodes = [], []
-    for number, part, _ in episodes_in_order(dataset):
-        own = np.flatnonzero(dataset.episode == number)
-        inner = (part.time >= part.time[0] + largest) & (part.time <= part.time[-1] - largest)
-        chosen = own[inner][::thin]
-        if len(chosen):
-            rows.append(chosen)
-            episodes.append((own, part.time, dataset.time[chosen]))
-    count = sum(len(chosen) for chosen in rows)
-    if count < 10 * BLOCKS:
-        raise DatasetError(
-            f"{count} rows lie more than {largest} s from the ends of their episodes; a delay needs at least "
-            f"{10 * BLOCKS}. Record longer, or give the delay in s."
-        )
-    first, count = (0.0, STEPS + 1) if kind == "lag" else (-largest, 2 * STEPS + 1)
-    return _Shifts(np.concatenate(rows), np.linspace(first, largest, count), episodes, kind)
+                rows = np.searchsorted(time, at)
+                parts.append(np.stack([lagged(u[own], time, lag)[rows] for lag in self.shifts]))
+            elif len(at):
+                parts.append(CubicSpline(time, u[own])(at + self.shifts[:, None]))
+        return np.concatenate(parts, axis=1)
 
 
 def _features(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows 7"]:

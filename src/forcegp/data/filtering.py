@@ -139,7 +139,7 @@ def resample(dataset: Dataset, step: float) -> Dataset:
     """
     if not (np.isfinite(step) and step > 0):
         raise InvalidInput(f"step is {step} s; it must be > 0.")
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "u", "a", "time", "episode")}
+    parts: list[dict[str, np.ndarray]] = []
     for number, rows, label in episodes_in_order(dataset):
         require_no_turns(rows, label)
         duration = rows.time[-1] - rows.time[0]
@@ -147,11 +147,9 @@ def resample(dataset: Dataset, step: float) -> Dataset:
         if count < 2:
             raise InvalidInput(f"step is {step} s, longer than {label} ({duration:.6g} s).")
         time = np.minimum(rows.time[0] + step * np.arange(count), rows.time[-1])
-        for name in ("q", "v", "u", "a"):
-            parts[name].append(CubicSpline(rows.time, getattr(rows, name), axis=0)(time))
-        parts["time"].append(time)
-        parts["episode"].append(np.full(count, number))
-    joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+        signals = {name: CubicSpline(rows.time, getattr(rows, name), axis=0)(time) for name in ("q", "v", "u", "a")}
+        parts.append({**signals, "time": time, "episode": np.full(count, number)})
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return replace(dataset, **joined, truth={}, noise_std=None)
 
 

@@ -51,9 +51,9 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
     latest = last - steps
     possible = np.flatnonzero(np.arange(rows) <= latest)
     if not possible.size:
+        longest = np.unique(dataset.episode, return_counts=True)[1].max() - 1
         raise InvalidInput(
-            f"no episode lasts {steps * dt:.4g} s: the longest has {dt * _longest(dataset):.4g} s; ask for fewer "
-            "seconds."
+            f"no episode lasts {steps * dt:.4g} s: the longest has {dt * longest:.4g} s; ask for fewer seconds."
         )
     if isinstance(starts, int):
         if starts < 1:
@@ -107,11 +107,6 @@ def _time_step(dataset: Dataset) -> float:
     if not pauses.size:
         raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")
     return float(np.median(pauses))
-
-
-def _longest(dataset: Dataset) -> int:
-    """Steps of the longest episode."""
-    return int(np.unique(dataset.episode, return_counts=True)[1].max()) - 1
 
 
 def _require_even(dataset: Dataset, starts: np.ndarray, steps: int, dt: float) -> None:

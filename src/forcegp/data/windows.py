@@ -20,7 +20,7 @@ from forcegp.data.dataset import Dataset
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
 from forcegp.data.row_selection import farthest_point_sampling
-from forcegp.errors import DatasetError, DataWarning, InvalidInput, unknown_name_message, usable_arguments
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, require_known, usable_arguments
 from forcegp.robots.arguments import whole_number
 
 EXACT_DEGREE = 5
@@ -232,8 +232,7 @@ def observation_of(given: WindowObservation | str) -> WindowObservation:
     """The observation of that name with its defaults, or itself. Raises InvalidInput for other names."""
     if isinstance(given, WindowObservation):
         return given
-    if given not in OBSERVATIONS:
-        raise InvalidInput(unknown_name_message("observation", str(given), "forcegp", tuple(OBSERVATIONS)))
+    require_known("observation", given, "forcegp", OBSERVATIONS)
     return OBSERVATIONS[given]()
 
 

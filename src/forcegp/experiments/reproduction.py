@@ -10,7 +10,7 @@ from typing import Any
 
 from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
 from forcegp.experiments.ablation import Ablation
@@ -93,13 +93,11 @@ ALL = "all"
 
 def experiments_of(preset: str, figure: str) -> tuple[Experiment, ...]:
     """One experiment by name, or all. Raises InvalidInput for names that do not exist."""
-    if preset not in PRESETS:
-        raise InvalidInput(unknown_name_message("preset", preset, "forcegp reproduce", PRESETS))
+    require_known("preset", preset, "forcegp reproduce", PRESETS)
     experiments = {experiment.name: experiment for experiment in PRESETS[preset]}
     if figure == ALL:
         return tuple(experiments.values())
-    if figure not in experiments:
-        raise InvalidInput(unknown_name_message("figure", figure, "forcegp reproduce", [*experiments, ALL]))
+    require_known("figure", figure, "forcegp reproduce", [*experiments, ALL])
     return (experiments[figure],)
 
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, unknown_name_message, usable_arguments
+from forcegp.errors import InvalidInput, require_known, usable_arguments
 from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior, WeightSpace
@@ -310,8 +310,7 @@ def engine_of(given: Engine | str) -> Engine | None:
         return given
     if given == "auto":
         return None
-    if not isinstance(given, str) or given not in ENGINES:
-        raise InvalidInput(unknown_name_message("engine", str(given), "forcegp", ("auto", *ENGINES)))
+    require_known("engine", given, "forcegp", ("auto", *ENGINES))
     return ENGINES[given]()
 
 

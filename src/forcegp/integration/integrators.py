@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, unknown_name_message
+from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
 from forcegp.robots import Kinematics
@@ -340,8 +340,7 @@ INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
 
 def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
     """The integrator of that name for motions of `system`. Raises InvalidInput for any other name."""
-    if not isinstance(name, str) or name not in INTEGRATORS:
-        raise InvalidInput(unknown_name_message("integrator", str(name), "forcegp", INTEGRATORS, cutoff=0.4))
+    require_known("integrator", name, "forcegp", INTEGRATORS, cutoff=0.4)
     return INTEGRATORS[name](system)
 
 

@@ -8,7 +8,6 @@ read from the one small pseudo-inverse A~^+, which also covers redundant constra
 H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.mechanics.surfaces import Surface
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, finite_vector
 
 
 @dataclass(frozen=True)
@@ -56,15 +55,8 @@ class Contact:
                 f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, Cylinder, "
                 "ImplicitSurface ..."
             )
-        try:
-            point = () if isinstance(self.point, str) else tuple(float(entry) for entry in self.point)
-        except (TypeError, ValueError):
-            point = ()
-        if len(point) != 3 or not all(math.isfinite(entry) for entry in point):
-            raise InvalidInput(
-                f"Contact point is {self.point!r}; give three finite numbers x, y, z in m, in frame {self.frame!r}."
-            )
-        object.__setattr__(self, "point", point)
+        point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")
+        object.__setattr__(self, "point", tuple(point.tolist()))
 
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:
         """World position p(q) of the contact point (..., 3) in m."""
@@ -119,11 +111,8 @@ class State:
     ) -> "State":
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
         q, v, u = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v), ("u", u)))
-        try:
-            q, v, u = torch.broadcast_tensors(q, v, u)
-        except RuntimeError:
-            shapes = f"q {tuple(q.shape)}, v {tuple(v.shape)}, u {tuple(u.shape)}"
-            raise InvalidInput(f"batch shapes do not broadcast: {shapes}; make them equal, or 1.") from None
+        batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
+        q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
         return cls(q, v, u, robot, robot.kinematics(q, v), inertials)
 
 

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.errors import InvalidInput
 from forcegp.mechanics.gauss_principle import State
-from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.robots import Robot
+from forcegp.robots.arguments import by_joint
 
 PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
 
@@ -53,7 +53,21 @@ class KnownForce(ABC):
 
     def _bound(self, name: str, robot: Robot) -> Tensor:
         what = f"{type(self).__name__} {name}"
-        values = _per_joint(what, getattr(self, name), robot)
+        given = by_joint(getattr(self, name), robot.joint_names, robot.name)
+        try:
+            values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise InvalidInput(
+                f"{what} is {given!r}; give a number, one per joint, or a mapping from joint names."
+            ) from None
+        values = (values.expand(robot.nv) if values.dim() == 0 else values).clone()  # which keeps the graph
+        if values.shape != (robot.nv,):
+            raise InvalidInput(
+                f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
+                f"{', '.join(robot.joint_names)}"
+            )
+        if not bool(torch.isfinite(values).all()):
+            raise InvalidInput(f"{what} is {values.tolist()}; every joint needs a finite number.")
         if name in self.signed:
             return values
         if name in self.positive and not bool((values > 0).all()):
@@ -266,7 +280,7 @@ KNOWN_FORCES: dict[str, type[KnownForce]] = {
 
 
 def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
-    """Plain numbers for `known_force_from_dict`. Raises InvalidInput for a force that has no name in files."""
+    """Plain numbers for `object_from_dict`. Raises InvalidInput for a force that has no name in files."""
     name = next((name for name, kind in KNOWN_FORCES.items() if type(force) is kind), None)
     if name is None:
         raise InvalidInput(f"a {type(force).__name__} cannot be stored; files carry {', '.join(KNOWN_FORCES)}")
@@ -274,33 +288,3 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
     for f in fields(force):  # type: ignore[arg-type]  # every entry of KNOWN_FORCES is a dataclass
         stored[f.name] = torch.as_tensor(getattr(force, f.name)).tolist()
     return stored
-
-
-def known_force_from_dict(stored: Mapping[str, Any]) -> KnownForce:
-    """The force that `known_force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
-    return object_from_dict("known force", KNOWN_FORCES, stored)
-
-
-def _per_joint(name: str, given: object, robot: Robot) -> Tensor:
-    """One finite float64 number per joint, on the robot's device: a copy, in which tensors keep their graph."""
-    if isinstance(given, Mapping):
-        unknown = next((joint for joint in given if joint not in robot.joint_names), None)
-        if unknown is not None:
-            raise UnknownJoint(unknown_name_message("joint", unknown, robot.name, robot.joint_names))
-        given = [given.get(joint, 0.0) for joint in robot.joint_names]
-    try:
-        values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
-    except (TypeError, ValueError, RuntimeError):
-        raise InvalidInput(
-            f"{name} is {given!r}; give a number, one per joint, or a mapping from joint names."
-        ) from None
-    if values.dim() == 0:
-        values = values.expand(robot.nv)
-    if values.shape != (robot.nv,):
-        raise InvalidInput(
-            f"{name} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
-            f"{', '.join(robot.joint_names)}"
-        )
-    if not bool(torch.isfinite(values).all()):
-        raise InvalidInput(f"{name} is {values.tolist()}; every joint needs a finite number.")
-    return values.clone()

@@ -18,6 +18,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.robots.arguments import finite_vector
 
 Kind = TypeVar("Kind")
 
@@ -90,44 +91,14 @@ class Plane(Surface):
         return p.new_zeros(*p.shape[:-1], 3, 3)
 
 
-@dataclass(frozen=True)
-class Sphere(Surface):
-    """The sphere |p - center| = radius; the normal points outwards."""
+class _Round(Surface):
+    """All points at distance `radius` from a centre or an axis."""
 
-    center: Vector
     radius: float
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _vector("Sphere center", self.center))
-        object.__setattr__(self, "radius", _positive("Sphere radius", self.radius))
-
-    @override
-    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1) - self.radius
-
-    @override
-    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        ray = p - _tensor(self.center, p)
-        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
-
-    @override
-    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-        ray = p - _tensor(self.center, p)
-        return _distance_hessian(ray, torch.eye(3, dtype=p.dtype, device=p.device))
-
-
-@dataclass(frozen=True)
-class Cylinder(Surface):
-    """All points at distance `radius` from the line through `point` along `axis`; the normal points outwards."""
-
-    point: Vector
-    axis: Vector
-    radius: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", _direction("Cylinder axis", self.axis)[0])
-        object.__setattr__(self, "point", _vector("Cylinder point", self.point))
-        object.__setattr__(self, "radius", _positive("Cylinder radius", self.radius))
+    @abstractmethod
+    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """The ray to p from the nearest point there, and its derivative d ray / dp, a projector."""
 
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -140,10 +111,43 @@ class Cylinder(Surface):
 
     @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-        return _distance_hessian(*self._radial(p))
+        ray, projector = self._radial(p)  # (projector - n n^T) / |ray|
+        distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
+        normal = ray[..., None] / distance
+        return (projector - normal @ normal.mT) / distance
 
+
+@dataclass(frozen=True)
+class Sphere(_Round):
+    """The sphere |p - center| = radius; the normal points outwards."""
+
+    center: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", _vector("Sphere center", self.center))
+        object.__setattr__(self, "radius", _positive("Sphere radius", self.radius))
+
+    @override
     def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Vector from the axis to p, and the projector onto the plane across the axis."""
+        return p - _tensor(self.center, p), torch.eye(3, dtype=p.dtype, device=p.device)
+
+
+@dataclass(frozen=True)
+class Cylinder(_Round):
+    """All points at distance `radius` from the line through `point` along `axis`; the normal points outwards."""
+
+    point: Vector
+    axis: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "axis", _direction("Cylinder axis", self.axis)[0])
+        object.__setattr__(self, "point", _vector("Cylinder point", self.point))
+        object.__setattr__(self, "radius", _positive("Cylinder radius", self.radius))
+
+    @override
+    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
         axis = _tensor(self.axis, p)
         projector = torch.eye(3, dtype=p.dtype, device=p.device) - torch.outer(axis, axis)
         return (p - _tensor(self.point, p)) @ projector, projector
@@ -180,10 +184,7 @@ SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinde
 
 
 def surface_to_dict(surface: Surface) -> dict[str, Any]:
-    """Plain numbers that `surface_from_dict` turns back into the surface.
-
-    Raises ContactError for a surface that holds code.
-    """
+    """Plain numbers for `object_from_dict`. Raises ContactError for a surface that holds code."""
     name = next((name for name, kind in SURFACES.items() if type(surface) is kind), None)
     if name is None:
         raise ContactError(
@@ -191,18 +192,6 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
             f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
         )
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
-
-
-def surface_from_dict(stored: dict[str, Any]) -> Surface:
-    """The surface that `surface_to_dict` stored. Raises FileFormatError for an unknown type or missing fields."""
-    return object_from_dict("surface", SURFACES, stored)
-
-
-def _distance_hessian(ray: Tensor, projector: Tensor) -> Tensor:
-    """Hessian of |ray| where d ray / dp = projector: (projector - n n^T) / |ray|."""
-    distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
-    normal = ray[..., None] / distance
-    return (projector - normal @ normal.mT) / distance
 
 
 def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
@@ -227,13 +216,7 @@ def _positive(name: str, value: object) -> float:
 
 
 def _vector(name: str, values: object) -> Vector:
-    try:
-        entries = tuple(_number(name, entry) for entry in values)  # type: ignore[attr-defined]  # what is no sequence is an error below
-    except TypeError:
-        entries = ()
-    if len(entries) != 3:
-        raise InvalidInput(f"{name} is {values!r}; give three numbers x, y, z.")
-    return entries  # type: ignore[return-value]  # three of them, as checked
+    return tuple(finite_vector(name, values, 3, " x, y, z").tolist())  # type: ignore[return-value]  # three of them
 
 
 def _direction(name: str, values: object) -> tuple[Vector, float]:

@@ -17,10 +17,9 @@ from forcegp.mechanics.known_forces import (
     Actuation,
     KnownForce,
     RigidBodyBias,
-    known_force_from_dict,
     known_force_to_dict,
 )
-from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
 from forcegp.summary import Summary, listed
@@ -227,11 +226,13 @@ class MechanicalSystem(Summary):
             )
             if contacts is None:
                 contacts = [
-                    Contact(entry["frame"], tuple(entry["point"]), surface_from_dict(entry["surface"]))
+                    Contact(
+                        entry["frame"], tuple(entry["point"]), object_from_dict("surface", SURFACES, entry["surface"])
+                    )
                     for entry in stored["contacts"]
                 ]
             baumgarte = None if stored["baumgarte"] is None else Baumgarte(**stored["baumgarte"])
-            forces = tuple(known_force_from_dict(entry) for entry in stored["known_forces"])
+            forces = tuple(object_from_dict("known force", KNOWN_FORCES, entry) for entry in stored["known_forces"])
         except FileFormatError:
             raise
         except (ForceGPError, KeyError, TypeError, ValueError, AttributeError) as error:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownJoint, unknown_name_message, usable_arguments
+from forcegp.errors import InvalidInput, UnknownJoint, require_known, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.basic_kernels import LOG_LENGTHSCALE_SPREAD, log_scale, register_log_normal_prior
 from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling
@@ -220,8 +220,7 @@ def joint_indices(joints: Sequence[str] | None, robot: Robot) -> list[int]:
     """Positions of the joints (None: all). Raises UnknownJoint for a name that the robot does not have."""
     names = robot.joint_names
     for joint in joints or ():
-        if joint not in names:
-            raise UnknownJoint(unknown_name_message("joint", joint, robot.name, names))
+        require_known("joint", joint, robot.name, names, UnknownJoint)
     return list(range(len(names))) if joints is None else [names.index(joint) for joint in joints]
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.distributions import StudentT
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_known
 from forcegp.priors.basic_kernels import (
     LOG_LENGTHSCALE_SPREAD,
     LOG_VARIANCE_SPREAD,
@@ -196,9 +196,8 @@ class KernelExpression:
         name = self._tokens.pop(0)
         if name in "()+*":
             raise self._wrong(f"{name!r} stands where a name is expected")
-        if name not in self.factories:
-            where = "the registry" if name == self.expression.strip() else repr(self.expression)
-            raise InvalidInput(unknown_name_message("kernel", name, where, self.factories, synonyms=ELSEWHERE))
+        where = "the registry" if name == self.expression.strip() else repr(self.expression)
+        require_known("kernel", name, where, self.factories, synonyms=ELSEWHERE)
         return self.factories[name]
 
     def _accept(self, token: str) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from inspect import Parameter, signature
 from typing import Any
 
-from forcegp.errors import FileFormatError, InvalidInput, unknown_name_message, usable_arguments
+from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.priors.contact_friction import ContactFriction
@@ -125,8 +125,7 @@ def _one(text: str, expression: str) -> ForcePrior:
             f"{name!r} in {expression!r} is a kernel, not a prior; a '+' inside of a kernel needs parentheses, as in "
             f"tool-friction:kernel=(linear + {name})"
         )
-    if name not in NAMED_PRIORS:
-        raise InvalidInput(unknown_name_message("prior", name, f"{expression!r}", NAMED_PRIORS))
+    require_known("prior", name, f"{expression!r}", NAMED_PRIORS)
     named = NAMED_PRIORS[name]
     given = dict(named.arguments)
     allowed = signature(named.prior).parameters

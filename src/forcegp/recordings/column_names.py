@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_known
 from forcegp.recordings.source import Source
 
 BRACES = re.compile(r"\{([^{}]*)\}")
@@ -222,9 +222,8 @@ class _Parser:
         self.rest = self.rest[found.end() :].lstrip()
         if kind in ("number", "pi"):
             return None, float(word) if kind == "number" else math.pi
-        if word not in self.columns:
-            where = "" if word == self.text else f" (in {self.text!r})"
-            raise InvalidInput(unknown_name_message("column", word, f"{self.owner}{where}", self.columns))
+        where = "" if word == self.text else f" (in {self.text!r})"
+        require_known("column", word, f"{self.owner}{where}", self.columns)
         return word, 1.0
 
     def _taken(self, sign: str) -> bool:

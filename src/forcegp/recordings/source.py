@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from typing_extensions import override
 
-from forcegp.errors import FileFormatError, ForceGPError, unknown_name_message
+from forcegp.errors import FileFormatError, ForceGPError, require_known
 
 Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
@@ -85,8 +85,7 @@ class Source(ABC):
         """Raises FileFormatError for a name that is no column."""
         known = self.columns()
         for name in names:
-            if name not in known:
-                raise FileFormatError(unknown_name_message("column", name, str(self.path), known))
+            require_known("column", name, str(self.path), known, FileFormatError)
 
 
 def require_distinct(path: Path, names: Sequence[str]) -> None:

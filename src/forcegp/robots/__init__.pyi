@@ -4,5 +4,6 @@ from .inertia import (
     pseudo_inertia_from_parameters as pseudo_inertia_from_parameters,
 )
 from .kinematics import Kinematics as Kinematics
-from .structure import Joint as Joint, Link as Link, LinkInertia as LinkInertia
+from .urdf import Joint as Joint
+from .structure import Link as Link, LinkInertia as LinkInertia
 from .robot import Robot as Robot

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import ForceGPError, InvalidInput, UnknownJoint, unknown_name_message
+from forcegp.errors import ForceGPError, InvalidInput, UnknownJoint, require_known
 
 LARGEST = 2**63 - 1
 """Of the integers that every library takes."""
@@ -137,15 +137,15 @@ def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
         ) from None
 
 
-def finite_vector(name: str, values: Vector, size: int) -> np.ndarray:
-    """``size`` finite numbers as an array."""
+def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.ndarray:
+    """``size`` finite numbers as an array; ``meaning`` follows them in the error, " x, y, z" for example."""
     try:
         plain = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
         array = real_array(name, plain).astype(np.float64)
     except InvalidInput:  # text, of which every letter could be a digit
-        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.") from None
+        array = np.full((), np.nan)
     if array.shape != (size,) or not np.isfinite(array).all():
-        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers.")
+        raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers{meaning}.")
     return array
 
 
@@ -156,18 +156,22 @@ def checked_point(point: Vector, device: torch.device) -> Tensor:
     return checked_tensor("point", point, 3, "x, y, z in m", device)
 
 
+def by_joint(given: Any, joints: tuple[str, ...], robot: str) -> Any:
+    """Values in joint order if they are given by joint name, 0 for those not named; else as they are given."""
+    if not isinstance(given, Mapping):
+        return given
+    for name in given:
+        require_known("joint", name, robot, joints, UnknownJoint)
+    return [given.get(name, 0.0) for name in joints]
+
+
 def armature_values(
     given: Vector | Mapping[str, float | int] | None, joints: tuple[str, ...], robot: str
 ) -> np.ndarray:
     """Rotor inertia per joint (kg m^2 or kg), given in joint order or by joint name; 0 where it is not given."""
     if given is None:
         return np.zeros(len(joints))
-    if isinstance(given, Mapping):
-        unknown = next((name for name in given if name not in joints), None)
-        if unknown is not None:
-            raise UnknownJoint(unknown_name_message("joint", unknown, robot, joints))
-        given = [given.get(name, 0.0) for name in joints]
-    values = finite_vector("armature", given, len(joints))
+    values = finite_vector("armature", by_joint(given, joints, robot), len(joints))
     if (values < 0.0).any():
         joint = joints[int(np.argmin(values))]
         raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")

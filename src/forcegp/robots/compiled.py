@@ -73,8 +73,6 @@ class CompiledRobot:
                 self.program(Request(name, inertials, keeps=True))
         return self
 
-    # ------------------------------------------------------------------ dynamics
-
     def mass_matrix(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
         return self._evaluate("mass_matrix", inertials, q=q)[0]
@@ -107,8 +105,6 @@ class CompiledRobot:
     ) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
         return self._evaluate("forward_dynamics", inertials, q=q, v=v, tau=tau)[0]
-
-    # ------------------------------------------------------------------ inside
 
     def program(self, request: Request) -> RowFunction:
         """The machine code of a request."""

@@ -113,16 +113,12 @@ class Request(NamedTuple):
     def sizes(self, unrolled: UnrolledRobot) -> dict[str, int]:
         """Length of every input, result and derivative by name."""
         nv = unrolled.nv
-        results = {MERGED: (len(INERTIA_ENTRIES) * nv,)}.get(
-            self.function, tuple(nv**d for d in DIMENSIONS.get(self.function, (1,)))
-        )
-        given = {"inertias": len(INERTIA_ENTRIES) * nv, "parameters": 10 * len(self.links)}
+        merged = len(INERTIA_ENTRIES) * nv
+        results = [merged] if self.function == MERGED else [nv**d for d in DIMENSIONS.get(self.function, (1,))]
+        given = {"inertias": merged, "parameters": 10 * len(self.links)}
         kept = dict.fromkeys(KEPT, len(unrolled.pairs) + 2 * nv)
-        return (
-            {name: given.get(name, nv) for name in self.arguments}
-            | kept
-            | dict(zip(self.results, results, strict=True))
-        )
+        arguments = {name: given.get(name, nv) for name in self.arguments}
+        return arguments | kept | dict(zip(self.results, results, strict=True))
 
 
 def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:

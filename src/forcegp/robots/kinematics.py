@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.arguments import Inertials, Vector, broadcast_batch, checked_point
+from forcegp.robots.arguments import Inertials, JointValues, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD, Tree
 from forcegp.robots.structure import RobotStructure
@@ -145,15 +145,6 @@ def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor
     return -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
 
 
-def solve_mass_matrix(mass: Float[Tensor, "*batch n n"], force: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-    """``M^-1 force`` by Cholesky; :class:`~forcegp.errors.NumericalError` where M is not positive definite."""
-    try:
-        factor = torch.linalg.cholesky(mass)
-    except torch.linalg.LinAlgError as error:
-        raise NumericalError(NOT_POSITIVE_DEFINITE) from error
-    return torch.cholesky_solve(force[..., None], factor).squeeze(-1)
-
-
 @dataclass(frozen=True, eq=False)
 class Kinematics:
     """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
@@ -184,8 +175,6 @@ class Kinematics:
         v = _columns(v, batch)
         return cls(robot, batch, poses, vectors, twists, v, body_accelerations(robot.tree, twists, v))
 
-    # ------------------------------------------------------------------ dynamics
-
     def mass_matrix(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         at, inertias = self._with_inertias(inertials)
@@ -208,28 +197,26 @@ class Kinematics:
         at, inertias = self._with_inertias(inertials)
         return at._rows(gravity_forces(self.robot.tree, at.twists, inertias))
 
-    def inverse_dynamics(
-        self, a: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, a: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
         a = self.robot.checked_input("a", a)
-        at, inertias = self._expand(self._broadcast("a", a.shape[:-1]))._with_inertias(inertials)
+        at, inertias = self._expanded("a", a.shape[:-1])._with_inertias(inertials)
         _, v = at._moving("inverse_dynamics")
         tree, a = self.robot.tree, _columns(a, at.batch_shape)
         accelerations = body_accelerations(tree, at.twists, v, a)
         forces = joint_forces(tree, at.twists, accelerations, inertias)
         return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
-    def forward_dynamics(
-        self, tau: Float[Tensor, "*batch nv"], inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, tau: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
         tau = self.robot.checked_input("tau", tau)
-        at, inertias = self._expand(self._broadcast("tau", tau.shape[:-1]))._with_inertias(inertials)
+        at, inertias = self._expanded("tau", tau.shape[:-1])._with_inertias(inertials)
         net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
-        return at._rows(solve_mass_matrix(at._mass_matrix(inertias), net))
-
-    # ------------------------------------------------------------------ linear in the standard parameters of bodies
+        try:
+            factor = torch.linalg.cholesky(at._mass_matrix(inertias))
+        except torch.linalg.LinAlgError as error:
+            raise NumericalError(NOT_POSITIVE_DEFINITE) from error
+        return at._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
 
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
         """Joint forces per unit of the standard parameters of each body (..., nv, nv, 10), armature left out.
@@ -238,7 +225,7 @@ class Kinematics:
         origin and in the axes of the child link, in the order of :func:`forcegp.robots.inertia.standard_basis`.
         """
         a = self.robot.checked_input("a", a)
-        at = self._expand(self._broadcast("a", a.shape[:-1]))
+        at = self._expanded("a", a.shape[:-1])
         _, v = at._moving("torque_regressor")
         tree = self.robot.tree
         accelerations = body_accelerations(tree, at.twists, v, _columns(a, at.batch_shape))
@@ -257,8 +244,6 @@ class Kinematics:
         pseudo = frames @ pseudo_inertia_of_standard(parameters) @ frames.mT
         inertias = world_inertias(self.poses, pseudo[..., None])
         return self._rows(self._mass_matrix(inertias)), self._rows(self._bias_forces(inertias))
-
-    # ------------------------------------------------------------------ frames
 
     def frame_pose(self, frame: str) -> Float[Tensor, "... 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
@@ -292,8 +277,6 @@ class Kinematics:
         angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ acceleration.flatten(0, 1))
         return at._rows(torch.cat([linear, angular]).mT)
 
-    # ------------------------------------------------------------------ inside
-
     def _rows(self, values: Tensor) -> Tensor:
         """Give values (batch, ...) their batch dimensions back."""
         return values.reshape(*self.batch_shape, *values.shape[1:])
@@ -321,7 +304,7 @@ class Kinematics:
         batch = inertias.shape[3:]
         if not batch:
             return self, world_inertias(self.poses, inertias[..., None])
-        at = self._expand(self._broadcast("inertials", batch))
+        at = self._expanded("inertials", batch)
         return at, world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
 
     def _world_point(self, frame: str, point: Vector | None) -> "tuple[Kinematics, int, Tensor]":
@@ -336,14 +319,13 @@ class Kinematics:
             if point.dim() == 1:
                 local = homogeneous[..., None]
             else:
-                at = self._expand(self._broadcast("point", point.shape[:-1]))
+                at = self._expanded("point", point.shape[:-1])
                 local = _expand_trailing(homogeneous.movedim((-2, -1), (0, 1)), 2, at.batch_shape)
         return at, body, local if body == WORLD else product(at.poses[body], local)
 
-    def _broadcast(self, name: str, batch: torch.Size) -> torch.Size:
-        return broadcast_batch({"the states": self.batch_shape, name: batch})
-
-    def _expand(self, batch: torch.Size) -> "Kinematics":
+    def _expanded(self, name: str, given: torch.Size) -> "Kinematics":
+        """These states, broadcast against the batch of the argument ``name``."""
+        batch = broadcast_batch({"the states": self.batch_shape, name: given})
         if batch == self.batch_shape:
             return self
 
@@ -351,15 +333,8 @@ class Kinematics:
             lead = values.shape[:-1]
             return _expand_trailing(values.reshape(*lead, *self.batch_shape), len(lead), batch)
 
-        return replace(
-            self,
-            batch_shape=batch,
-            poses=wider(self.poses),
-            vectors=wider(self.vectors),
-            twists=wider(self.twists),
-            v=None if self.v is None else wider(self.v),
-            accelerations=None if self.accelerations is None else wider(self.accelerations),
-        )
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, batch_shape=batch, **{name: wider(value) for name, value in tensors.items()})
 
 
 def _columns(values: Tensor, batch: torch.Size) -> Tensor:

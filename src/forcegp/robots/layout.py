@@ -23,7 +23,7 @@ from forcegp.errors import (
     UnknownJoint,
     UnknownLink,
     UnsupportedJoint,
-    unknown_name_message,
+    require_known,
 )
 from forcegp.robots.arguments import Inertials, broadcast_batch, usable_device
 from forcegp.robots.inertia import (
@@ -37,7 +37,7 @@ from forcegp.robots.inertia import (
     skew,
     transform,
 )
-from forcegp.robots.urdf import MOVABLE, InertialDescription, JointDescription, RobotDescription
+from forcegp.robots.urdf import MOVABLE, JointDescription, RobotDescription
 
 WORLD = -1
 
@@ -71,10 +71,8 @@ class Layout:
 
     def require_moving(self, link: str, robot: str) -> None:
         """Raise where ``link`` has no inertia that matters: it does not exist, or it is fixed in the world."""
-        placement = self.links.get(link)
-        if placement is None:
-            raise UnknownLink(unknown_name_message("link", link, robot, self.links))
-        if placement.body == WORLD:
+        require_known("link", link, robot, self.links, UnknownLink)
+        if self.links[link].body == WORLD:
             raise InvalidInput(
                 f"link {link!r} of {robot} is fixed in the world, so its inertia never enters the dynamics and "
                 f"cannot be a parameter; name a moving link: {', '.join(self.moving)}"
@@ -114,8 +112,7 @@ def lay_out(description: RobotDescription, locked: Mapping[str, float]) -> Layou
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
     by_name = {joint.name: joint for joint in description.joints}
     for name in locked:
-        if name not in by_name:
-            raise UnknownJoint(unknown_name_message("joint", name, description.source, by_name))
+        require_known("joint", name, description.source, by_name, UnknownJoint)
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
     for joint in description.joints:
@@ -172,38 +169,32 @@ def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
     return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
 
 
-def check_inertias(description: RobotDescription, layout: Layout, armature: np.ndarray) -> None:
-    """Every moving link must be physically possible and every body resist its joint, by itself or by ``armature`` (n,).
+def check_inertias(description: RobotDescription, layout: Layout, tree: "Tree") -> None:
+    """Every moving link must be physically possible and every body resist its joint, by itself or by its armature.
 
     A body resists a prismatic joint by its mass and any other joint by its inertia about the axis. Where all bodies do,
     the mass matrix is positive definite at every position: the moving joint nearest to the base moves its body by
     itself alone. Links fixed in the world need no inertia.
     """
-    mass = np.zeros(len(layout.joints))
-    bodies = np.zeros((len(layout.joints), 4, 4))
-    for name, placement in layout.links.items():
-        inertial: InertialDescription | None = description.links[name]
-        if placement.body == WORLD or inertial is None:
-            continue
-        objection = physical_objection(inertial.mass, inertial.center_of_mass, inertial.inertia)
-        if objection is not None:
+    for name in layout.moving:
+        inertial = description.links[name]
+        objection = inertial and physical_objection(inertial.mass, inertial.center_of_mass, inertial.inertia)
+        if objection:
             raise NonPhysicalInertia(
                 f"{description.source}: no physical body has the inertia of link {name!r}: {objection}. Correct its "
                 "<inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>), or "
                 "take the nearest inertia that a body can have: `inertias='nearest'`."
             )
-        mass[placement.body] += inertial.mass
-        local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
-        bodies[placement.body] += placement.offset @ local @ placement.offset.T
+    bodies = tree.inertias[..., 0].numpy()
     for body, joint in enumerate(layout.joints):
         carried = [name for name, placement in layout.links.items() if placement.body == body and name != joint.child]
         others = f" and the links fixed to it ({', '.join(map(repr, carried))})" if carried else ""
-        if mass[body] == 0.0:
+        if bodies[body, 3, 3] == 0.0:
             raise MissingInertia(
                 f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no mass; "
                 f"add an <inertial> element, make the joint fixed, or lock it with locked={{{joint.name!r}: 0.0}}."
             )
-        if joint.type != "prismatic" and armature[body] == 0.0 and axis_inertia_vanishes(bodies[body]):
+        if joint.type != "prismatic" and tree.armature[body] == 0.0 and axis_inertia_vanishes(bodies[body]):
             raise NonPhysicalInertia(
                 f"{description.source}: link {joint.child!r}{others} turns with joint {joint.name!r} but has no "
                 "rotational inertia about its axis, so any force would accelerate it infinitely; correct its "
@@ -273,10 +264,8 @@ class Tree:
         )
 
 
-def compile_tree(
-    description: RobotDescription, layout: Layout, *, gravity: np.ndarray, armature: np.ndarray, device: torch.device
-) -> Tree:
-    """Batched constants for :mod:`forcegp.robots.kinematics`, on ``device``."""
+def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray, armature: np.ndarray) -> Tree:
+    """Batched constants for :mod:`forcegp.robots.kinematics`, on the CPU."""
     n = len(layout.joints)
     revolute = np.array([joint.type != "prismatic" for joint in layout.joints])
     rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
@@ -307,10 +296,10 @@ def compile_tree(
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
     related = np.maximum(descendants, descendants.T)
-    levels, order = _levels(layout.parents, device)
+    levels, order = _levels(layout.parents)
 
     def constant(array: np.ndarray) -> Tensor:
-        return torch.tensor(array, dtype=torch.float64, device=device)
+        return torch.tensor(array, dtype=torch.float64)
 
     return Tree(
         rest=constant(rest[..., None]),
@@ -356,7 +345,7 @@ def merged_inertias(tree: Tree, layout: Layout, inertials: Inertials) -> Float[T
     return kept.reshape(-1, 4, 4, *(1 for _ in batch)) + added
 
 
-def _levels(parents: tuple[int, ...], device: torch.device) -> tuple[tuple[Level, ...], Tensor | None]:
+def _levels(parents: tuple[int, ...]) -> tuple[tuple[Level, ...], Tensor | None]:
     depth: list[int] = []
     for parent in parents:
         depth.append(0 if parent == WORLD else depth[parent] + 1)
@@ -368,10 +357,10 @@ def _levels(parents: tuple[int, ...], device: torch.device) -> tuple[tuple[Level
         contiguous = joints == list(range(joints[0], joints[-1] + 1))
         levels.append(
             Level(
-                slice(joints[0], joints[-1] + 1) if contiguous else torch.tensor(joints, device=device),
-                None if whole else torch.tensor(above, device=device),
+                slice(joints[0], joints[-1] + 1) if contiguous else torch.tensor(joints),
+                None if whole else torch.tensor(above),
             )
         )
     laid = [i for joints in members for i in joints]
-    order = None if laid == sorted(laid) else torch.tensor(np.argsort(laid), device=device)
+    order = None if laid == sorted(laid) else torch.tensor(np.argsort(laid))
     return tuple(levels), order

@@ -43,8 +43,6 @@ class Robot(RobotStructure):
     :class:`~forcegp.errors.UnknownName`.
     """
 
-    # ------------------------------------------------------------------ making one
-
     @classmethod
     @usable_arguments("Robot.from_urdf")
     def from_urdf(
@@ -88,14 +86,8 @@ class Robot(RobotStructure):
         text, description = with_chosen_inertias(inertias, text, description, layout)
         names = tuple(joint.name for joint in layout.joints)
         rotor_inertias = armature_values(armature, names, description.name)
-        check_inertias(description, layout, rotor_inertias)
-        tree = compile_tree(
-            description,
-            layout,
-            gravity=finite_vector("gravity", gravity, 3),
-            armature=rotor_inertias,
-            device=torch.device("cpu"),
-        )
+        tree = compile_tree(description, layout, finite_vector("gravity", gravity, 3), rotor_inertias)
+        check_inertias(description, layout, tree)
         frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
         return cls(description, layout, tree, text, tuple(locked.items()), frames)
 
@@ -143,8 +135,6 @@ class Robot(RobotStructure):
             write_text(self.urdf_text, Path(path))
         return self.urdf_text
 
-    # ------------------------------------------------------------------ dynamics
-
     def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:
         """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""
         q = self.checked_input("q", q)
@@ -190,8 +180,6 @@ class Robot(RobotStructure):
         Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
         """
         return self.kinematics(q, v).forward_dynamics(tau, inertials)
-
-    # ------------------------------------------------------------------ frames
 
     def frame_pose(self, q: Float[Tensor, "*batch nv"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""

@@ -9,37 +9,16 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, unknown_name_message
+from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
-from forcegp.robots.urdf import InertialDescription, JointDescription, RobotDescription
+from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
+MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
 ALIASES = {"center_of_mass": "com"}
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
-
-    name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic'
-    parent: str
-    child: str
-    axis: tuple[float, float, float]  # unit vector in the joint frame
-    lower: float
-    upper: float
-    velocity_limit: float
-    effort_limit: float
-    damping: float  # Nms/rad or Ns/m
-    friction: float  # Nm or N
-
-    @classmethod
-    def of(cls, joint: JointDescription) -> "Joint":
-        """A movable joint as a description has it, without its place in the tree."""
-        return cls(**{field.name: getattr(joint, field.name) for field in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -75,19 +54,6 @@ class Link:
     mass: float  # kg; 0 for a massless frame
     center_of_mass: tuple[float, float, float]  # m, in the link frame
     inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
-
-    @classmethod
-    def of(cls, name: str, joint: str | None, inertial: InertialDescription | None) -> "Link":
-        """A link with its inertia; without one it is a massless frame."""
-        if inertial is None:
-            return cls(name, joint, 0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
-        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
-        return cls(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
-
-    def log_cholesky(self, owner: str) -> Float[Tensor, "10"]:
-        """Log-Cholesky parameters; ``owner`` is the robot that error messages name. Raises as log_cholesky_of_link."""
-        center, inertia = np.array(self.center_of_mass), np.array(self.inertia)
-        return log_cholesky_of_link(self.mass, center, inertia, f"{self.name!r} of {owner}")
 
     def inertial(self, *parts: str) -> LinkInertia:
         """Parts to learn, for ``StructuredGP.identify``: 'mass', 'com', 'inertia'; all three if none is named.
@@ -126,7 +92,8 @@ class RobotStructure(Summary):
     @property
     def joints(self) -> tuple[Joint, ...]:
         """Movable joints in the order of q."""
-        return tuple(map(Joint.of, self.layout.joints))
+        names = [field.name for field in fields(Joint)]
+        return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -165,18 +132,17 @@ class RobotStructure(Summary):
 
     def link(self, name: str) -> Link:
         """One link by name."""
-        placement = self.layout.links.get(name)
-        if placement is None:
-            raise UnknownLink(unknown_name_message("link", name, self.name, self.layout.links))
-        joint = None if placement.body == WORLD else self.joint_names[placement.body]
-        return Link.of(name, joint, self.description.links[name])
+        require_known("link", name, self.name, self.layout.links, UnknownLink)
+        body = self.layout.links[name].body
+        joint = None if body == WORLD else self.joint_names[body]
+        inertial = self.description.links[name] or MASSLESS
+        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
+        return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
 
     def joint(self, name: str) -> Joint:
         """One movable joint by name."""
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
-        raise UnknownJoint(unknown_name_message("joint", name, self.name, self.joint_names))
+        require_known("joint", name, self.name, self.joint_names, UnknownJoint)
+        return self.joints[self.joint_names.index(name)]
 
     def inertial_parameters(self, *links: str) -> dict[str, Float[Tensor, "10"]]:
         """Log-Cholesky parameters (10,) of the named links, to start an identification from.
@@ -184,9 +150,13 @@ class RobotStructure(Summary):
         Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
         :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
         """
+        out = {}
         for name in links:
             self.layout.require_moving(name, self.name)
-        return {name: self.link(name).log_cholesky(owner=self.name).to(self.device) for name in links}
+            own = self.description.links[name] or MASSLESS
+            owner = f"{name!r} of {self.name}"
+            out[name] = log_cholesky_of_link(own.mass, own.center_of_mass, own.inertia, owner).to(self.device)
+        return out
 
     @override
     def facts(self) -> dict[str, object]:
@@ -194,14 +164,10 @@ class RobotStructure(Summary):
         kinds = listed((f"{joint.name} ({joint.type})" for joint in self.layout.joints), most=7)
         return {"name": repr(self.name), "nv": self.nv, "links": len(self.layout.links), "joints": kinds}
 
-    # ------------------------------------------------------------------ checks of inputs
-
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
-        found = self._frames.get(name)
-        if found is None:
-            raise UnknownFrame(unknown_name_message("frame", name, self.name, self._frames))
-        body, offset = found
+        require_known("frame", name, self.name, self._frames, UnknownFrame)
+        body, offset = self._frames[name]
         return body, offset.clone()
 
     def checked_input(self, name: str, value: object) -> Tensor:

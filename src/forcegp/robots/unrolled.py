@@ -151,8 +151,6 @@ class UnrolledKinematics:
         """Joint forces (nv,) that hold the robot still."""
         return self._joint_forces([0.0] * self.unrolled.nv, None, inertias)
 
-    # ------------------------------------------------------------------ inside
-
     def _accelerations(self, v: Sequence[Any], a: Scalars | None) -> list[Scalars]:
         """Accelerations A (3, 4) of all bodies at joint accelerations ``a`` (0 if None), less that of free fall."""
         base = scalars([[0.0, 0.0, 0.0, -g] for g in self.unrolled.gravity])

@@ -44,21 +44,27 @@ class InertialDescription:
 
 
 @dataclass(frozen=True)
-class JointDescription:
-    """One ``<joint>``; ``origin`` (4, 4) places it in its parent link, ``axis`` is a unit vector in the joint frame."""
+class Joint:
+    """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
 
     name: str
-    type: str
+    type: str  # 'revolute' | 'continuous' | 'prismatic'
     parent: str
     child: str
-    origin: np.ndarray
-    axis: tuple[float, float, float]
+    axis: tuple[float, float, float]  # unit vector in the joint frame
     lower: float
     upper: float
     velocity_limit: float
     effort_limit: float
-    damping: float
-    friction: float
+    damping: float  # Nms/rad or Ns/m
+    friction: float  # Nm or N
+
+
+@dataclass(frozen=True, eq=False)
+class JointDescription(Joint):
+    """One ``<joint>``, which may also be fixed; ``origin`` (4, 4) places it in its parent link."""
+
+    origin: np.ndarray
     mimics: str | None
 
 

@@ -13,6 +13,7 @@ from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
 
 Heights = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]
+Aim = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 Motions = tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]
 
 
@@ -221,11 +222,7 @@ class TaskSpaceController:
         self.posture = np.deg2rad(config.start_degrees)
         self.selected = np.isin(np.arange(1, 8), config.null_space_joints).astype(np.float64)
 
-    def joint_acceleration(
-        self,
-        state: ArmState,
-        reference: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
-    ) -> Float[np.ndarray, " nv"]:
+    def joint_acceleration(self, state: ArmState, reference: Aim) -> Float[np.ndarray, " nv"]:
         """Commanded joint acceleration [rad/s^2]; `reference` is the aimed position, velocity and acceleration."""
         aim, aim_velocity, aim_acceleration = reference
         jacobian = state.jacobian

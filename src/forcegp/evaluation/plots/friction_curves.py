@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, unknown_name_message
+from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation.force_errors import true_names
 from forcegp.evaluation.plots import style
 from forcegp.mechanics import ConstrainedDynamics
@@ -110,10 +110,9 @@ def _velocity_along(term: ForcePrior, name: str, index: int) -> int | None:
 
 
 def _panel(panels: Sequence[CurvePanel], name: str) -> CurvePanel:
-    for panel in panels:
-        if panel.latent == name:
-            return panel
-    raise InvalidInput(unknown_name_message("curve", name, "this model", [panel.latent for panel in panels]))
+    by_name = {panel.latent: panel for panel in panels}
+    require_known("curve", name, "this model", by_name)
+    return by_name[name]
 
 
 def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:

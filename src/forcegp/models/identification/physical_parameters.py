@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, NumericalError, UnknownJoint, unknown_name_message, usable_arguments
+from forcegp.errors import InvalidInput, NumericalError, UnknownJoint, require_known, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import LinkInertia, physical_from_parameters
 
@@ -258,9 +258,8 @@ def _coefficients(system: MechanicalSystem, entry: Coefficients) -> _Coefficient
     robot = system.robot
     force = system.known_forces[system.force_index(entry.force)]
     joints = robot.joint_names if entry.joints is None else entry.joints
-    unknown = next((joint for joint in joints if joint not in robot.joint_names), None)
-    if unknown is not None:
-        raise UnknownJoint(unknown_name_message("joint", unknown, robot.name, robot.joint_names))
+    for joint in joints:
+        require_known("joint", joint, robot.name, robot.joint_names, UnknownJoint)
     chosen = torch.tensor([robot.joint_names.index(joint) for joint in joints], device=robot.device)
     values = getattr(force, str(force.learned)).detach().clone()
     if entry.start is not None:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, unknown_name_message
+from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import Actuation, ConstrainedDynamics
 from forcegp.models.prediction import Gaussian
@@ -52,8 +52,7 @@ class Components(Mapping[str, ForceComponent]):
 
     @override
     def __getitem__(self, name: str) -> ForceComponent:
-        if name not in self.parts:
-            raise InvalidInput(unknown_name_message("component", name, "this model", list(self.parts)))
+        require_known("component", name, "this model", self.parts)
         return self.parts[name]
 
     @override

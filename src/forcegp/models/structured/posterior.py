@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, require_type, unknown_name_message, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.inference import (
     Engine,
     InducingPosterior,
@@ -201,8 +201,7 @@ class StructuredPosterior(Posterior):
         Raises InvalidInput for another name, wrong shapes, and None for processes of several features.
         """
         names = self.latent_names
-        if latent not in names:
-            raise InvalidInput(unknown_name_message("latent", str(latent), "this model", names))
+        require_known("latent", latent, "this model", names)
         index = names.index(latent)
         prior, robot = self.model.prior, self.model.system.robot
         with torch.no_grad():
