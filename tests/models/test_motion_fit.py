@@ -23,7 +23,8 @@ from forcegp.data.motion_records import all_motions, recorded_motions
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.mechanics import Actuation, Armature, CoulombJointFriction, RigidBodyBias, ViscousJointFriction
 from forcegp.models import Noise
-from forcegp.models.structured.motion_fit import MotionFit, Unknowns
+from forcegp.models.structured.motion_fit import MotionFit
+from forcegp.models.structured.motion_unknowns import Unknowns
 
 URDF = """<robot name="slide"><link name="base"/><link name="cart"><inertial><mass value="5"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="x" type="prismatic">
@@ -128,6 +129,34 @@ def test_processes_learn_from_motions_what_no_law_has(beyond_the_law):
     assert errors[2] < 0.1 * min(errors[:2])
     curve = refined.curve(refined.latent_names[0], np.array([0.3]))
     assert 0.0 < float(curve.std[0]) < 2.0
+
+
+def test_functions_that_motions_do_not_support_cost_nothing(along_the_law):
+    train, test = along_the_law, recording(line, 4)
+    parametric = analytical(train).refined_on_motions(train, 1.0)
+    rough = StructuredGP(slide(1.0, 1.0), JointFriction(), noise=QUIET).fit(train, points=60, restarts=1)
+    refined = rough.refined_on_motions(train, 1.0)
+    assert refined.settings["motions"]["not_told"][-1] == "x"
+    assert motion_error(refined, test) < 1.3 * motion_error(parametric, test) < 0.1 * motion_error(rough, test)
+
+
+def test_support_of_a_function_is_its_evidence_over_none(along_the_law):
+    """Of a linear model y = B x + e, as log densities of y with the function and without it."""
+    rough = StructuredGP(slide(1.0, 1.0), JointFriction(), noise=QUIET).fit(along_the_law, points=30, restarts=1)
+    unknowns = replace(Unknowns.of(rough, along_the_law, False), scales=torch.tensor([0.7], dtype=torch.float64))
+    size, count = sum(unknowns.sizes), unknowns.space.count
+    generator = torch.Generator().manual_seed(0)
+    B, y = (torch.randn(40, n, generator=generator, dtype=torch.float64) for n in (size, 1))
+    prior = torch.cat([torch.full((size - count,), 3.0), torch.full((count,), 0.7)]).double()
+    N = B.mT @ B + torch.diag(prior**-2)
+    (found,) = unknowns.support(torch.linalg.solve(N, B.mT @ y)[:, 0], N)
+
+    def density(columns):
+        covariance = torch.eye(40).double() + (B[:, columns] * prior[columns] ** 2) @ B[:, columns].mT
+        return torch.distributions.MultivariateNormal(torch.zeros(40).double(), covariance).log_prob(y[:, 0])
+
+    expected = density(slice(None)) - density(slice(size - count))
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0.0)
 
 
 def test_what_is_stored_predicts_the_same(beyond_the_law, tmp_path):
