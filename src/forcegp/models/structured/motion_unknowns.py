@@ -24,8 +24,8 @@ from forcegp.mechanics import MechanicalSystem
 Structured = Any
 """A `StructuredPosterior`, whose module imports this one."""
 POINTS = {1: 48, 2: 64}
-"""Inducing points of a latent with so many features; `MORE` of others. What too few cannot be is small beside forces and
-large beside the noise of positions: laws and scales bend to make up for it."""
+"""Inducing points of a latent with so many features; `MORE` of others. What too few cannot be is small beside forces
+and large beside the noise of positions: laws and scales bend to make up for it."""
 MORE = 96
 SCALES = 1e-3, 30.0
 """Least and largest scale: accelerations may show less of a force than motions, and more than there is. With the least
