@@ -1,7 +1,7 @@
 """`NAME/motions`: models refined on the motions of all training rows, in a comparison with those that were not."""
 
 import pytest
-from tests.models.test_motion_fit import bump, recording
+from tests.models.test_motion_fit import bump, line, recording
 from tests.validation.moving_arm import given_system
 
 from forcegp.errors import InvalidInput
@@ -18,6 +18,26 @@ def test_refined_models_move_better(tmp_path):
     found = validate(compared, tmp_path / "out", models=NAMES, seeds=1)
     plain, refined = (found.document["models"][name]["motions"]["rms"][-1]["median"] for name in NAMES)
     assert refined < 0.5 * plain
+
+
+def test_friction_laws_stand_side_by_side(tmp_path):
+    """The cart has dry friction: laws without it are worse, and so is what rests on them."""
+    data = recording(line, 1, seconds=10.0)
+    compared = Comparison(data, data, data.system, split_named(data, "blocks:4:2,4"), points=40, horizons=(0.1, 0.2))
+    dry, viscous, on_top = names = (
+        *("identified-acceleration-all", "identified-acceleration-all:viscous"),
+        "joint-friction@identified:viscous",
+    )
+    found = validate(compared, tmp_path / "out", models=names, seeds=1).document["models"]
+    error = {name: found[name]["nrmse"]["median"] for name in names}
+    assert max(error[dry], error[on_top]) < 0.7 * error[viscous]
+    assert found[viscous]["summary"].endswith("(friction viscous); noise from training rows held out")
+
+
+@pytest.mark.parametrize("name", ["identified-torque:dry", "joint@identified:", "joint@torque:viscous,none"])
+def test_unknown_laws_are_named(name):
+    with pytest.raises(InvalidInput, match=r"no identification is called .* out of viscous, coulomb"):
+        candidates([name], given_system())
 
 
 @pytest.mark.parametrize("name", ["analytical/motions", "independent-gp/motions", "ensemble/motions"])

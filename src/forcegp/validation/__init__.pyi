@@ -1,11 +1,11 @@
 from .candidates import (
     CANDIDATES as CANDIDATES, DEFAULT_MODELS as DEFAULT_MODELS, Candidate as Candidate, Training as Training,
 )
-from .comparison import Comparison as Comparison
-from .figures import figures_of as figures_of
-from .jobs import (
-    IDENTIFICATIONS as IDENTIFICATIONS, Identification as Identification, training_subset as training_subset,
+from .comparison import (
+    IDENTIFICATIONS as IDENTIFICATIONS, Comparison as Comparison, Identification as Identification,
+    training_subset as training_subset,
 )
+from .figures import figures_of as figures_of
 from .paired_tests import SCORES as SCORES
 from .run import Validation as Validation, validate as validate
 from .splits import (

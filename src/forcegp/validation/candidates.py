@@ -1,8 +1,9 @@
 """The models of a comparison, by name: each fits a posterior to the same training rows.
 
 A name is an entry of `CANDIDATES`, a way to identify the system (`identified-torque`), or an expression of priors as in
-`forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. With
-`/motions` at its end it is refined on the motions of all training rows (docs/motions.md). Add yours:
+`forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. A way to
+identify may name friction laws of its own (`identified-torque:viscous,load`), and with `/motions` at its end a model is
+refined on the motions of all training rows (docs/motions.md). Add yours:
 
     CANDIDATES["mine"] = Candidate("what it is", "black box", fit_mine)
 """
@@ -21,7 +22,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, has_few_inputs, named_prior
-from forcegp.validation.comparison import DEFAULT_IDENTIFICATION, IDENTIFICATIONS
+from forcegp.validation.comparison import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, LAWS_AFTER, identification_named
 
 Kind = Literal["given", "identified", "residual", "black box", "force prior"]
 """Parametric physics as given or identified, a Gaussian process on what it leaves of the acceleration, a model without
@@ -100,7 +101,7 @@ class Candidate:
     summary: what it is, for the page.
     kind: which questions it answers.
     fit: makes the posterior.
-    identification: the one that it builds on, a key of `IDENTIFICATIONS`; None for none.
+    identification: the one that it builds on, see `identification_named`; None for none.
     all_rows: whether it learns from all training rows alone, so that one seed stands for all.
     cost: CPU time relative to others, for the remaining time alone.
     """
@@ -115,10 +116,8 @@ class Candidate:
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
             raise InvalidInput(f"kind is {self.kind!r}; allowed: {', '.join(get_args(Kind))}.")
-        if self.identification is not None and self.identification not in IDENTIFICATIONS:
-            raise InvalidInput(
-                f"no identification is called {self.identification!r}; there are {', '.join(IDENTIFICATIONS)}."
-            )
+        if self.identification is not None:
+            identification_named(self.identification)
 
 
 def _fit_system(mean: str, training: Training) -> Posterior:
@@ -203,14 +202,15 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
             raise InvalidInput(f"model {name!r} has no physics to refine on motions, or is the one that was given.")
         summary = f"{base.summary}; refined on the motions of all training rows"
         return replace(base, summary=summary, fit=partial(_fit_motions, base.fit), cost=5.0 * base.cost)
-    if name.removeprefix(IDENTIFIED) in IDENTIFICATIONS and name.startswith(IDENTIFIED):
+    if name.startswith(IDENTIFIED) and name.removeprefix(IDENTIFIED).partition(LAWS_AFTER)[0] in IDENTIFICATIONS:
         return _identified_candidate(name.removeprefix(IDENTIFIED))
     expression, at, mean = (part.strip() for part in name.partition(MEAN))
-    mean = mean if at else "given"
-    method = {"given": None, "identified": identification}.get(mean, mean)
-    if method is not None and method not in IDENTIFICATIONS:
+    mean, colon, laws = (mean if at else "given").partition(LAWS_AFTER)
+    if mean not in ("given", "identified", *IDENTIFICATIONS) or (colon and mean == "given"):
         allowed = ", ".join(("given", "identified", *IDENTIFICATIONS))
         raise InvalidInput(f"model {name!r} takes its mean from {mean!r}; give PRIOR{MEAN}MEAN with one of {allowed}.")
+    method = {"given": None, "identified": identification}.get(mean, mean)
+    method = f"{method}{colon}{laws}" if colon else method
     try:
         prior = named_prior(expression, system)
     except InvalidInput as error:
@@ -221,19 +221,19 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
             f"no model is called {name!r}; {hint}there are {', '.join(known)}, and priors PRIOR{MEAN}MEAN with the "
             f"mean given or identified ({error})"
         ) from None
-    takes = "as given" if method is None else f"identified by {IDENTIFICATIONS[method].summary}"
+    takes = "as given" if method is None else f"identified by {identification_named(method).summary}"
     return Candidate(
         f"Gaussian processes on unknown forces ({expression}), mean of the system {takes}",
         "residual" if expression == RESIDUAL else "force prior",
         partial(_fit_forces, expression, "given" if method is None else method),
         method,
         cost=10.0,
-        all_rows=has_few_inputs(prior, system.robot) and (method is None or IDENTIFICATIONS[method].all_rows),
+        all_rows=has_few_inputs(prior, system.robot) and (method is None or identification_named(method).all_rows),
     )
 
 
 def _identified_candidate(method: str) -> Candidate:
-    chosen = IDENTIFICATIONS[method]
+    chosen = identification_named(method)
     noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
     summary = f"the system identified by {chosen.summary}; {noise}"
     return Candidate(summary, "identified", partial(_fit_system, method), method, all_rows=chosen.all_rows)

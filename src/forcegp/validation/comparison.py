@@ -2,13 +2,14 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from forcegp.analytical import NoiseLevels, held_out_noise, identify_analytical
+from forcegp.analytical.joint_terms import LAWS
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput, require_type
@@ -88,6 +89,34 @@ IDENTIFICATIONS: dict[str, Identification] = {
 }
 """By name. Add your own: IDENTIFICATIONS["mine"] = Identification("how", identify_mine)."""
 
+LAWS_AFTER = ":"  # between the name of an identification and laws of its own, in the place of those of the comparison
+
+
+def identification_named(name: str) -> Identification:
+    """The entry of `IDENTIFICATIONS` with that name; `acceleration-all:viscous,load` with friction laws of its own.
+
+    Raises InvalidInput for names and laws that do not exist.
+    """
+    base, colon, words = name.partition(LAWS_AFTER)
+    found, laws = IDENTIFICATIONS.get(base), tuple(words.split(","))
+    if found is None or (colon and not set(laws) <= set(LAWS)):
+        raise InvalidInput(
+            f"no identification is called {name!r}; there are {', '.join(IDENTIFICATIONS)}, each with friction laws of "
+            f"its own as in {DEFAULT_IDENTIFICATION}:viscous,coulomb (out of {', '.join(LAWS)})."
+        )
+    if not colon:
+        return found
+    noise = None if found.noise is None else partial(_with_laws, found.noise, laws)
+    summary = f"{found.summary} (friction {', '.join(laws)})"
+    return replace(found, summary=summary, identify=partial(_with_laws, found.identify, laws), noise=noise)
+
+
+def _with_laws(
+    function: Callable[..., Any], laws: Sequence[str], system: MechanicalSystem, rows: Dataset, _: Sequence[str]
+) -> Any:
+    return function(system, rows, laws)
+
+
 FRICTION = ("viscous", "coulomb")
 """Laws that are identified where nothing else is asked for."""
 
@@ -107,7 +136,7 @@ class Comparison:
     splits: what is held out; with several of them everything is done for each.
     points: training rows of every model.
     horizons, starts, integrator: of the predicted motions.
-    identification: what `@identified` and the mass matrix of force errors take, a key of `IDENTIFICATIONS`.
+    identification: what `@identified` and the mass matrix of force errors take, see `identification_named`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
     measured_torque: whether predictions account for a u that is as noisy (`Noise`); needs `force_noise`, or models that
@@ -143,10 +172,8 @@ class Comparison:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
         Noise(None, self.force_noise)
         integrator_named(self.integrator, self.system)
-        if self.identification not in IDENTIFICATIONS:
-            given, allowed = self.identification, ", ".join(IDENTIFICATIONS)
-            raise InvalidInput(f"no identification is called {given!r}; there are {allowed}.")
-        if self.measured_torque and self.force_noise is None and IDENTIFICATIONS[self.identification].noise is None:
+        chosen = identification_named(self.identification)
+        if self.measured_torque and self.force_noise is None and chosen.noise is None:
             raise InvalidInput(
                 "measured_torque needs a noise of the forces; give `force_noise`, or an `identification` of "
                 "all training rows, which finds it: acceleration-all or torque-all."

@@ -21,7 +21,7 @@ from forcegp.jobs import Job, JobStore
 from forcegp.mechanics import MechanicalSystem
 from forcegp.parallel import Shared
 from forcegp.validation.candidates import Candidate, Training
-from forcegp.validation.comparison import IDENTIFICATIONS, Comparison, Identification, training_subset
+from forcegp.validation.comparison import Comparison, Identification, identification_named, training_subset
 from forcegp.validation.scores import acceleration_scores, mass_matrices, motion_scores, outside_range
 from forcegp.validation.splits import Split
 
@@ -47,7 +47,8 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
 
     for seed in range(seeds):
         for split in range(len(comparison.splits)):
-            for name, work in IDENTIFICATIONS.items():
+            for name in sorted({*wanted, comparison.identification}):
+                work = identification_named(name)
                 if _needed(comparison, wanted, name, seed):
                     found = job(IDENTIFICATION, name, split, seed, work, {})
                     identifications[found.name] = found
@@ -63,13 +64,13 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
 
 def _needed(comparison: Comparison, wanted: set[str], name: str, seed: int) -> bool:
     """Seeds choose rows: an identification of all rows, and the one of the mass matrix, is done once."""
-    if name in wanted and (seed == 0 or not IDENTIFICATIONS[name].all_rows):
+    if name in wanted and (seed == 0 or not identification_named(name).all_rows):
         return True
     return name == comparison.identification and seed == 0
 
 
 def _identification_name(comparison: Comparison, name: str, split: int, seed: int) -> str:
-    seed = 0 if IDENTIFICATIONS[name].all_rows else seed
+    seed = 0 if identification_named(name).all_rows else seed
     return job_name(comparison.splits[split], seed, IDENTIFICATION, name)
 
 
