@@ -79,6 +79,7 @@ class Fit(ModelOptions):
         command = replace(command, points=points)
         how = search_arguments(command, points)
         if all_rows:
+            assert isinstance(model, forcegp.StructuredGP)
             model = forcegp.evaluation.with_force_noise(model, dataset)
             given = {} if command.learning_points is None else {"learning_points": command.learning_points}
             how |= forcegp.evaluation.all_rows_at_once(points) | given

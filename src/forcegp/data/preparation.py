@@ -14,7 +14,8 @@ from forcegp.data.filtering import Signal, differentiated, episodes_in_order, lo
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
-LATE, AUTOMATIC = ("delay", "lag"), ("auto", "each")
+LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
+AUTOMATIC = "auto", "each"
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 FORGOTTEN = 1e-12
 """What may be left of a row's influence beyond the halo."""

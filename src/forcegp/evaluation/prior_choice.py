@@ -117,7 +117,9 @@ def allowing_for_correlation(
     if k > 1.0:
         settings = {**posterior.settings, "correlated_rows": k}
         given = posterior.training, posterior.parameters, posterior.result, settings, posterior.engine
-        posterior = posterior.model.condition(*given)
+        found = posterior.model.condition(*given)
+        assert isinstance(found, StructuredPosterior)
+        posterior = found
     if isinstance(posterior.engine, Inducing):
         posterior = refined(replace(posterior, engine=replace(posterior.engine, refine=Inducing.refine)), hyperprior)
     return posterior, f"errors resemble each other over {k:.0f} rows, which count as one" if k > 1.0 else None
