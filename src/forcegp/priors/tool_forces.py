@@ -47,11 +47,6 @@ class ToolPoint:
         return (self.jacobian @ v[..., None])[..., 0]
 
 
-def has_contact(dynamics: ConstrainedDynamics, contact: int) -> bool:
-    """Whether the constraint has that contact; forces of a contact that is not there are zero."""
-    return contact < len(dynamics.contacts)
-
-
 def contact_axes(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch 3 3"]:
     """Tangents t1, t2 and normal n of a contact's surface, as columns in world axes."""
     return surface_axes(dynamics.normals[..., contact, :])
@@ -61,6 +56,15 @@ def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[T
     """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
     size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
     return size * dynamics.multiplier_map().offset[..., contact].abs()
+
+
+def finite_numbers(given: object) -> tuple[float, ...] | None:
+    """`given` as finite floats, None where it is anything else."""
+    try:
+        numbers = tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
+    except (TypeError, ValueError):
+        return None
+    return numbers if not isinstance(given, str) and all(map(math.isfinite, numbers)) else None
 
 
 def is_contact_number(value: object) -> bool:
@@ -92,7 +96,7 @@ def require_moving(prior: str, frame: str, robot: Robot) -> None:
 
 TOOL_INPUTS = ("velocity", "angular-velocity", "position", "load", "q", "v", "u")
 SMALLEST_SPEED = 1e-6
-"""m/s, below which a direction of motion means nothing."""
+"""m/s, below which a direction of motion means nothing: far below any velocity scale of friction."""
 NAMES = {"world": ("x", "y", "z"), "tool": ("tool-x", "tool-y", "tool-z"), "surface": ("tangent-1", "tangent-2")}
 TORQUE_NAMES = {**NAMES, "surface": ("tangent-1", "tangent-2", "normal")}
 
@@ -130,8 +134,8 @@ class ToolForces(ExpressedKernels):
         check_kernel(self.kernel)
         if not (self.frame is None or isinstance(self.frame, str)):
             raise InvalidInput(f"ToolForces frame is {self.frame!r}; give the name of a link, or None for the contact.")
-        point = _three_numbers(self.point)
-        if self.axes not in AXES or point is None or not is_contact_number(self.contact):
+        point = finite_numbers(self.point)
+        if self.axes not in AXES or point is None or len(point) != 3 or not is_contact_number(self.contact):
             raise InvalidInput(
                 f"ToolForces has axes {self.axes!r}, point {self.point!r} and contact {self.contact!r}; give axes "
                 f"{' or '.join(map(repr, AXES))}, a point of three numbers in m, and a contact's number from 0."
@@ -238,7 +242,7 @@ class ToolForces(ExpressedKernels):
 
     def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint | None:
         """None where the force belongs to a contact that the constraint does not have."""
-        if self._needs_contact and not has_contact(dynamics, self.contact):
+        if self._needs_contact and self.contact >= len(dynamics.contacts):
             return None
         if self.frame is None:
             return ToolPoint.of_contact(dynamics, self.contact)
@@ -252,15 +256,6 @@ class ToolForces(ExpressedKernels):
             return where.orientation
         identity = torch.eye(3, dtype=where.position.dtype, device=where.position.device)
         return identity.expand_as(where.orientation)
-
-
-def _three_numbers(given: object) -> tuple[float, ...] | None:
-    """`given` as three finite floats, None where it is anything else."""
-    try:
-        point = () if isinstance(given, str) else tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
-    except (TypeError, ValueError):
-        return None
-    return point if len(point) == 3 and all(map(math.isfinite, point)) else None
 
 
 def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
