@@ -187,8 +187,8 @@ class ToolForces(ExpressedKernels):
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state, where = dynamics.state, self._point(dynamics)
         if where is None:  # the force is zero whatever its features are
-            nothing = state.q.new_zeros(*state.q.shape[:-1], sum(self._width(name, state.q) for name in self.inputs))
-            return (nothing,) * self._count
+            names = self.feature_names(state.robot)
+            return (state.q.new_zeros(*state.q.shape[:-1], len(names[0])),) * self._count
         velocity, axes = where.velocity(state.v), self._directions(dynamics, where)
         tangents = axes[..., : len(NAMES[self.axes])]
         # along the normal of a surface the point neither moves nor changes its place
@@ -207,24 +207,27 @@ class ToolForces(ExpressedKernels):
     @override
     def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...], ...]:
         origin = ("velocity", "angular-velocity", "v")
+        labels = self._labels(robot)
         ways: tuple[Scaling, ...] = tuple(
-            "scale" if name in origin else "standardize"
-            for name in self.inputs
-            for _ in range(self._width(name, robot.armature))
+            "scale" if name in origin else "standardize" for name in self.inputs for _ in labels[name]
         )
         return (ways,) * self._count
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        labels = self._labels(robot)
+        return (tuple(label for name in self.inputs for label in labels[name]),) * self._count
+
+    def _labels(self, robot: Robot) -> dict[str, Sequence[str]]:
+        """Of the features that every input brings."""
         along, turning = NAMES[self.axes], TORQUE_NAMES[self.axes]
-        named = {
+        return {
             "velocity": [f"tool velocity along {axis} [m/s]" for axis in along],
             "angular-velocity": [f"tool angular velocity about {axis} [rad/s]" for axis in turning],
             "position": [f"tool position along {axis} [m]" for axis in (along if self.axes == "surface" else "xyz")],
             "load": ["nominal normal force [N]"],
             **{name: joint_labels(name, name, robot.joint_names, robot) for name in ("q", "v", "u")},
         }
-        return (tuple(entry for name in self.inputs for entry in named[name]),) * self._count
 
     @override
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
@@ -233,12 +236,6 @@ class ToolForces(ExpressedKernels):
     @property
     def _count(self) -> int:
         return len(NAMES[self.axes]) + (3 if self.torque else 0)
-
-    def _width(self, name: str, per_joint: Tensor) -> int:
-        """Number of features that an input brings."""
-        if name in ("q", "v", "u"):
-            return per_joint.shape[-1]
-        return {"load": 1, "angular-velocity": 3}.get(name, len(NAMES[self.axes]))
 
     def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint | None:
         """None where the force belongs to a contact that the constraint does not have."""
