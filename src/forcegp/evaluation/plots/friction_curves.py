@@ -149,48 +149,24 @@ def _draw_curve(
     features[:, panel.feature] = at
     curve = posterior.curve(panel.latent, features)
     mean = panel.resisting * curve.mean.cpu().numpy()
-    spread = 1.959963984540054 * curve.std.cpu().numpy()
+    spread = style.QUANTILE * curve.std.cpu().numpy()
     inside = (at >= low) & (at <= high)
     axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
     if start < 0.0:
         axes.axvline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
-    axes.plot(at[inside], mean[inside], color=style.PREDICTION, linewidth=1.5, label="learned")
+    style.draw_line(axes, at[inside], mean[inside], style.PREDICTION, 1.5, "learned")
     style.draw_band(axes, at, mean, spread, alpha=0.28, where=inside.tolist(), label="95 % band")
     style.draw_band(axes, at, mean, spread, alpha=0.12)
-    axes.plot(
-        at,
-        mean,
-        color=style.PREDICTION,
-        linewidth=1.2,
-        linestyle=(0, (3, 2)),
-        label="beyond the training data",
-        zorder=1.9,
-    )
-    axes.plot(
-        visited,
-        np.full(len(visited), 0.025),
-        "|",
-        color=style.TRUTH,
-        markersize=5,
-        markeredgewidth=0.6,
-        alpha=0.5,
-        transform=axes.get_xaxis_transform(),
-        label="training velocities",
-        zorder=4,
-    )
+    dashes = {"label": "beyond the training data", "linestyle": (0, (3, 2)), "zorder": 1.9}
+    style.draw_line(axes, at, mean, style.PREDICTION, 1.2, **dashes)
+    ticks = {"markersize": 5, "markeredgewidth": 0.6, "transform": axes.get_xaxis_transform()}
+    ticks |= {"label": "training velocities", "color": style.TRUTH, "alpha": 0.5, "zorder": 4}
+    axes.plot(visited, np.full(len(visited), 0.025), "|", **ticks)
     levels = [(mean - spread)[inside], (mean + spread)[inside]]
     if truth is not None and len(truth[0]):
         shown = (truth[0] >= at[0]) & (truth[0] <= at[-1])
-        axes.plot(
-            truth[0][shown],
-            truth[1][shown],
-            "o",
-            color=TRUE_DOTS,
-            markersize=4.0,
-            markeredgewidth=0,
-            label="true",
-            zorder=1.8,
-        )
+        dots = {"label": "true", "color": TRUE_DOTS, "markersize": 4.0, "markeredgewidth": 0, "zorder": 1.8}
+        axes.plot(truth[0][shown], truth[1][shown], "o", **dots)
         if shown.any():
             levels.append(np.percentile(truth[1][shown], (1.0, 99.0)))  # a load near 0 makes any coefficient
     values = np.concatenate(levels)
