@@ -21,7 +21,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, has_few_inputs, named_prior
-from forcegp.validation.comparison import DEFAULT_IDENTIFICATION, IDENTIFICATIONS
+from forcegp.validation.comparison import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, require_identification
 
 Kind = Literal["given", "identified", "residual", "black box", "force prior"]
 """Parametric physics as given or identified, a Gaussian process on what it leaves of the acceleration, a model without
@@ -115,10 +115,8 @@ class Candidate:
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
             raise InvalidInput(f"kind is {self.kind!r}; allowed: {', '.join(get_args(Kind))}.")
-        if self.identification is not None and self.identification not in IDENTIFICATIONS:
-            raise InvalidInput(
-                f"no identification is called {self.identification!r}; there are {', '.join(IDENTIFICATIONS)}."
-            )
+        if self.identification is not None:
+            require_identification(self.identification)
 
 
 def _fit_system(mean: str, training: Training) -> Posterior:

@@ -88,6 +88,13 @@ IDENTIFICATIONS: dict[str, Identification] = {
 }
 """By name. Add your own: IDENTIFICATIONS["mine"] = Identification("how", identify_mine)."""
 
+
+def require_identification(name: str) -> None:
+    """Raise InvalidInput for what is no key of `IDENTIFICATIONS`."""
+    if name not in IDENTIFICATIONS:
+        raise InvalidInput(f"no identification is called {name!r}; there are {', '.join(IDENTIFICATIONS)}.")
+
+
 FRICTION = ("viscous", "coulomb")
 """Laws that are identified where nothing else is asked for."""
 
@@ -143,9 +150,7 @@ class Comparison:
                 raise InvalidInput(f"{name} is {value}; it must be at least 1.")
         Noise(None, self.force_noise)
         integrator_named(self.integrator, self.system)
-        if self.identification not in IDENTIFICATIONS:
-            given, allowed = self.identification, ", ".join(IDENTIFICATIONS)
-            raise InvalidInput(f"no identification is called {given!r}; there are {allowed}.")
+        require_identification(self.identification)
         if self.measured_torque and self.force_noise is None and IDENTIFICATIONS[self.identification].noise is None:
             raise InvalidInput(
                 "measured_torque needs a noise of the forces; give `force_noise`, or an `identification` of "
