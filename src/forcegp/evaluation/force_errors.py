@@ -119,7 +119,9 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
     mean, where the processes hold the known forces, too. Raises InvalidInput for data of other joints.
     """
     require_rows("dataset", dataset, posterior.joint_names, "the model")
-    named = true_names(_component_names(posterior), dataset)
+    comparable = isinstance(posterior, StructuredPosterior) and not posterior.carries_known_forces
+    terms = term_slices(posterior.model.prior, posterior.system.robot) if comparable else ()
+    named = true_names([name for name, *_ in terms], dataset)
     if not named and "lambda" not in dataset.truth:
         return ForceScores(len(dataset))
     predicted = _predict(posterior, dataset, named)
@@ -169,13 +171,6 @@ def curve_coverage(curve: Curve, law: Callable[[np.ndarray], np.ndarray], *, pro
     lower, upper = (end.cpu().numpy() for end in curve.interval(probability))
     slack = ROUNDING * float(np.abs(truth).max())  # friction at rest is exactly zero, and so is its interval's width
     return float(((truth >= lower - slack) & (truth <= upper + slack))[inside].mean())
-
-
-def _component_names(posterior: Posterior) -> list[str]:
-    """The components that can be compared with a truth."""
-    if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
-        return []
-    return [name for name, *_ in term_slices(posterior.model.prior, posterior.system.robot)]
 
 
 def _predict(

@@ -78,7 +78,10 @@ def friction_curves_figure(
             f"a model of {posterior.description} has no process that is a curve; fit one with friction priors, for "
             "example JointFriction() or ContactFriction()."
         )
-    chosen = panels[:LARGEST_GRID] if latents is None else [_panel(panels, name) for name in latents]
+    by_name = {panel.latent: panel for panel in panels}
+    for name in latents or ():
+        require_known("curve", name, "this model", by_name)
+    chosen = panels[:LARGEST_GRID] if latents is None else [by_name[name] for name in latents]
     columns = min(4 if len(chosen) > 6 else 3, len(chosen))
     rows = math.ceil(len(chosen) / columns)
     figure = style.new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
@@ -102,17 +105,8 @@ def friction_curves_figure(
 
 def _velocity_along(term: ForcePrior, name: str, index: int) -> int | None:
     """The feature that is the velocity along a tool force's own axis; None for other processes."""
-    if not isinstance(term, ToolForces) or not name.startswith("force"):
-        return None
-    if term.inputs == ("velocity",) or term.inputs == ("velocity", "angular-velocity"):
-        return index
-    return None
-
-
-def _panel(panels: Sequence[CurvePanel], name: str) -> CurvePanel:
-    by_name = {panel.latent: panel for panel in panels}
-    require_known("curve", name, "this model", by_name)
-    return by_name[name]
+    of_velocity = isinstance(term, ToolForces) and term.inputs in (("velocity",), ("velocity", "angular-velocity"))
+    return index if of_velocity and name.startswith("force") else None
 
 
 def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:
@@ -203,11 +197,8 @@ def _truth(
             features = panel.term.features(dynamics)[panel.index]
             own = features[:, panel.feature]
             others = torch.cat([features[:, : panel.feature], features[:, panel.feature + 1 :]], dim=-1)
-            kept = torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()
-            if not features.shape[-1] > 1:
-                kept = torch.ones_like(kept)
             latent = panel.resisting * values[:, panel.index]
-            kept = kept & torch.isfinite(latent)
+            kept = (torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()) & torch.isfinite(latent)
             found[panel.latent] = (own[kept].numpy(), latent[kept].numpy())
     return found
 

@@ -130,8 +130,8 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         _draw_force(grid[index, 0], rows, forces, index, known)
         style.quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
         if every is not None:
-            _draw_errors(grid[index, 1], every, index)
-            style.quiet(grid[index, 1], title=_summary(every, index), x="error / standard deviation", y="density")
+            title = _draw_errors(grid[index, 1], every, index)
+            style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")
     style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
     style.heading(figure, f"Normal force after {len(posterior.training)} training points")
     return figure
@@ -173,7 +173,8 @@ def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: b
     axes.margins(x=0)
 
 
-def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
+def _draw_errors(axes: Axes, forces: _Forces, index: int) -> str:
+    """The histogram of errors; returns what their root mean square is, for its title."""
     assert forces.truth is not None, "errors are drawn where the truth is known"
     errors = (forces.mean - forces.truth)[:, index] / np.maximum(forces.std[:, index], np.finfo(float).tiny)
     bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
@@ -186,10 +187,6 @@ def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
     text = f"{100.0 * float((np.abs(errors) <= QUANTILE).mean()):.0f} % inside\nthe 95 % band"
     corner: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
     axes.annotate(text, (0.98, 0.95), fontsize=style.SMALL, color=style.TRUTH, **corner)
-
-
-def _summary(forces: _Forces, index: int) -> str:
-    assert forces.truth is not None, "errors are drawn where the truth is known"
     truth = forces.truth[:, index]
     error, size = (float(np.sqrt(np.square(x).mean())) for x in (forces.mean[:, index] - truth, truth))
     relative = f" ({100.0 * error / size:.2g} %)" if size else ""
