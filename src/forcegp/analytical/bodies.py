@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 from typing_extensions import override
 
 from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
@@ -124,10 +125,7 @@ class ConsistentBodies(BodyCoordinates):
         change = change + change.swapaxes(-1, -2)
         inside = turned[:, None] @ change @ vectors[:, None] * divided[:, None]
         moved = vectors[:, None] @ inside @ turned[:, None]
-        blocks = np.einsum("kab,niab->nki", _SYMMETRIC, moved)
-        jacobian = np.zeros((len(x), len(x)))
-        for n, block in enumerate(blocks):
-            jacobian[10 * n : 10 * n + 10, 10 * n : 10 * n + 10] = block
+        jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved))
         return np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel(), jacobian
 
     @override

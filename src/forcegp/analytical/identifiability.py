@@ -141,11 +141,7 @@ class BaseParameters:
 
 def base_parameters(robot: Robot) -> BaseParameters:
     """The base parameters of a robot, whatever the motion: from random states, the same ones every time."""
-    generator = np.random.default_rng(0)
-    rows = RANDOM_ROWS * robot.nv
-    q, v, a = (torch.tensor(x, device=robot.device) for x in generator.normal(0.0, 2.0, (3, rows, robot.nv)))
-    regressor = torque_regressor(robot, q, v, a).flatten(0, 1).cpu().numpy()
-    return BaseParameters.of(regressor, parameter_names(robot))
+    return excitation(robot, *np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv)))
 
 
 def excitation(

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
 from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies, thickened
 from forcegp.analytical.identifiability import body_pseudo_inertias
@@ -112,10 +113,7 @@ def identify_analytical(
     def prior(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         distance, in_bodies = bodies.distance(x[:split])
         values = np.concatenate([distance, (x[split:] - center) / spread])
-        jacobian = np.zeros((len(x), len(x)))
-        jacobian[:split, :split] = in_bodies
-        jacobian[split:, split:] = np.diag(1.0 / spread)
-        return weight * values, weight * jacobian
+        return weight * values, weight * block_diag(in_bodies, np.diag(1.0 / spread))
 
     low, high = terms.bounds
     longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])

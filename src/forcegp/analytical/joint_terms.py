@@ -4,8 +4,9 @@ A term adds ``f(parameters; v) + B(parameters) a`` to the torque that a motion n
 system (which has the opposite sign). A new friction law is one entry in `LAWS`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -194,8 +195,7 @@ class JointTerms:
                 size = self._sizes[len(rows)]
                 value = given.get(field.name, size if field.logarithm else unlisted * size)
                 rows.append(np.log(value / size) if field.logarithm else value / size)
-        low, high = self.bounds
-        return np.clip(np.array(rows).ravel(), low, high)
+        return np.clip(np.array(rows).ravel(), *self.bounds)
 
     def prior(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Mean and standard deviation of a weak prior: around what the system lists, else 0 or typical velocities."""
@@ -220,22 +220,20 @@ class JointTerms:
     ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv k"]]:
         """What the terms add to the torque at v and a under actuators of torque `load` = |u|, and derivatives in x."""
         values, slopes = self.values(x), self.slopes(x)
-        total, nv, row = np.zeros_like(v), len(self.joints), 0
+        total, nv = np.zeros_like(v), len(self.joints)
         jacobian = np.zeros((*v.shape, len(self.fields), nv))
         diagonal = np.arange(nv)
         at_v = torch.tensor(v)
         state = State(at_v, at_v, torch.tensor(load), self.robot, self._rest)  # laws look at v and u alone
-        for law in self.laws:
-            named = {field.name: values[row + k] for k, field in enumerate(law.fields)}
+        for law, row, named in self._by_law(values):
             added, derivatives = law.torque(named, state)
             total = total + added
-            for k in range(len(law.fields)):
-                jacobian[:, diagonal, row + k, diagonal] = derivatives[k] * slopes[row + k]
-            row += len(law.fields)
+            for k, derivative in enumerate(derivatives, row):
+                jacobian[:, diagonal, k, diagonal] = derivative * slopes[k]
         if self.inertia:
             moved = np.einsum("pij,nj->nip", self._inertia_basis(), a)
-            total = total + moved @ values[row]
-            jacobian[:, :, row] = moved * slopes[row]
+            total = total + moved @ values[-1]
+            jacobian[:, :, -1] = moved * slopes[-1]
         return total, jacobian.reshape(*v.shape, -1)
 
     def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
@@ -246,15 +244,20 @@ class JointTerms:
 
     def known_forces(self, x: Float[np.ndarray, " k"]) -> tuple[KnownForce, ...]:
         """The terms as known forces of a system."""
-        values, forces, row = self.values(x), [], 0
-        for law in self.laws:
-            forces.append(law.force({field.name: torch.tensor(values[row + k]) for k, field in enumerate(law.fields)}))
-            row += len(law.fields)
+        values = torch.tensor(self.values(x))
+        forces = [law.force(named) for law, _, named in self._by_law(values)]
         if self.inertia == "armature":
-            forces.append(Armature(torch.tensor(values[row])))
+            forces.append(Armature(values[-1]))
         elif self.inertia == "rotor":
-            forces.append(RotorInertia(torch.tensor(values[row]), self._transmission()))
+            forces.append(RotorInertia(values[-1], self._transmission()))
         return tuple(forces)
+
+    def _by_law(self, values: Any) -> Iterator[tuple[Law, int, dict[str, Any]]]:
+        """Every law, the row of its first field, and its rows of `values` by the names of its fields."""
+        row = 0
+        for law in self.laws:
+            yield law, row, {field.name: values[row + k] for k, field in enumerate(law.fields)}
+            row += len(law.fields)
 
     def _transmission(self) -> torch.Tensor:
         if self.inertia == "armature":

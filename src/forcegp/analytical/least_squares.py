@@ -89,9 +89,7 @@ MAD = 1.4826
 """Median absolute deviation of a normal distribution -> its standard deviation."""
 
 Residual = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""x -> residuals (rows, nv) and Jacobian (rows, nv, k)."""
-Prior = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""x -> residuals of the prior (p,) and Jacobian (p, k)."""
+"""x -> residuals (rows, nv) and Jacobian (rows, nv, k); of the prior (p,) and (p, k)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +109,20 @@ class Fit:
     evaluations: int
     settled: bool
 
+    def weighted(self, time: Float[np.ndarray, " nv"] | float = 1.0) -> Float[np.ndarray, "n k"]:
+        """The Jacobian (rows nv, k) over the noise, for residuals of which one in so many rows is independent."""
+        scaled = self.jacobian * (np.sqrt(self.weight / time) / self.noise)[..., None]
+        return scaled.reshape(-1, scaled.shape[-1])
+
     @property
     def information(self) -> Float[np.ndarray, "k k"]:
         """Gauss-Newton curvature of the data, each residual weighted by its noise."""
-        scaled = self.jacobian * (np.sqrt(self.weight) / self.noise)[..., None]
-        flat = scaled.reshape(-1, scaled.shape[-1])
-        return flat.T @ flat
+        return self.weighted().T @ self.weighted()
 
 
 def weighted_least_squares(
     residual: Residual,
-    prior: Prior,
+    prior: Residual,
     start: Float[np.ndarray, " k"],
     bounds: tuple[np.ndarray, np.ndarray],
     *,
@@ -172,7 +173,7 @@ class _Point:
 
 def _minimized(
     at: Residual,
-    prior: Prior,
+    prior: Residual,
     x: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     longest: np.ndarray | float,
@@ -210,7 +211,7 @@ def _minimized(
     return here.x, MOST_EVALUATIONS, False
 
 
-def _point(at: Residual, prior: Prior, x: np.ndarray, noise: np.ndarray, robust: bool) -> _Point:
+def _point(at: Residual, prior: Residual, x: np.ndarray, noise: np.ndarray, robust: bool) -> _Point:
     bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
     with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
         try:

@@ -91,11 +91,9 @@ class RecordedRows:
         at = torch.as_tensor(np.array(a), device=self.kinematics.robot.device)
         return self.kinematics.torque_regressor(at).cpu().numpy()
 
-    def needed_torque(
-        self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray | None = None
-    ) -> np.ndarray:
+    def needed_torque(self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray) -> np.ndarray:
         """The force Q (rows, nv) under which the model accelerates by a."""
-        return self._needed(parameters, x, a, self.regressor(a) if regressor is None else regressor)[0]
+        return self._needed(parameters, x, a, self.regressor(a))[0]
 
     def _needed(
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray

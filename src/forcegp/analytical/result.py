@@ -48,12 +48,10 @@ class AnalyticalIdentification(Summary):
         return {
             "robot": f"{self.given.robot.name!r}, {self.given.robot.nv} joints",
             "likelihood": self.likelihood,
-            "inertias": "free" if isinstance(self.bodies, FreeBodies) else "consistent",
+            "inertias": self._inertias,
             "learned from": f"{len(self.episode)} rows",
             "converged": self.fit.settled,
         }
-
-    # ------------------------------------------------------------------ the estimates
 
     @property
     def parameters(self) -> Float[np.ndarray, "nv 10"]:
@@ -85,12 +83,12 @@ class AnalyticalIdentification(Summary):
     @property
     def units(self) -> dict[str, str]:
         """By name."""
-        joints = {joint.name: joint.type == "prismatic" for joint in self.given.robot.joints}
-        out = dict(zip(parameter_names(self.given.robot), UNITS * self.given.robot.nv, strict=True))
-        for field in self.terms.fields:
-            for name, prismatic in joints.items():
-                out[f"{field.name}.{name}"] = _unit(field.unit, prismatic)
-        return out
+        of_bodies = dict(zip(parameter_names(self.given.robot), UNITS * self.given.robot.nv, strict=True))
+        return of_bodies | {
+            f"{field.name}.{joint.name}": _unit(field.unit, joint.type == "prismatic")
+            for field in self.terms.fields
+            for joint in self.given.robot.joints
+        }
 
     @property
     def values(self) -> dict[str, float]:
@@ -117,18 +115,13 @@ class AnalyticalIdentification(Summary):
     def _spread(self) -> np.ndarray:
         """S with S S^T the covariance of all numbers, as if only one row in a correlation time were independent."""
         time = correlation_time(self.fit.residual / self.fit.noise, self.episode)
-        scaled = self.fit.jacobian * (np.sqrt(self.fit.weight / time) / self.fit.noise)[..., None]
-        flat = scaled.reshape(-1, scaled.shape[-1])
         # by QR, not by normal equations, whose rounding can make a variance negative
-        root = np.linalg.qr(np.concatenate([flat, np.linalg.cholesky(self.fit.prior_information).T]), mode="r")
-        moved = np.zeros((len(self.names), len(root)))
-        split = self.bodies.size
-        for body, block in enumerate(self.bodies.derivatives(self._in_bodies)):
-            moved[10 * body : 10 * body + 10, 10 * body : 10 * body + 10] = block
-        moved[split:, split:] = np.diag(self.terms.slopes(self._in_terms).ravel())
+        root = np.linalg.qr(
+            np.concatenate([self.fit.weighted(time), np.linalg.cholesky(self.fit.prior_information).T]), mode="r"
+        )
+        slopes = np.diag(self.terms.slopes(self._in_terms).ravel())
+        moved = scipy.linalg.block_diag(*self.bodies.derivatives(self._in_bodies), slopes)
         return scipy.linalg.solve_triangular(root, moved.T, trans="T").T
-
-    # ------------------------------------------------------------------ what the data identify
 
     @cached_property
     def base(self) -> BaseParameters:
@@ -152,8 +145,6 @@ class AnalyticalIdentification(Summary):
             out.append((name, float((values < prior).sum())))
         return tuple(sorted((entry for entry in out if entry[1]), key=lambda entry: -entry[1]))
 
-    # ------------------------------------------------------------------ what it predicts
-
     def accelerations(self, q: Rows, v: Rows, u: Rows) -> Rows:
         """Accelerations under the forces u, also of free inertias. Raises NumericalError for a singular M."""
         return self._recorded(q, v, u).acceleration(self.parameters, self._in_terms)[0]
@@ -173,15 +164,10 @@ class AnalyticalIdentification(Summary):
         values, start, errors, units = self.values, self.start, self.standard_errors, self.units
         return {
             "likelihood": self.likelihood,
-            "inertias": "free" if isinstance(self.bodies, FreeBodies) else "consistent",
+            "inertias": self._inertias,
             "prior_strength": self.prior_strength,
             "parameters": {
-                name: {
-                    "unit": units[name],
-                    "start": float(start[name]),
-                    "identified": value,
-                    "standard_error": errors[name],
-                }
+                name: {"unit": units[name], "start": start[name], "identified": value, "standard_error": errors[name]}
                 for name, value in values.items()
             },
             "noise_std": (self.fit.noise if self.noise is None else self.noise.acceleration).tolist(),
@@ -195,7 +181,9 @@ class AnalyticalIdentification(Summary):
             "evaluations": self.fit.evaluations,
         }
 
-    # ------------------------------------------------------------------ inside
+    @property
+    def _inertias(self) -> str:
+        return "free" if isinstance(self.bodies, FreeBodies) else "consistent"
 
     @property
     def _in_bodies(self) -> np.ndarray:

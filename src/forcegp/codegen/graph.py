@@ -30,12 +30,7 @@ UNARY: dict[str, Callable[[float], float]] = {
 }
 ARITHMETIC = {"add": operator.add, "subtract": operator.sub, "multiply": operator.mul, "divide": operator.truediv}
 COMPARED = {"less": operator.lt, "at_most": operator.le, "equal": operator.eq}
-BINARY: dict[str, Callable[[float, float], float]] = {
-    **ARITHMETIC,
-    "power": math.pow,
-    "atan2": math.atan2,
-    **COMPARED,
-}
+BINARY: dict[str, Callable[[float, float], float]] = {**ARITHMETIC, "power": math.pow, "atan2": math.atan2, **COMPARED}
 COMMUTATIVE = ("add", "multiply", "equal")
 LEAVES = ("constant", "input")
 

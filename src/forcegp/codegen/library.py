@@ -158,7 +158,18 @@ def load_library(
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     path = own_folder(folder, purpose) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
     if not path.exists():
-        _compile(write(unit), unit.options, path, purpose)
+        source = write(unit)
+        try:
+            with atomic_file(path) as library:  # whoever else compiles the same meanwhile
+                compile_library(
+                    source, (*OPTIONS, *unit.options), library, "evaluate", purpose
+                )  # tried before it is kept
+                library.chmod(0o700)
+        except OSError as error:
+            raise CompilerError(
+                f"the folder {path.parent} for {purpose.what} cannot be written to ({error.strerror}); choose another: "
+                f"{purpose.elsewhere}."
+            ) from error
     return opened_library(path, purpose), path
 
 
@@ -219,19 +230,6 @@ def own_file(path: Path, purpose: Purpose, *, parent: bool = False) -> None:
             f"{path} can be written to by others than you, and code from it would run with your rights; take that "
             f"away (chmod go-w {shlex.quote(str(path))}) or choose another folder: {purpose.elsewhere}."
         )
-
-
-def _compile(source: str, options: tuple[str, ...], path: Path, purpose: Purpose) -> None:
-    """Compile a source text to the library ``path``, whole or not at all."""
-    try:
-        with atomic_file(path) as library:  # whoever else compiles the same meanwhile
-            compile_library(source, (*OPTIONS, *options), library, "evaluate", purpose)  # tried before it is kept
-            library.chmod(0o700)
-    except OSError as error:
-        raise CompilerError(
-            f"the folder {path.parent} for {purpose.what} cannot be written to ({error.strerror}); choose another: "
-            f"{purpose.elsewhere}."
-        ) from error
 
 
 STATES_PER_THREAD = 2048  # fewer are done before another thread has started

@@ -170,10 +170,7 @@ def _moved(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any], index
     def nodes(value: Any) -> Any:
         return _numbers(graph, value).nodes if isinstance(value, _Numbers | Tensor) else value
 
-    if indexed:
-        args = (nodes(args[0]), *args[1:])
-    else:
-        args = _pytree.tree_map(nodes, args)
+    args = (nodes(args[0]), *args[1:]) if indexed else _pytree.tree_map(nodes, args)
     result = target(*args, **{key: value for key, value in kwargs.items() if key not in CREATION})
     return _Numbers(result) if isinstance(result, Tensor) else [_Numbers(part) for part in result]
 
@@ -249,10 +246,9 @@ def _sum(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _
     count, width = (math.prod(nodes.shape[d] for d in which) for which in (kept, dims))
     rows = nodes.permute(*kept, *dims).reshape(count, width)
     total = torch.tensor([graph.sum(row) for row in rows.tolist()], dtype=torch.long)
-    shape = (
-        [1 if d in dims else size for d, size in enumerate(nodes.shape)] if keepdim else [nodes.shape[d] for d in kept]
+    return _Numbers(
+        total.view([1 if d in dims else size for d, size in enumerate(nodes.shape) if keepdim or d in kept])
     )
-    return _Numbers(total.view(shape))
 
 
 def _mean(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _Numbers:
@@ -263,7 +259,6 @@ def _mean(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> 
 def _norm(graph: Graph, x: Any, order: Any = 2.0, dim: Any = None, keepdim: bool = False) -> _Numbers:
     if order != 2.0:
         raise InvalidInput(f"compiled code holds norms of order 2 only, not {order}; give compile=False.")
-
     return _elementwise(graph, lambda total: _root(graph, total), _sum(graph, _power(graph, x, 2.0), dim, keepdim))
 
 

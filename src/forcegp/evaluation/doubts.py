@@ -124,15 +124,12 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
 
 def _groups(features: tuple[Tensor, ...]) -> list[list[int]]:
     """Numbers of the processes that have the same inputs."""
-    groups: list[list[int]] = []
+    groups: dict[int, list[int]] = {}
     for index, z in enumerate(features):
         constant = bool((z == z[:1]).all())  # also without any feature
-        same = next((group for group in groups if not constant and torch.equal(features[group[0]], z)), None)
-        if same is None:
-            groups.append([index])
-        else:
-            same.append(index)
-    return groups
+        first = next((k for k in groups if not constant and torch.equal(features[k], z)), index)
+        groups.setdefault(first, []).append(index)
+    return list(groups.values())
 
 
 def _presses_unseen(moving: Tensor, pressing: Tensor) -> bool:
@@ -154,11 +151,6 @@ WORTH_MOVING = 0.9
 """Error in the system of the data over that in the model's own, below which the model is worth carrying over."""
 
 
-def overlap_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
-    """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
-    return tuple(_warnings(posterior, dataset))
-
-
 def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
     """Numbers of the rows of `dataset` whose (q, v, u) is exactly that of a training point."""
     training = posterior.training
@@ -167,7 +159,8 @@ def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " sha
     return np.array([number for number, row in enumerate(rows) if row.tobytes() in trained], dtype=np.int64)
 
 
-def _warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+    """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
     repeated = shared_rows(posterior, dataset)
     if repeated.size:
         yield (

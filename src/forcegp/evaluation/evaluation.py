@@ -17,7 +17,6 @@ from forcegp.models.protocol import Posterior
 from forcegp.summary import Summary, listed
 
 Numbers = tuple[float, ...]
-PER = ("_per_joint", "_per_contact")
 Mean = TypeVar("Mean", float, float | None)
 
 
@@ -123,16 +122,9 @@ class Evaluation(Summary):
         """Every score, and every mean before what it is the mean of, as plain JSON values."""
         out: dict[str, Any] = {}
         for field in fields(self):
-            score = field.name
-            for suffix in PER:
-                score = score.removesuffix(suffix)
-            out.setdefault(score, _plain(getattr(self, score)))
-            out[field.name] = _plain(getattr(self, field.name))
-        return out
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+            score = field.name.removesuffix("_per_joint").removesuffix("_per_contact")
+            out |= {name: getattr(self, name) for name in (score, field.name)}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in out.items()}
 
 
 NOISE_FACTOR = 1.5
@@ -185,14 +177,12 @@ def _noise_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
 
 
 def _against_measurements(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]:
-    measurement = predicted.measurement_variance
+    a, measurement = dataset.a, predicted.measurement_variance
     return {
-        "known_physics_mae_per_joint": metrics.mean_absolute_error(predicted.known_physics, dataset.a),
-        "mae_per_joint": metrics.mean_absolute_error(predicted.mean, dataset.a),
-        "rmse_per_joint": metrics.root_mean_square_error(predicted.mean, dataset.a),
+        "known_physics_mae_per_joint": metrics.mean_absolute_error(predicted.known_physics, a),
         "nlpd": float(predicted.negative_log_density.mean()),
-        "nlpd_per_joint": metrics.marginal_negative_log_density(predicted.mean, measurement, dataset.a),
-        "coverage_95_per_joint": metrics.interval_coverage(predicted.mean, measurement, dataset.a),
+        "nlpd_per_joint": metrics.marginal_negative_log_density(predicted.mean, measurement, a),
+        **_errors("{}_per_joint", predicted.mean, measurement, a),
     }
 
 
@@ -201,30 +191,26 @@ def _against_truth(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]
     if "a" in dataset.truth:
         a = dataset.truth["a"]
         force_error = (predicted.mass @ (predicted.mean - a)[..., None])[..., 0]
-        out["mae_noise_free_per_joint"] = metrics.mean_absolute_error(predicted.mean, a)
-        out["rmse_noise_free_per_joint"] = metrics.root_mean_square_error(predicted.mean, a)
-        out["coverage_95_noise_free_per_joint"] = metrics.interval_coverage(predicted.mean, predicted.variance, a)
+        out |= _errors("{}_noise_free_per_joint", predicted.mean, predicted.variance, a)
         out["known_physics_mae_noise_free_per_joint"] = metrics.mean_absolute_error(predicted.known_physics, a)
         out["force_mae_per_joint"] = np.abs(force_error).mean(axis=0)
     if "Q_U" in dataset.truth and predicted.carried_known_force is not None:
         truth = dataset.truth["Q_U"] + predicted.carried_known_force
-        out |= _forces("unknown_force", "_per_joint", predicted.unknown_force, predicted.unknown_force_variance, truth)
+        out |= _errors("unknown_force_{}_per_joint", predicted.unknown_force, predicted.unknown_force_variance, truth)
     if "lambda" in dataset.truth:
         truth = dataset.truth["lambda"]
-        out |= _forces("multiplier", "_per_contact", predicted.multiplier, predicted.multiplier_variance, truth)
+        out |= _errors("multiplier_{}_per_contact", predicted.multiplier, predicted.multiplier_variance, truth)
     return out
 
 
-def _forces(
-    name: str, per: str, mean: np.ndarray | None, variance: np.ndarray | None, truth: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Scores of a force; none where the model lacks it, or of another number of contacts."""
+def _errors(name: str, mean: np.ndarray | None, variance: np.ndarray | None, truth: np.ndarray) -> dict[str, Any]:
+    """Three scores; none of forces that the model lacks, or of another number of contacts."""
     if mean is None or variance is None or mean.shape != truth.shape:
         return {}
     return {
-        f"{name}_mae{per}": metrics.mean_absolute_error(mean, truth),
-        f"{name}_rmse{per}": metrics.root_mean_square_error(mean, truth),
-        f"{name}_coverage_95{per}": metrics.interval_coverage(mean, variance, truth),
+        name.format("mae"): metrics.mean_absolute_error(mean, truth),
+        name.format("rmse"): metrics.root_mean_square_error(mean, truth),
+        name.format("coverage_95"): metrics.interval_coverage(mean, variance, truth),
     }
 
 

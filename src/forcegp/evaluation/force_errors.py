@@ -25,13 +25,8 @@ from forcegp.models.structured.components import Curve, term_slices
 ROUNDING = 1e-9
 """Relative to the size of the truth: widths and distances below it are none."""
 
-TRUE_NAMES: dict[str, str] = {
-    "tool-friction": "tool-friction",
-    "tool-forces": "tool-friction",
-    "contact-friction": "tool-friction",
-    "load-friction": "tool-friction",
-    "friction-map": "tool-friction",
-}
+AT_THE_TOOL = ("tool-friction", "tool-forces", "contact-friction", "load-friction", "friction-map")
+TRUE_NAMES: dict[str, str] = dict.fromkeys(AT_THE_TOOL, "tool-friction")
 """Component of a model -> what a Dataset calls that force (`Q_U.<name>`, `force.<name>`), where it is not the same."""
 
 
@@ -58,7 +53,6 @@ class ForceScore:
         truth: Float[np.ndarray, "rows k"],
     ) -> "ForceScore":
         """Scores of a prediction."""
-        error = mean - truth
         size = float(np.sqrt(np.square(truth).mean()))
         wide = variance > (ROUNDING * size) ** 2
         covered: list[float | None] = []
@@ -69,7 +63,7 @@ class ForceScore:
             tuple(metrics.mean_absolute_error(mean, truth).tolist()),
             tuple(metrics.root_mean_square_error(mean, truth).tolist()),
             tuple(covered),
-            float(np.sqrt(np.square(error).mean())) / size if size > 0.0 else None,
+            float(np.sqrt(np.square(mean - truth).mean())) / size if size > 0.0 else None,
         )
 
     @property
@@ -125,7 +119,9 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
     mean, where the processes hold the known forces, too. Raises InvalidInput for data of other joints.
     """
     require_rows("dataset", dataset, posterior.joint_names, "the model")
-    named = true_names(_component_names(posterior), dataset)
+    comparable = isinstance(posterior, StructuredPosterior) and not posterior.carries_known_forces
+    terms = term_slices(posterior.model.prior, posterior.system.robot) if comparable else ()
+    named = true_names([name for name, *_ in terms], dataset)
     if not named and "lambda" not in dataset.truth:
         return ForceScores(len(dataset))
     predicted = _predict(posterior, dataset, named)
@@ -144,12 +140,8 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
 
 def true_names(components: Sequence[str], dataset: Dataset) -> dict[str, str]:
     """Component -> what the truth of the Dataset calls it; without those that the truth does not hold alone."""
-    found: dict[str, str] = {}
-    for name in components:
-        for kept in (name, TRUE_NAMES.get(name)):
-            if kept is not None and {f"Q_U.{kept}", f"force.{kept}"} & set(dataset.truth):
-                found[name] = kept
-                break
+    pairs = [(name, kept) for name in components for kept in (TRUE_NAMES.get(name, name), name)]
+    found = {name: kept for name, kept in pairs if {f"Q_U.{kept}", f"force.{kept}"} & set(dataset.truth)}
     claimed = list(found.values())
     return {name: kept for name, kept in found.items() if claimed.count(kept) == 1}
 
@@ -179,13 +171,6 @@ def curve_coverage(curve: Curve, law: Callable[[np.ndarray], np.ndarray], *, pro
     lower, upper = (end.cpu().numpy() for end in curve.interval(probability))
     slack = ROUNDING * float(np.abs(truth).max())  # friction at rest is exactly zero, and so is its interval's width
     return float(((truth >= lower - slack) & (truth <= upper + slack))[inside].mean())
-
-
-def _component_names(posterior: Posterior) -> list[str]:
-    """The components that can be compared with a truth."""
-    if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
-        return []
-    return [name for name, *_ in term_slices(posterior.model.prior, posterior.system.robot)]
 
 
 def _predict(

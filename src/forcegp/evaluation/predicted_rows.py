@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.evaluation.metrics import negative_log_density
-from forcegp.models.prediction import Gaussian, Prediction
+from forcegp.models.prediction import Prediction
 from forcegp.models.protocol import Posterior
 from forcegp.models.search import SMALL_COVARIANCE
 
@@ -97,7 +97,9 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     prediction = posterior.predict(q, v, u)
     dynamics = posterior.dynamics(q, v, u)
     own = dynamics if dataset.system is None else dataset.system.to(device).dynamics(q, v, u)
-    covariance = _array(_not_none(prediction.covariance))
+    covariance, force, multiplier = prediction.covariance, prediction.unknown_force, prediction.multiplier
+    assert covariance is not None, "predict computes the covariance unless asked not to"
+    covariance = _array(covariance)
     measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
     known = _array(dynamics.acceleration_map(known=True).offset)
@@ -107,14 +109,14 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
         variance=_array(prediction.variance),
         measurement_variance=np.diagonal(measurement, axis1=-2, axis2=-1),
         negative_log_density=negative_log_density(mean, measurement, np.asarray(dataset.a[block])),
-        unknown_force=_mean(prediction.unknown_force),
-        unknown_force_variance=_variance(prediction.unknown_force),
-        multiplier=_mean(prediction.multiplier),
-        multiplier_variance=_variance(prediction.multiplier),
+        unknown_force=None if force is None else _array(force.mean),
+        unknown_force_variance=None if force is None else _array(force.variance),
+        multiplier=None if multiplier is None else _array(multiplier.mean),
+        multiplier_variance=None if multiplier is None else _array(multiplier.variance),
         known_physics=known,
         moving_force=(mass @ (mean - known)[..., None])[..., 0],
         moving_force_variance=np.einsum("nij,njk,nik->ni", mass, covariance, mass),
-        carried_known_force=None if prediction.unknown_force is None else _array(carried),
+        carried_known_force=None if force is None else _array(carried),
         A=_array(own.A),
         b=_array(own.b),
         mass=mass,
@@ -152,19 +154,6 @@ def _noise_covariance(
     stated, model = stated_noise_level(posterior, dataset), _array(posterior.noise_std)
     rows = np.maximum(model / stated, 1.0) * dataset.noise_std[block]
     return noise + (np.square(rows) - np.square(model))[..., None] * identity
-
-
-def _mean(force: Gaussian | None) -> np.ndarray | None:
-    return None if force is None else _array(force.mean)
-
-
-def _variance(force: Gaussian | None) -> np.ndarray | None:
-    return None if force is None else _array(force.variance)
-
-
-def _not_none(covariance: Tensor | None) -> Tensor:
-    assert covariance is not None, "predict computes the covariance unless asked not to"
-    return covariance
 
 
 def _array(values: Tensor) -> np.ndarray:

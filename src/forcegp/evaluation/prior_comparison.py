@@ -122,14 +122,10 @@ class PriorComparison:
     @property
     def verdict(self) -> str:
         """Which prior the data support, in one sentence, and in another which columns of the table disagree."""
-        others = [
-            (what, best)
-            for what, key in COLUMNS.items()
-            if (best := self._best_by(key)) is not None and best is not self.preferred
-        ]
-        if not others:
+        found = {what: self._best_by(key) for what, key in COLUMNS.items()}
+        named = "; ".join(f"{best.name} has the best {what}" for what, best in found.items() if best is not None)
+        if not named:
             return self._supported
-        named = "; ".join(f"{best.name} has the best {what}" for what, best in others)
         return (
             f"{self._supported} Other columns disagree: {named}. The choice rests on left-out stretches, which "
             "are what a model has not seen; if errors of the acceleration are what counts, take the best test MAE."
@@ -235,12 +231,19 @@ def compare_priors(
             "shorter ones, or a longer recording"
         )
     models = {name: _named(name, partial(StructuredGP, known, prior, mean, noise)) for name, prior in priors.items()}
-    _require_memory([_named(name, partial(_checked_size, model, rows)) for name, model in models.items()], known)
+    sizes = [_named(name, partial(_checked_size, model, rows)) for name, model in models.items()]
+    needed = sum(8 * (size.rows * size.rank) ** 2 for size in sizes)  # all are kept
+    needed += max(Exact().required_bytes(size) for size in sizes)
+    what, remedy = (
+        f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows",
+        "give fewer `points`, or fewer candidates",
+    )
+    require_memory(needed, what, remedy, known.robot.device)
     how: dict[str, Any] = {"restarts": restarts, "seed": seed, "backend": workers, "hyperprior": hyperprior}
     how |= {"options": options, "engine": "exact"}  # whatever the number of rows: no other engine can leave rows out
     posteriors = {}
     for name, model in models.items():
-        note = None if progress is None else _note(progress, name)
+        note = None if progress is None else partial(progress, name)
         posteriors[name] = _named(name, partial(model.fit, rows, **how, progress=note))
     return _compared(posteriors, blocks, seconds, test)
 
@@ -318,18 +321,6 @@ def _checked_size(model: StructuredGP, rows: Dataset) -> ProblemSize:
         check_prior(likelihood)
         with torch.no_grad():
             return ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(training.a[0])}))
-
-
-def _require_memory(sizes: Sequence[ProblemSize], system: MechanicalSystem) -> None:
-    """Raise NotEnoughMemory where the posteriors of all candidates, which are kept, do not fit with their making."""
-    kept = sum(8 * (size.rows * size.rank) ** 2 for size in sizes)
-    needed = kept + max(Exact().required_bytes(size) for size in sizes)
-    what = f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows"
-    require_memory(needed, what, "give fewer `points`, or fewer candidates", system.robot.device)
-
-
-def _note(progress: Progress, name: str) -> Callable[[int, int, float], None]:
-    return lambda restart, iteration, value: progress(name, restart, iteration, value)
 
 
 def _named(name: str, make: Callable[[], Any]) -> Any:

@@ -71,7 +71,7 @@ def integrate(
     alive = torch.ones(n, dtype=torch.bool, device=q.device)
     for k in range(steps):
         forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
-        step = integrator.step(_at_finite_states(_under(acceleration, forces), q, v), q, v, dt)
+        step = integrator.step(_at_finite_states(acceleration, q, v, forces), q, v, dt)
         rows_a.append(torch.where(alive[:, None], step.a, math.nan))
         bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
         good = alive & bounded & step.found
@@ -104,19 +104,16 @@ def check_start(v0: Tensor, dt: float) -> None:
         )
 
 
-def _under(acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], forces: Tensor) -> Acceleration:
-    """a(q, v) under the constant forces of one step."""
-    return lambda q, v: acceleration(q, v, forces)
-
-
-def _at_finite_states(acceleration: Acceleration, q0: Tensor, v0: Tensor) -> Acceleration:
-    """a(q, v), which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
+def _at_finite_states(
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], q0: Tensor, v0: Tensor, u: Tensor
+) -> Acceleration:
+    """a(q, v) under u, which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
 
     def guarded(q: Tensor, v: Tensor) -> Tensor:
         finite = (torch.isfinite(q) & torch.isfinite(v)).all(-1, keepdim=True)
         if bool(finite.all()):
-            return acceleration(q, v)
-        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0)), math.nan)
+            return acceleration(q, v, u)
+        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)
 
     return guarded
 

@@ -109,21 +109,28 @@ def rational_quadratic(dimension: int, variance: float | Tensor) -> ScaleKernel:
     return kernel
 
 
-def periodic(dimension: int, variance: float | Tensor) -> ScaleKernel:
+def periodic(
+    dimension: int,
+    variance: float | Tensor,
+    *,
+    period: float = PERIOD,
+    spread: float = PERIOD_LOG_SPREAD,
+    constraint: Positive | None = None,
+) -> ScaleKernel:
     """k = variance exp(-2 sum_d sin^2(pi (z_d - z'_d) / p_d) / l_d) in GPyTorch's convention, l not squared.
 
     Source: MacKay (1998), eq. 47. Periods start at 2 pi with log p ~ N(log 2 pi, 0.5^2), so features in rad repeat
-    every revolution; l starts at 1 with log l ~ N(0, 2^2).
+    every revolution, or at `period` with that `spread`; l starts at 1 with log l ~ N(0, 2^2).
     """
-    base = PeriodicKernel(
-        ard_num_dims=dimension, lengthscale_constraint=log_scale(), period_length_constraint=log_scale()
-    )
+    near = constraint or log_scale()
+    base = PeriodicKernel(ard_num_dims=dimension, lengthscale_constraint=log_scale(), period_length_constraint=near)
     kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
     base.lengthscale = torch.ones(1, dimension, dtype=torch.float64)
-    base.period_length = torch.full((1, dimension), PERIOD, dtype=torch.float64)
+    base.period_length = torch.full((1, dimension), period, dtype=torch.float64)
     kernel.outputscale = float64(variance)
+    # without it, what has no ripple would run off to a constant of boundless variance
     register_log_normal_prior(base, "lengthscale", 1.0, LOG_LENGTHSCALE_SPREAD)
-    register_log_normal_prior(base, "period_length", PERIOD, PERIOD_LOG_SPREAD)
+    register_log_normal_prior(base, "period_length", period, spread)
     return kernel
 
 
@@ -201,7 +208,7 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
 class _WidthKernel(Kernel):
     """A kernel with a velocity `width` (1, 1) in units of the feature; log w ~ N(log of its start value, 1)."""
 
-    def __init__(self, width: float, **more: Any) -> None:
+    def __init__(self, width: float = WIDTH, **more: Any) -> None:
         super().__init__(**more)
         self.register_parameter("raw_width", torch.nn.Parameter(float64(width).log().reshape(1, 1)))
         self.register_constraint("raw_width", log_scale())
@@ -221,9 +228,6 @@ class SmoothSignKernel(_WidthKernel):
 
     At s = w, 76 % of the friction is developed.
     """
-
-    def __init__(self, width: float = WIDTH) -> None:
-        super().__init__(width)
 
     def weight_features(self, z: Tensor) -> Tensor:
         """phi (n, 1), with k = phi phi^T."""

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import isfinite
 from typing import ClassVar
 
 import torch
@@ -19,9 +18,10 @@ from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling, Su
 from forcegp.priors.joint_forces import JointFriction, chosen_inputs, joint_indices
 from forcegp.priors.kernels import check_kernel
 from forcegp.priors.tool_forces import (
+    SMALLEST_SPEED,
     ToolPoint,
     contact_axes,
-    has_contact,
+    finite_numbers,
     is_contact_number,
     nominal_normal_force,
     require_contact,
@@ -49,7 +49,10 @@ class TabulatedCurve:
 
     def __post_init__(self) -> None:
         for name in ("at", "values"):
-            object.__setattr__(self, name, _finite(name, getattr(self, name)))
+            values = finite_numbers(getattr(self, name))
+            if values is None:
+                raise InvalidInput(f"a tabulated curve has {name} {getattr(self, name)!r}; give finite numbers")
+            object.__setattr__(self, name, values)
         if len(self.at) < 2 or len(self.at) != len(self.values) or any(b <= a for a, b in pairwise(self.at)):
             raise InvalidInput(
                 f"a tabulated curve has {len(self.at)} places and {len(self.values)} values; give two or more of each, "
@@ -143,20 +146,8 @@ def _warn_of_jamming(growth: Tensor, contact: int) -> None:
         )
 
 
-def _finite(name: str, given: object) -> tuple[float, ...]:
-    try:
-        values = tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # errors below
-    except (TypeError, ValueError):
-        values = (float("nan"),)
-    if not all(map(isfinite, values)):
-        raise InvalidInput(f"a tabulated curve has {name} {given!r}; give finite numbers")
-    return values
-
-
 AXES = ("isotropic", "two-axis")
 CONTACT_INPUTS = ("velocity", "position")
-SMALLEST_SPEED = 1e-6
-"""m/s; below it the direction of sliding is rounded off, far below any velocity scale of friction."""
 
 
 @dataclass(frozen=True)
@@ -232,14 +223,14 @@ class ContactFriction(ExpressedKernels):
 
     @override
     def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
-        if not has_contact(dynamics, self.contact):
+        if self.contact >= len(dynamics.contacts):
             return torch.zeros_like(dynamics.H[..., :1]).expand(*dynamics.H.shape[:-1], self._count)
         where = ToolPoint.of_contact(dynamics, self.contact)
         return where.jacobian[..., :3, :].mT @ self.point_force(dynamics)
 
     @override
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
-        if not has_contact(dynamics, self.contact):
+        if self.contact >= len(dynamics.contacts):
             return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, self._count)
         tangents, sliding = self._sliding(dynamics)
         motion = sliding[..., None] if self.viscous else _direction(sliding)
@@ -255,7 +246,7 @@ class ContactFriction(ExpressedKernels):
 
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
-        if not has_contact(dynamics, self.contact):  # the force is zero whatever its features are
+        if self.contact >= len(dynamics.contacts):  # the force is zero whatever its features are
             width = len(self.inputs) + ("position" in self.inputs)
             return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], width),) * self._count
         tangents, sliding = self._sliding(dynamics)

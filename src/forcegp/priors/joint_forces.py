@@ -8,14 +8,14 @@ from typing import Any, ClassVar, Literal
 
 import torch
 from gpytorch.constraints import Positive
-from gpytorch.kernels import Kernel, PeriodicKernel, ScaleKernel
+from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownJoint, require_known, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
-from forcegp.priors.basic_kernels import LOG_LENGTHSCALE_SPREAD, log_scale, register_log_normal_prior
+from forcegp.priors.basic_kernels import periodic
 from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling
 from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
@@ -282,19 +282,9 @@ class PeriodicJointForces(PerJointPrior):
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return tuple(self._kernel(variance) for variance in variances)
-
-    def _kernel(self, variance: Tensor) -> Kernel:
         near = Positive(partial(_period, self.period), partial(_spreads, self.period))  # type: ignore[arg-type]  # stubs
-        base = PeriodicKernel(lengthscale_constraint=log_scale(), period_length_constraint=near)
-        kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
-        register_log_normal_prior(base, "period_length", self.period, PERIOD_SPREAD)
-        # a joint without ripple would run off to a constant of boundless variance
-        register_log_normal_prior(base, "lengthscale", 1.0, LOG_LENGTHSCALE_SPREAD)
-        base.period_length = torch.tensor(self.period, dtype=torch.float64)
-        base.lengthscale = torch.tensor(1.0, dtype=torch.float64)
-        kernel.outputscale = variance
-        return kernel
+        how: dict[str, Any] = {"period": self.period, "spread": PERIOD_SPREAD, "constraint": near}
+        return tuple(periodic(1, variance, **how) for variance in variances)
 
 
 def _period(given: float, spreads: Tensor) -> Tensor:

@@ -5,8 +5,7 @@
 Sums of independent functions have the sum of their kernels, and a product of kernels is a kernel (Rasmussen & Williams
 2006, section 4.2.4).
 
-Terms of a sum have log-normal priors on their variances: beside a linear kernel a slow squared exponential ran off to
-1e27 times the noise. A kernel by itself has none, for nothing competes with it.
+Terms of a sum have log-normal priors on their variances (`_sum_of`); a kernel by itself has none.
 """
 
 import math

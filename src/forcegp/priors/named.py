@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from inspect import Parameter, signature
+from itertools import accumulate
 from typing import Any
 
 from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
@@ -167,13 +168,9 @@ def _value(name: str, key: str, text: str, default: Any) -> Any:
 
 def _without_parentheses(text: str) -> str:
     """Without the one pair that encloses the whole text; "(a) + (b)" stays as it is."""
-    enclosed = text.startswith("(") and text.endswith(")")
-    depth, closes = 0, []
-    for index, character in enumerate(text):
-        depth += (character == "(") - (character == ")")
-        if depth == 0:
-            closes.append(index)
-    return text[1:-1].strip() if enclosed and closes == [len(text) - 1] else text
+    depths = list(accumulate((character == "(") - (character == ")") for character in text))
+    enclosed = text.startswith("(") and 0 in depths and depths.index(0) == len(text) - 1
+    return text[1:-1].strip() if enclosed else text
 
 
 def _split(text: str, separator: str) -> list[str]:

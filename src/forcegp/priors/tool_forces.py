@@ -47,11 +47,6 @@ class ToolPoint:
         return (self.jacobian @ v[..., None])[..., 0]
 
 
-def has_contact(dynamics: ConstrainedDynamics, contact: int) -> bool:
-    """Whether the constraint has that contact; forces of a contact that is not there are zero."""
-    return contact < len(dynamics.contacts)
-
-
 def contact_axes(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch 3 3"]:
     """Tangents t1, t2 and normal n of a contact's surface, as columns in world axes."""
     return surface_axes(dynamics.normals[..., contact, :])
@@ -61,6 +56,15 @@ def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[T
     """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
     size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
     return size * dynamics.multiplier_map().offset[..., contact].abs()
+
+
+def finite_numbers(given: object) -> tuple[float, ...] | None:
+    """`given` as finite floats, None where it is anything else."""
+    try:
+        numbers = tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
+    except (TypeError, ValueError):
+        return None
+    return numbers if not isinstance(given, str) and all(map(math.isfinite, numbers)) else None
 
 
 def is_contact_number(value: object) -> bool:
@@ -92,7 +96,7 @@ def require_moving(prior: str, frame: str, robot: Robot) -> None:
 
 TOOL_INPUTS = ("velocity", "angular-velocity", "position", "load", "q", "v", "u")
 SMALLEST_SPEED = 1e-6
-"""m/s, below which a direction of motion means nothing."""
+"""m/s, below which a direction of motion means nothing: far below any velocity scale of friction."""
 NAMES = {"world": ("x", "y", "z"), "tool": ("tool-x", "tool-y", "tool-z"), "surface": ("tangent-1", "tangent-2")}
 TORQUE_NAMES = {**NAMES, "surface": ("tangent-1", "tangent-2", "normal")}
 
@@ -130,8 +134,8 @@ class ToolForces(ExpressedKernels):
         check_kernel(self.kernel)
         if not (self.frame is None or isinstance(self.frame, str)):
             raise InvalidInput(f"ToolForces frame is {self.frame!r}; give the name of a link, or None for the contact.")
-        point = _three_numbers(self.point)
-        if self.axes not in AXES or point is None or not is_contact_number(self.contact):
+        point = finite_numbers(self.point)
+        if self.axes not in AXES or point is None or len(point) != 3 or not is_contact_number(self.contact):
             raise InvalidInput(
                 f"ToolForces has axes {self.axes!r}, point {self.point!r} and contact {self.contact!r}; give axes "
                 f"{' or '.join(map(repr, AXES))}, a point of three numbers in m, and a contact's number from 0."
@@ -183,8 +187,8 @@ class ToolForces(ExpressedKernels):
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state, where = dynamics.state, self._point(dynamics)
         if where is None:  # the force is zero whatever its features are
-            nothing = state.q.new_zeros(*state.q.shape[:-1], sum(self._width(name, state.q) for name in self.inputs))
-            return (nothing,) * self._count
+            names = self.feature_names(state.robot)
+            return (state.q.new_zeros(*state.q.shape[:-1], len(names[0])),) * self._count
         velocity, axes = where.velocity(state.v), self._directions(dynamics, where)
         tangents = axes[..., : len(NAMES[self.axes])]
         # along the normal of a surface the point neither moves nor changes its place
@@ -203,24 +207,27 @@ class ToolForces(ExpressedKernels):
     @override
     def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...], ...]:
         origin = ("velocity", "angular-velocity", "v")
+        labels = self._labels(robot)
         ways: tuple[Scaling, ...] = tuple(
-            "scale" if name in origin else "standardize"
-            for name in self.inputs
-            for _ in range(self._width(name, robot.armature))
+            "scale" if name in origin else "standardize" for name in self.inputs for _ in labels[name]
         )
         return (ways,) * self._count
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        labels = self._labels(robot)
+        return (tuple(label for name in self.inputs for label in labels[name]),) * self._count
+
+    def _labels(self, robot: Robot) -> dict[str, Sequence[str]]:
+        """Of the features that every input brings."""
         along, turning = NAMES[self.axes], TORQUE_NAMES[self.axes]
-        named = {
+        return {
             "velocity": [f"tool velocity along {axis} [m/s]" for axis in along],
             "angular-velocity": [f"tool angular velocity about {axis} [rad/s]" for axis in turning],
             "position": [f"tool position along {axis} [m]" for axis in (along if self.axes == "surface" else "xyz")],
             "load": ["nominal normal force [N]"],
             **{name: joint_labels(name, name, robot.joint_names, robot) for name in ("q", "v", "u")},
         }
-        return (tuple(entry for name in self.inputs for entry in named[name]),) * self._count
 
     @override
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
@@ -230,15 +237,9 @@ class ToolForces(ExpressedKernels):
     def _count(self) -> int:
         return len(NAMES[self.axes]) + (3 if self.torque else 0)
 
-    def _width(self, name: str, per_joint: Tensor) -> int:
-        """Number of features that an input brings."""
-        if name in ("q", "v", "u"):
-            return per_joint.shape[-1]
-        return {"load": 1, "angular-velocity": 3}.get(name, len(NAMES[self.axes]))
-
     def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint | None:
         """None where the force belongs to a contact that the constraint does not have."""
-        if self._needs_contact and not has_contact(dynamics, self.contact):
+        if self._needs_contact and self.contact >= len(dynamics.contacts):
             return None
         if self.frame is None:
             return ToolPoint.of_contact(dynamics, self.contact)
@@ -252,15 +253,6 @@ class ToolForces(ExpressedKernels):
             return where.orientation
         identity = torch.eye(3, dtype=where.position.dtype, device=where.position.device)
         return identity.expand_as(where.orientation)
-
-
-def _three_numbers(given: object) -> tuple[float, ...] | None:
-    """`given` as three finite floats, None where it is anything else."""
-    try:
-        point = () if isinstance(given, str) else tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
-    except (TypeError, ValueError):
-        return None
-    return point if len(point) == 3 and all(map(math.isfinite, point)) else None
 
 
 def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -1,6 +1,6 @@
 """Figures of a comparison: errors per joint, calibration, and errors of predicted motions against their length."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from forcegp.evaluation.plots import style
 
-LINE_STYLES = ("-", "--", ":")
+LINE_STYLES, MARKERS = ("-", "--", ":"), "os^"
 """For models beyond the number of colours."""
 
 
@@ -30,11 +30,9 @@ def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fig
     joints = style.short_joint_names(document["joint_names"])
     figure = style.new_figure(max(7.0, 1.3 * len(joints) + 2.0), 6.4)
     above, below = figure.subplots(2, 1, sharex=True)
-    units = document["units"]["u"]
-    unit = units if isinstance(units, str) else "/".join(dict.fromkeys(units))
     for axes, score, title, label in (
         (above, "nrmse", "Acceleration: RMSE over the standard deviation of the target", "nRMSE"),
-        (below, "force_rms", "Force space: RMS of M (predicted − measured acceleration)", f"{unit}"),
+        (below, "force_rms", "Force space: RMS of M (predicted − measured acceleration)", _unit(document, "u")),
     ):
         _points(axes, models, f"{score}_per_joint", len(joints))
         style.quiet(axes, title=title, y=label)
@@ -50,10 +48,9 @@ def _points(axes: Axes, models: Mapping[str, Any], score: str, joints: int) -> N
         known = [(joint, value) for joint, value in enumerate(model[score]) if value is not None]
         at = np.array([joint + (place + 0.5) * width - 0.4 for joint, _ in known])
         middle, low, high = (np.array([value[key] for _, value in known]) for key in ("median", "min", "max"))
-        color, marker = _color(place), "os^"[place // len(style.SERIES) % 3]
-        below_and_above = np.vstack([middle - low, high - middle])
-        looks = {"fmt": marker, "markersize": 4.5, "color": color, "elinewidth": 1.2}
-        axes.errorbar(at, middle, yerr=below_and_above, label=name, **looks)
+        looks = {"fmt": MARKERS[place // len(style.SERIES) % 3], "markersize": 4.5, "elinewidth": 1.2}
+        around = np.vstack([middle - low, high - middle])
+        axes.errorbar(at, middle, yerr=around, label=name, color=_color(place), **looks)
     for joint in range(joints - 1):
         axes.axvline(joint + 0.5, color="#DDE0E4", linewidth=0.7)
 
@@ -64,14 +61,10 @@ def calibration_figure(models: Mapping[str, Any]) -> Figure:
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color=style.TRUTH, linewidth=1.0)
     for place, (name, model) in enumerate(models.items()):
-        levels = model["calibration"]["levels"]
         middle = [covered["median"] for covered in model["calibration"]["covered"]]
-        axes.plot(
-            levels, middle, _style(place), color=_color(place), linewidth=1.4, marker="o", markersize=3, label=name
-        )
-    style.quiet(
-        axes, title="Calibration, mean over joints, median over runs", x="nominal interval", y="held-out rows inside"
-    )
+        _draw_curve(axes, place, name, model["calibration"]["levels"], middle)
+    title = "Calibration, mean over joints, median over runs"
+    style.quiet(axes, title=title, x="nominal interval", y="held-out rows inside")
     axes.set_aspect("equal")
     axes.annotate("too narrow", (0.72, 0.2), fontsize=style.NORMAL, color=style.QUIET)
     axes.annotate("too wide", (0.1, 0.72), fontsize=style.NORMAL, color=style.QUIET)
@@ -90,14 +83,10 @@ def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fi
             continue
         time = [h for h, _ in known]
         low, middle, high = ([rms[key] for _, rms in known] for key in ("min", "median", "max"))
-        axes.plot(
-            time, middle, _style(place), color=_color(place), linewidth=1.5, marker="o", markersize=3.5, label=name
-        )
+        _draw_curve(axes, place, name, time, middle)
         axes.fill_between(time, low, high, color=_color(place), alpha=0.10, linewidth=0)
-    units = document["units"]["q"]
-    unit = units if isinstance(units, str) else "/".join(dict.fromkeys(units))
-    title = "Motions predicted from recorded states under recorded forces"
-    style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{unit}]")
+    title, label = "Motions predicted from recorded states under recorded forces", _unit(document, "q")
+    style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{label}]")
     axes.set_yscale("log")
     _legend(figure, axes, len(models))
     return figure
@@ -117,5 +106,11 @@ def _color(place: int) -> str:
     return style.SERIES[place % len(style.SERIES)]
 
 
-def _style(place: int) -> str:
-    return LINE_STYLES[place // len(style.SERIES) % len(LINE_STYLES)]
+def _draw_curve(axes: Axes, place: int, name: str, x: Sequence[float], y: Sequence[float]) -> None:
+    looks = {"linestyle": LINE_STYLES[place // len(style.SERIES) % len(LINE_STYLES)], "marker": "o", "markersize": 3.0}
+    style.draw_line(axes, x, y, _color(place), 1.4, name, **looks)
+
+
+def _unit(document: Mapping[str, Any], quantity: str) -> str:
+    units = document["units"][quantity]
+    return units if isinstance(units, str) else "/".join(dict.fromkeys(units))

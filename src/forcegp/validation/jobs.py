@@ -77,8 +77,7 @@ def _identification_name(comparison: Comparison, name: str, split: int, seed: in
 def _modules(work: Candidate | Identification) -> tuple[str, ...]:
     """Where the functions are defined, which somebody else may have added."""
     functions = (work.fit,) if isinstance(work, Candidate) else (work.identify, work.noise)
-    found = {_plain(function).__module__ for function in functions if function is not None}
-    return tuple(sorted(found))
+    return tuple(sorted({_plain(function).__module__ for function in functions if function is not None}))
 
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -121,28 +120,22 @@ def compute(
     return {**{key: spec[key] for key in ("kind", "name", "seed")}, "split": split, "result": result, "error": error}
 
 
-def _training_rows(comparison: Comparison, spec: Mapping[str, Any]) -> tuple[Dataset, Dataset]:
-    train, test = comparison.splits[spec["split"]].apply(comparison.rows)
-    return training_subset(train, comparison.points, spec["seed"]), test
-
-
 def _identify(comparison: Comparison, spec: Mapping[str, Any], work: Identification) -> dict[str, Any]:
-    rows, _ = _training_rows(comparison, spec)
-    if work.all_rows:
-        rows, _ = comparison.splits[spec["split"]].apply(comparison.rows)
+    train, _ = comparison.splits[spec["split"]].apply(comparison.rows)
+    rows = train if work.all_rows else training_subset(train, comparison.points, spec["seed"])
     start = time.process_time()
     system = work.identify(comparison.system, rows, comparison.friction)
     found: dict[str, Any] = {"how": work.summary, "training_rows": len(rows)}
     if work.noise is not None:
         noise = work.noise(comparison.system, rows, comparison.friction)
         found["noise"] = {"acceleration": noise.acceleration.tolist(), "force": noise.force.tolist()}
-    seconds = time.process_time() - start
-    return {"cpu_seconds": seconds, **found, "system": system.to_dict()}
+    return {"cpu_seconds": time.process_time() - start, **found, "system": system.to_dict()}
 
 
 def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], work: Candidate) -> dict[str, Any]:
-    rows, test = _training_rows(comparison, spec)
     split = comparison.splits[spec["split"]]
+    train, test = split.apply(comparison.rows)
+    rows = training_subset(train, comparison.points, spec["seed"])
     motions = comparison.motions(split)
     identified: dict[str, MechanicalSystem | str] = {}
     before, noise = 0.0, None
@@ -158,7 +151,7 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
         comparison.force_noise,
         comparison.measured_torque,
         noise,
-        split.apply(comparison.rows)[0],
+        train,
         split.apply(comparison.recording)[0],
         max(motions.horizons, default=1.0),
     )
@@ -166,7 +159,7 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
     posterior = work.fit(training)
     seconds = before + time.process_time() - start
     mass, whose = reference_mass(store, comparison, spec["mass_matrix"], test)
-    scores, doubted = acceleration_scores(posterior, test, mass, outside_range(training.all_rows or rows, test))
+    scores, doubted = acceleration_scores(posterior, test, mass, outside_range(train, test))
     for sentence in doubted:
         warnings.warn(sentence, DataWarning, stacklevel=1)  # the page shows what was warned of in a job
     scores["motions"] = motion_scores(posterior, motions, comparison.integrator)

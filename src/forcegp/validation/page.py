@@ -1,7 +1,7 @@
 """The page of a comparison: every number on it comes from the document of results."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
@@ -111,28 +111,25 @@ def _conclusions(document: Mapping[str, Any]) -> str:
 def _against_baseline(found: Mapping[str, Any] | None) -> list[str]:
     if found is None or not found["models"]:
         return []
-    baseline, scores = found["baseline"], tuple(SCORES)
-    rows = []
-    for name, answers in found["models"].items():
-        given = [answers[score] for score in scores]
-        rows.append([name, *(_against(answer) for answer in given)])
+    models: Mapping[str, Mapping[str, Any]] = found["models"]
+    rows = [[name, *(_against(answers[score]) for score in SCORES)] for name, answers in models.items()]
+    verdicts = {name: {answer["verdict"] for answer in each.values() if answer} for name, each in models.items()}
     sentences = []
-    for outcome, words in (("better", "Better than it by every score"), ("worse", "Worse than it by every score")):
-        names = [
-            name
-            for name, answers in found["models"].items()
-            if all(answer["verdict"] == outcome for answer in answers.values() if answer is not None)
-        ]
-        sentences.append(f"{words}: {', '.join(names) if names else 'none'}.")
-    never = [
-        name
-        for name, answers in found["models"].items()
-        if not any(answer["verdict"] == "better" for answer in answers.values() if answer is not None)
-    ]
-    sentences.append(f"Not shown to be better by any score: {', '.join(never) if never else 'none'}.")
-    header = ["model", *(f"{SCORES[score]}{', difference' if score == 'nlpd' else ', ratio'}" for score in scores)]
+    for words, holds in (
+        ("Better than it by every score", lambda outcomes: outcomes <= {"better"}),
+        ("Worse than it by every score", lambda outcomes: outcomes <= {"worse"}),
+        ("Not shown to be better by any score", lambda outcomes: "better" not in outcomes),
+    ):
+        names = [name for name, outcomes in verdicts.items() if holds(outcomes)]
+        sentences.append(f"{words}: {', '.join(names) or 'none'}.")
+    header = [f"{words}, {'difference' if score == 'nlpd' else 'ratio'}" for score, words in SCORES.items()]
     text = "With 95 % intervals over stretches and seeds; bold where the model is shown to be better."
-    return [f"## Every model against {baseline}", text, markdown_table(header, rows), " ".join(sentences)]
+    return [
+        f"## Every model against {found['baseline']}",
+        text,
+        markdown_table(["model", *header], rows),
+        " ".join(sentences),
+    ]
 
 
 def _against(answer: Mapping[str, Any] | None) -> str:
@@ -149,36 +146,16 @@ def _against(answer: Mapping[str, Any] | None) -> str:
 
 def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
     force = _listed_units(document["units"]["u"])
-    header = [
-        "model",
-        "nRMSE",
-        f"force error [{force}], rms",
-        "mean abs",
-        "NLPD [nats]",
-        "in 95 %",
-        "in 50 %",
-        "fit [CPU s]",
-    ]
-    low = _by(models, lambda model, score: None if model[score] is None else model[score]["median"])
+    header = ["model", "nRMSE", f"force error [{force}], rms", "mean abs", "NLPD [nats]"]
+    header += ["in 95 %", "in 50 %", "fit [CPU s]"]
+    errors, levels = ("nrmse", "force_rms", "force_mae", "nlpd"), {"coverage_95": 0.95, "coverage_50": 0.5}
+    best = {s: _least((model[s] for model in models.values()), levels.get(s)) for s in (*errors, *levels)}
     rows = []
     for name, model in models.items():
-        cells = [_marked(model[s], 3, low("least", s)) for s in ("nrmse", "force_rms", "force_mae", "nlpd")]
-        cells += [_percent(model[s], low("nearest", s)) for s in ("coverage_95", "coverage_50")]
+        cells = [_marked(model[score], 3, best[score]) for score in errors]
+        cells += [_percent(model[score], best[score]) for score in levels]
         rows.append([_named(name, model), *cells, formatted(model["cpu_seconds"], 1)])
     return markdown_table(header, rows)
-
-
-def _by(models: Mapping[str, Any], value: Callable[[Any, str], float | None]) -> Callable[[str, str], float | None]:
-    """The best median of a score: the least, or the nearest to the level of the interval."""
-
-    def best(how: str, score: str) -> float | None:
-        found = [number for model in models.values() if (number := value(model, score)) is not None]
-        if how == "least":
-            return min(found, default=None)
-        level = int(score.rpartition("_")[2]) / 100.0
-        return min(found, key=lambda number: abs(number - level), default=None)
-
-    return best
 
 
 def _range(models: Mapping[str, Any]) -> list[str]:
@@ -272,17 +249,13 @@ def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
     unit = _listed_units(document["units"]["q"])
     table = markdown_table(["model", *(f"after {h:g} s" for h in first["horizons"])], rows)
     last = first["horizons"][-1]
-    each = _motion_joints(moving, document, len(first["horizons"]) - 1)
+    at_last = {name: {**model, "at": model["motions"]["rms_per_joint"][-1]} for name, model in moving.items()}
+    each = _joint_table(at_last, document, "at", 4)
     return (
         f"RMS error of q over motions and joints [{unit}]; the mean of each model integrated by {first['integrator']} "
         f"in steps of {first['dt']:.4g} s from recorded states under recorded forces. Errors are those of motions that "
         f"had not diverged.\n\n{table}\n\nBy joint after {last:g} s:\n\n{each}"
     )
-
-
-def _motion_joints(models: Mapping[str, Any], document: Mapping[str, Any], place: int) -> str:
-    flat = {name: {**model, "at": model["motions"]["rms_per_joint"][place]} for name, model in models.items()}
-    return _joint_table(flat, document, "at", 4)
 
 
 def _models(models: Mapping[str, Any]) -> str:
@@ -293,15 +266,12 @@ def _models(models: Mapping[str, Any]) -> str:
 def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, model in models.items():
-        for reason, runs in _grouped(
-            (f["error"], f"{f['split']}, seed {f['seed']}") for f in model["failures"]
-        ).items():
+        for reason, runs in _reasons(model["failures"]).items():
             lines.append(f"* **{name}** failed in {len(runs)} of {_runs(model)} runs ({'; '.join(runs)}): {reason}")
     failed = [run for run in document["identifications"] if run["error"] is not None]
-    reasons = _grouped((f"{run['name']}\n{run['error']}", f"{run['split']}, seed {run['seed']}") for run in failed)
-    for reason, runs in reasons.items():
-        name, _, error = reason.partition("\n")
-        lines.append(f"* the {name} identification failed ({'; '.join(runs)}): {error}")
+    for name in dict.fromkeys(run["name"] for run in failed):
+        for reason, runs in _reasons(run for run in failed if run["name"] == name).items():
+            lines.append(f"* the {name} identification failed ({'; '.join(runs)}): {reason}")
     return ["## Failures", "\n".join(lines)] if lines else []
 
 
@@ -317,6 +287,10 @@ def _warnings(models: Mapping[str, Any]) -> list[str]:
     return ["## Warnings", "\n".join(lines)] if lines else []
 
 
+def _reasons(failed: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
+    return _grouped((run["error"], f"{run['split']}, seed {run['seed']}") for run in failed)
+
+
 def _grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for key, value in pairs:
@@ -328,8 +302,10 @@ def _named(name: str, model: Mapping[str, Any]) -> str:
     return f"{name} ({model['runs']} of {_runs(model)} runs)" if model["failures"] else name
 
 
-def _least(values: Iterable[Mapping[str, Any] | None]) -> float | None:
-    return min((value["median"] for value in values if value is not None), default=None)
+def _least(values: Iterable[Mapping[str, Any] | None], level: float | None = None) -> float | None:
+    """The best median: the least, or the nearest to a level."""
+    medians = (value["median"] for value in values if value is not None)
+    return min(medians, key=lambda median: median if level is None else abs(median - level), default=None)
 
 
 def _marked(value: Mapping[str, Any] | None, digits: int, best: float | None) -> str:
@@ -344,10 +320,7 @@ def _marked(value: Mapping[str, Any] | None, digits: int, best: float | None) ->
 def _percent(value: Mapping[str, Any] | None, best: float | None = None) -> str:
     if value is None:
         return "–"
-    in_percent = {
-        name: [100.0 * each for each in number] if isinstance(number, list) else 100.0 * number
-        for name, number in value.items()
-    }
+    in_percent = {name: 100.0 * value[name] for name in ("median", "min", "max")} | {"values": value["values"]}
     return _marked(in_percent, 1, None if best is None else 100.0 * best) + " %"
 
 

@@ -28,16 +28,12 @@ SCORES: Mapping[str, str] = {
 }
 """What is compared, by the name of the score: `motion` over all horizons. Ratios, but densities differences."""
 
-PARAMETRIC = ("given", "identified")
+PARAMETRIC, NO_FORCES = ("given", "identified"), ("black box", "residual")
 QUESTIONS: Sequence[tuple[str, tuple[str, ...], tuple[str, ...]]] = (
     ("Is the identified model better than the system as given?", ("identified",), ("given",)),
     ("Does a Gaussian process on forces beat the best parametric model?", ("force prior",), PARAMETRIC),
     ("Does a model without physics beat the best parametric model?", ("black box",), PARAMETRIC),
-    (
-        "Does a Gaussian process on forces beat models without force priors?",
-        ("force prior",),
-        ("black box", "residual"),
-    ),
+    ("Does a Gaussian process on forces beat models without force priors?", ("force prior",), NO_FORCES),
 )
 """Question, kinds of the challenger and of the baseline; of both the one with the lowest error is taken."""
 
@@ -193,18 +189,12 @@ def against_baseline(summary: Mapping[str, Any], runs: Runs, margin: float = MAR
             baseline = baseline or best_of(summary, runs, (kind,), score)
     if baseline is None:
         return None
-    compare = {
-        name: {score: compared(score, name, baseline, runs, margin) for score in SCORES}
-        for name, model in summary.items()
-        if name != baseline and model["runs"]
-    }
-    return {
-        "baseline": baseline,
-        "models": {
-            name: {score: None if each is None else each.to_dict() for score, each in scores.items()}
-            for name, scores in compare.items()
-        },
-    }
+    models: dict[str, dict[str, Any]] = {}
+    for name, model in summary.items():
+        if name != baseline and model["runs"]:
+            tests = {score: compared(score, name, baseline, runs, margin) for score in SCORES}
+            models[name] = {score: None if each is None else each.to_dict() for score, each in tests.items()}
+    return {"baseline": baseline, "models": models}
 
 
 def best_of(summary: Mapping[str, Any], runs: Runs, kinds: Sequence[str], score: str) -> str | None:

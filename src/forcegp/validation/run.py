@@ -1,6 +1,6 @@
 """`validate`: compute what is missing of a comparison, and write its page, figures and numbers."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,8 @@ def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
             f"The filter took {shares} of the variance of the joints' acceleration; scores are against the rest."
         )
     for quantity, reason in dict(report.get("why") or {}).items():
-        lines.append(f"Chosen automatically, {quantity}: {_reason(reason)}")
+        told = "; ".join(f"{name} {why}" for name, why in reason.items()) if isinstance(reason, Mapping) else reason
+        lines.append(f"Chosen automatically, {quantity}: {told}")
     earlier = report.get("earlier")
     return lines + (preparation_lines({"preparation": earlier}) if preparation_report({"preparation": earlier}) else [])
 
@@ -65,15 +66,6 @@ def _step(report: Mapping[str, Any]) -> str:
     if report.get("trim"):
         parts.append(f"{report['trim']:g} s dropped at both ends of every episode")
     return "; ".join(parts) + "."
-
-
-def _reason(reason: object) -> str:
-    if isinstance(reason, Mapping):
-        return "; ".join(f"{name} {value}" for name, value in reason.items())
-    return str(reason)
-
-
-Result = Mapping[str, Any]
 
 
 def summary_of(runs: Mapping[str, Sequence[Mapping[str, Any]]], models: Mapping[str, Candidate]) -> dict[str, Any]:
@@ -112,31 +104,22 @@ def _model(runs: Sequence[Mapping[str, Any]], candidate: Candidate) -> dict[str,
     if not results:
         return out
     for score in ("nrmse", "rmse", "mae", "force_rms", "force_mae"):
-        out[score] = median_and_range(over_joints(score, result[score]) for result in results)
-        out[f"{score}_per_joint"] = _per_joint(results, lambda result, score=score: result[score])
+        out[score] = _spread([over_joints(score, result[score]) for result in results])
+        out[f"{score}_per_joint"] = _spread([result[score] for result in results])
     if all("force_rms_at_rest" in result for result in results):
-        out["force_rms_at_rest_per_joint"] = _per_joint(results, lambda result: result["force_rms_at_rest"])
-    for score in ("nlpd", "cpu_seconds"):
-        out[score] = median_and_range(result[score] for result in results)
-    out["nlpd_per_joint"] = _per_joint(results, lambda result: result["nlpd_per_joint"])
+        out["force_rms_at_rest_per_joint"] = _spread([result["force_rms_at_rest"] for result in results])
+    for score in ("nlpd", "cpu_seconds", "nlpd_per_joint"):
+        out[score] = _spread([result[score] for result in results])
     levels = results[0]["levels"]
+    covered = _spread([[over_joints("coverage", each) for each in result["coverage"]] for result in results])
+    by_joint = _spread([result["coverage"] for result in results])
     for level in (0.5, 0.95):
-        place = levels.index(level)
-        name = f"coverage_{round(100 * level)}"
-        out[name] = median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
-        out[f"{name}_per_joint"] = _per_joint(results, lambda result, place=place: result["coverage"][place])
-    out["calibration"] = {
-        "levels": levels,
-        "covered": [
-            median_and_range(over_joints("coverage", result["coverage"][place]) for result in results)
-            for place in range(len(levels))
-        ],
-    }
+        place, name = levels.index(level), f"coverage_{round(100 * level)}"
+        out[name], out[f"{name}_per_joint"] = covered[place], by_joint[place]
+    out["calibration"] = {"levels": levels, "covered": covered}
     apart = [result["range"] for result in results]
     out["range"] = {
-        name: {
-            score: median_and_range(each[name][score] for each in apart) for score in ("rows", "nrmse", "coverage_95")
-        }
+        name: {score: _spread([each[name][score] for each in apart]) for score in ("rows", "nrmse", "coverage_95")}
         for name in ("inside", "outside")
         if all(name in each for each in apart)
     }
@@ -150,26 +133,26 @@ def _motions(runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
     if not given or len(given) < len(runs):
         return None
     horizons = [h for h in given[0]["horizons"] if all(h in run["horizons"] for run in given)]
-    places = [[run["horizons"].index(h) for run in given] for h in horizons]
+    rms, per_joint, diverged = (
+        [[run[name][run["horizons"].index(h)] for h in horizons] for run in given]
+        for name in ("rms", "rms_per_joint", "diverged")
+    )
     return {
         "horizons": horizons,
         "motions": sum(run["motions"] for run in given),
         "integrator": given[0]["integrator"],
         "dt": given[0]["dt"],
-        "rms": [median_and_range(run["rms"][at] for run, at in zip(given, here, strict=True)) for here in places],
-        "rms_per_joint": [
-            [
-                median_and_range(run["rms_per_joint"][at][joint] for run, at in zip(given, here, strict=True))
-                for joint in range(len(given[0]["rms_per_joint"][0]))
-            ]
-            for here in places
-        ],
-        "diverged": [sum(run["diverged"][at] for run, at in zip(given, here, strict=True)) for here in places],
+        "rms": _spread(rms),
+        "rms_per_joint": _spread(per_joint),
+        "diverged": [sum(each) for each in zip(*diverged, strict=True)],
     }
 
 
-def _per_joint(results: Sequence[Result], values: Callable[[Result], Sequence[float | None]]) -> list[Any]:
-    return [median_and_range(values(result)[joint] for result in results) for joint in range(len(values(results[0])))]
+def _spread(values: Sequence[Any]) -> Any:
+    """`median_and_range` of what runs found; of lists, place by place."""
+    if isinstance(values[0], Sequence):
+        return [_spread(each) for each in zip(*values, strict=True)]
+    return median_and_range(values)
 
 
 KIND = "forcegp validate"

@@ -218,16 +218,12 @@ def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: st
     for horizon in held_out.horizons:
         here = squared[:, round(horizon / motions.dt)]
         lasting = np.isfinite(here).all(axis=-1)
-        per_joint = _root_mean(here[lasting])
+        per_joint = np.sqrt(here[lasting].mean(axis=0)) if lasting.any() else np.full(here.shape[-1], np.nan)
         scores["rms_per_joint"].append(plain(per_joint))
         scores["rms"] += plain(np.sqrt(np.square(per_joint).mean(keepdims=True)))
         scores["diverged"].append(int((~lasting).sum()))
         scores["squared"].append(plain(np.where(lasting, here.mean(axis=-1), np.nan)))
     return scores
-
-
-def _root_mean(squared: Float[np.ndarray, "motions nv"]) -> Float[np.ndarray, " nv"]:
-    return np.sqrt(squared.mean(axis=0)) if len(squared) else np.full(squared.shape[-1], np.nan)
 
 
 def _step(recording: Dataset) -> float:

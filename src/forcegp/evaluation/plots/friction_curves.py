@@ -78,7 +78,10 @@ def friction_curves_figure(
             f"a model of {posterior.description} has no process that is a curve; fit one with friction priors, for "
             "example JointFriction() or ContactFriction()."
         )
-    chosen = panels[:LARGEST_GRID] if latents is None else [_panel(panels, name) for name in latents]
+    by_name = {panel.latent: panel for panel in panels}
+    for name in latents or ():
+        require_known("curve", name, "this model", by_name)
+    chosen = panels[:LARGEST_GRID] if latents is None else [by_name[name] for name in latents]
     columns = min(4 if len(chosen) > 6 else 3, len(chosen))
     rows = math.ceil(len(chosen) / columns)
     figure = style.new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
@@ -102,17 +105,8 @@ def friction_curves_figure(
 
 def _velocity_along(term: ForcePrior, name: str, index: int) -> int | None:
     """The feature that is the velocity along a tool force's own axis; None for other processes."""
-    if not isinstance(term, ToolForces) or not name.startswith("force"):
-        return None
-    if term.inputs == ("velocity",) or term.inputs == ("velocity", "angular-velocity"):
-        return index
-    return None
-
-
-def _panel(panels: Sequence[CurvePanel], name: str) -> CurvePanel:
-    by_name = {panel.latent: panel for panel in panels}
-    require_known("curve", name, "this model", by_name)
-    return by_name[name]
+    of_velocity = isinstance(term, ToolForces) and term.inputs in (("velocity",), ("velocity", "angular-velocity"))
+    return index if of_velocity and name.startswith("force") else None
 
 
 def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:
@@ -149,48 +143,24 @@ def _draw_curve(
     features[:, panel.feature] = at
     curve = posterior.curve(panel.latent, features)
     mean = panel.resisting * curve.mean.cpu().numpy()
-    spread = 1.959963984540054 * curve.std.cpu().numpy()
+    spread = style.QUANTILE * curve.std.cpu().numpy()
     inside = (at >= low) & (at <= high)
     axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
     if start < 0.0:
         axes.axvline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
-    axes.plot(at[inside], mean[inside], color=style.PREDICTION, linewidth=1.5, label="learned")
+    style.draw_line(axes, at[inside], mean[inside], style.PREDICTION, 1.5, "learned")
     style.draw_band(axes, at, mean, spread, alpha=0.28, where=inside.tolist(), label="95 % band")
     style.draw_band(axes, at, mean, spread, alpha=0.12)
-    axes.plot(
-        at,
-        mean,
-        color=style.PREDICTION,
-        linewidth=1.2,
-        linestyle=(0, (3, 2)),
-        label="beyond the training data",
-        zorder=1.9,
-    )
-    axes.plot(
-        visited,
-        np.full(len(visited), 0.025),
-        "|",
-        color=style.TRUTH,
-        markersize=5,
-        markeredgewidth=0.6,
-        alpha=0.5,
-        transform=axes.get_xaxis_transform(),
-        label="training velocities",
-        zorder=4,
-    )
+    dashes = {"label": "beyond the training data", "linestyle": (0, (3, 2)), "zorder": 1.9}
+    style.draw_line(axes, at, mean, style.PREDICTION, 1.2, **dashes)
+    ticks = {"markersize": 5, "markeredgewidth": 0.6, "transform": axes.get_xaxis_transform()}
+    ticks |= {"label": "training velocities", "color": style.TRUTH, "alpha": 0.5, "zorder": 4}
+    axes.plot(visited, np.full(len(visited), 0.025), "|", **ticks)
     levels = [(mean - spread)[inside], (mean + spread)[inside]]
     if truth is not None and len(truth[0]):
         shown = (truth[0] >= at[0]) & (truth[0] <= at[-1])
-        axes.plot(
-            truth[0][shown],
-            truth[1][shown],
-            "o",
-            color=TRUE_DOTS,
-            markersize=4.0,
-            markeredgewidth=0,
-            label="true",
-            zorder=1.8,
-        )
+        dots = {"label": "true", "color": TRUE_DOTS, "markersize": 4.0, "markeredgewidth": 0, "zorder": 1.8}
+        axes.plot(truth[0][shown], truth[1][shown], "o", **dots)
         if shown.any():
             levels.append(np.percentile(truth[1][shown], (1.0, 99.0)))  # a load near 0 makes any coefficient
     values = np.concatenate(levels)
@@ -227,11 +197,8 @@ def _truth(
             features = panel.term.features(dynamics)[panel.index]
             own = features[:, panel.feature]
             others = torch.cat([features[:, : panel.feature], features[:, panel.feature + 1 :]], dim=-1)
-            kept = torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()
-            if not features.shape[-1] > 1:
-                kept = torch.ones_like(kept)
             latent = panel.resisting * values[:, panel.index]
-            kept = kept & torch.isfinite(latent)
+            kept = (torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()) & torch.isfinite(latent)
             found[panel.latent] = (own[kept].numpy(), latent[kept].numpy())
     return found
 

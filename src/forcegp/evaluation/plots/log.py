@@ -10,7 +10,6 @@ from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
 from forcegp.data import (
     Dataset,
-    MotionSpectrum,
     Preparation,
     episodes_in_order,
     low_pass_gain,
@@ -36,15 +35,15 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
     units = {name: style.joint_units(dataset, name) for name in ("a", "u")}
     for joint in range(dataset.nv):
         panel = axes[joint, 0]
-        draw_acceleration_spectrum(panel, spectrum, joint, preparation)
+        _draw_filtered(panel, spectrum.frequency, spectrum.acceleration_density[:, joint], spectrum.step, preparation)
+        if np.isfinite(spectrum.floor[joint]):
+            order = 4 if spectrum.source == "q" else 2
+            floor = spectrum.floor[joint] * (2.0 * np.pi * spectrum.frequency) ** order
+            below = {"label": "noise floor", "linestyle": ":"}
+            style.draw_line(panel, spectrum.frequency, floor, style.KNOWN_PHYSICS, 1.0, **below)
         style.quiet(panel, y=f"{names[joint]}\n({units['a'][joint]})² / Hz")
         panel = axes[joint, 1]
-        _draw(panel, frequency, torque[:, joint], style.MEASUREMENT, "as logged")
-        if preparation.cutoff is not None:
-            gain = low_pass_gain(frequency, 1.0 / step, float(preparation.cutoff), preparation.order)
-            _draw(panel, frequency, torque[:, joint] * gain**2, style.PREDICTION, "after the filter")
-            draw_cutoff(panel, float(preparation.cutoff))
-        _limits(panel, torque[:, joint])
+        _draw_filtered(panel, frequency, torque[:, joint], step, preparation)
         style.quiet(panel, y=f"({units['u'][joint]})² / Hz")
     for column, title in enumerate(("Acceleration (positions differentiated)", "Torque")):
         axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
@@ -57,42 +56,34 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
     return figure
 
 
-def draw_acceleration_spectrum(axes: Axes, spectrum: MotionSpectrum, joint: int, preparation: Preparation) -> None:
-    """The acceleration of one joint, its noise floor, and what the filter leaves."""
-    power = spectrum.acceleration_density[:, joint]
-    _draw(axes, spectrum.frequency, power, style.MEASUREMENT, "as logged")
-    if np.isfinite(spectrum.floor[joint]):
-        order = 4 if spectrum.source == "q" else 2
-        floor = spectrum.floor[joint] * (2.0 * np.pi * spectrum.frequency) ** order
-        axes.plot(
-            spectrum.frequency, floor, color=style.KNOWN_PHYSICS, linewidth=1.0, linestyle=":", label="noise floor"
-        )
+def _draw_filtered(axes: Axes, frequency: np.ndarray, power: np.ndarray, step: float, preparation: Preparation) -> None:
+    """A spectrum as logged and what the filter leaves of it."""
+    _draw(axes, frequency, power, style.MEASUREMENT, "as logged")
     if preparation.cutoff is not None:
-        gain = low_pass_gain(spectrum.frequency, 1.0 / spectrum.step, float(preparation.cutoff), preparation.order)
-        _draw(axes, spectrum.frequency, power * gain**2, style.PREDICTION, "after the filter")
-        draw_cutoff(axes, float(preparation.cutoff))
-    _limits(axes, power)
+        gain = low_pass_gain(frequency, 1.0 / step, float(preparation.cutoff), preparation.order)
+        _draw(axes, frequency, power * gain**2, style.PREDICTION, "after the filter")
+        _draw_cutoff(axes, float(preparation.cutoff), style.PREDICTION)
+    _limits(axes, frequency, power)
 
 
-def draw_cutoff(axes: Axes, cutoff: float, color: str = style.PREDICTION) -> None:
-    """A vertical line at the cut-off [Hz]."""
+def _draw_cutoff(axes: Axes, cutoff: float, color: str) -> None:
     axes.axvline(cutoff, color=color, linewidth=1.0, linestyle=style.DASHED, label="cut-off")
 
 
 def _draw(axes: Axes, frequency: np.ndarray, power: np.ndarray, color: str, label: str) -> None:
     axes.loglog(frequency, np.maximum(power, 1e-300), color=color, linewidth=1.0, label=label)
-    axes.set_xlim(frequency[0], frequency[-1])
 
 
-def _limits(axes: Axes, power: np.ndarray) -> None:
+def _limits(axes: Axes, frequency: np.ndarray, power: np.ndarray) -> None:
     """From the least to the largest of what was logged: a filter leaves next to nothing beyond, which need not show."""
+    axes.set_xlim(frequency[0], frequency[-1])
     shown = power[power > 0.0]
     if len(shown):
         top = 5.0 * float(shown.max())
         axes.set_ylim(max(0.1 * float(shown.min()), top * 10.0**-DECADES), top)
 
 
-def draw_time_steps(axes: Axes, dataset: Dataset) -> None:
+def _draw_time_steps(axes: Axes, dataset: Dataset) -> None:
     """Every time step of a log against time, episodes one after the other."""
     elapsed = 0.0
     steps: list[float] = []
@@ -105,8 +96,7 @@ def draw_time_steps(axes: Axes, dataset: Dataset) -> None:
     if not steps:
         return
     median = float(np.median(steps))
-    label = f"median {median:.4g} ms"
-    axes.axhline(median, color=style.PREDICTION, linewidth=1.0, linestyle=style.DASHED, label=label)
+    axes.axhline(median, color=style.PREDICTION, linewidth=1.0, linestyle=style.DASHED, label=f"median {median:.4g} ms")
     axes.set_ylim(0.0, 1.15 * max(steps))
     axes.margins(x=0)
     axes.legend(fontsize=style.SMALL, frameon=False, loc="upper right")
@@ -128,22 +118,17 @@ def check_figure(report: CheckReport) -> Figure:
     grid = -(-nv // columns)
     figure = style.new_figure(10.0, 1.75 * grid + 3.4)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7))
-    panels = halves[0].subplots(grid, columns, sharex=True, squeeze=False)
+    panels = style.joint_panels(halves[0], nv, columns)
     names = style.short_joint_names(inputs.names)
     shown = style.window(inputs.log if inputs.compared is None else inputs.compared, 0.0, SECONDS)
     shown = shown.rows(slice(None, None, max(1, len(shown) // MOST_ROWS)))
-    drawn = [_draw_joint(panel, report, shown, joint) for joint, panel in zip(range(nv), panels.flat, strict=False)]
-    for joint, panel in enumerate(panels.flat):
-        if joint >= nv:
-            panel.set_visible(False)
-            continue
-        bottom = joint + columns >= nv
-        panel.tick_params(labelbottom=bottom)
-        style.quiet(panel, title=_title(names[joint], report, joint), y=drawn[joint], x="time in s" if bottom else "")
-    style.legend_above(halves[0], _heading(report), *panels.flat[:nv], markerscale=4)
+    for joint, (panel, lowest) in enumerate(panels):
+        unit = _draw_joint(panel, report, shown, joint)
+        style.quiet(panel, title=_title(names[joint], report, joint), y=unit, x="time in s" if lowest else "")
+    style.legend_above(halves[0], _heading(report), *(panel for panel, _ in panels), markerscale=4)
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]
     _draw_spectra(left, report, names)
-    draw_time_steps(right, inputs.log)
+    _draw_time_steps(right, inputs.log)
     style.quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
     return figure
 
@@ -153,18 +138,18 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     axes.margins(x=0)
     log = report.comparison
     if log is None:
-        axes.plot(shown.time, shown.q[:, joint], color=style.TRUTH, linewidth=1.0, label="position")
+        style.draw_line(axes, shown.time, shown.q[:, joint], style.TRUTH, 1.0, "position")
         return style.joint_units(shown, "q")[joint]
     rows = log.correction.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
     measured, fitted = rows.u[:, joint], log.fit.at(tau, rows)[:, joint]
     mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
     if mended:
-        axes.plot(rows.time, shown.u[:, joint], color=style.KNOWN_PHYSICS, linewidth=0.9, label="before the correction")
-    axes.plot(rows.time, measured, color=style.MEASUREMENT, linewidth=2.2, label="measured, filtered")
-    axes.plot(rows.time, tau[:, joint], color=style.TRUTH, linewidth=0.8, linestyle=":", label="inverse dynamics")
-    label = "with factor, armature, friction"
-    axes.plot(rows.time, fitted, color=style.PREDICTION, linewidth=1.1, linestyle=style.DASHED, label=label)
+        style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")
+    style.draw_line(axes, rows.time, measured, style.MEASUREMENT, 2.2, "measured, filtered")
+    style.draw_line(axes, rows.time, tau[:, joint], style.TRUTH, 0.8, "inverse dynamics", linestyle=":")
+    dashed = {"label": "with factor, armature, friction", "linestyle": style.DASHED}
+    style.draw_line(axes, rows.time, fitted, style.PREDICTION, 1.1, **dashed)
     drawn = [measured, fitted, *([shown.u[:, joint]] if mended else [])]
     low, high = min(values.min() for values in drawn), max(values.max() for values in drawn)
     space = 0.3 * max(float(high - low), 1e-9)
@@ -191,16 +176,13 @@ def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     inputs = report.inputs
     spectrum = motion_spectrum(inputs.even)
     for joint, name in enumerate(names):
-        power = np.maximum(spectrum.acceleration_density[:, joint], 1e-300)
-        axes.loglog(spectrum.frequency, power, color=style.SERIES[joint % len(style.SERIES)], linewidth=0.9, label=name)
-    shown = spectrum.acceleration_density[spectrum.acceleration_density > 0.0]
-    if len(shown):
-        axes.set_ylim(max(0.3 * float(shown.min()), 1e-12 * float(shown.max())), 5.0 * float(shown.max()))
+        color = style.SERIES[joint % len(style.SERIES)]
+        _draw(axes, spectrum.frequency, spectrum.acceleration_density[:, joint], color, name)
+    _limits(axes, spectrum.frequency, spectrum.acceleration_density)
     preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
     title = "Acceleration as logged: no filter"
     if preparation.cutoff is not None:
-        draw_cutoff(axes, float(preparation.cutoff), style.TRUTH)
+        _draw_cutoff(axes, float(preparation.cutoff), style.TRUTH)
         title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
-    axes.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
     axes.legend(fontsize=style.SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
     style.quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

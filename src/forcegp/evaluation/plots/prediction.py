@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.plots.style import NORMAL, SERIES, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import NORMAL, QUANTILE, SERIES, SMALL, new_figure, quiet
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models.protocol import Posterior
 
@@ -85,15 +86,9 @@ def likelihood_figure(
         last = len(history) - 1
         axes.plot(history, color=color, linewidth=1.6, label=name)
         axes.plot(last, history[-1], "o", color=color, markersize=4)
-        axes.annotate(
-            f"{history[-1]:.1f}" if abs(history[-1]) >= 10.0 else f"{history[-1]:.3g}",
-            (last, history[-1]),
-            xytext=(6, 0),
-            textcoords="offset points",
-            color=color,
-            fontsize=SMALL,
-            va="center",
-        )
+        text = f"{history[-1]:.1f}" if abs(history[-1]) >= 10.0 else f"{history[-1]:.3g}"
+        beside = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(text, (last, history[-1]), color=color, fontsize=SMALL, **beside)
     axes.margins(x=0.08)
     what, _, unit = objective.partition(" [")
     quiet(axes, title=f"What the search lowers: {what}", x="iteration", y=unit.removesuffix("]"))
@@ -101,8 +96,6 @@ def likelihood_figure(
     return figure
 
 
-QUANTILE = 1.959963984540054
-"""Of the standard normal distribution at 97.5 %."""
 LARGEST_ERROR = 5.0
 """Standard deviations at which the histogram of errors ends; what lies beyond is counted at the ends."""
 ERROR_ROWS = 2000
@@ -137,8 +130,8 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         _draw_force(grid[index, 0], rows, forces, index, known)
         style.quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
         if every is not None:
-            _draw_errors(grid[index, 1], every, index)
-            style.quiet(grid[index, 1], title=_summary(every, index), x="error / standard deviation", y="density")
+            title = _draw_errors(grid[index, 1], every, index)
+            style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")
     style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
     style.heading(figure, f"Normal force after {len(posterior.training)} training points")
     return figure
@@ -180,7 +173,8 @@ def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: b
     axes.margins(x=0)
 
 
-def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
+def _draw_errors(axes: Axes, forces: _Forces, index: int) -> str:
+    """The histogram of errors; returns what their root mean square is, for its title."""
     assert forces.truth is not None, "errors are drawn where the truth is known"
     errors = (forces.mean - forces.truth)[:, index] / np.maximum(forces.std[:, index], np.finfo(float).tiny)
     bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
@@ -188,24 +182,11 @@ def _draw_errors(axes: Axes, forces: _Forces, index: int) -> None:
     kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
     axes.hist(kept, bins=list(bins), density=True, color=style.PREDICTION, alpha=0.45, linewidth=0)
     at = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 201)
-    axes.plot(
-        at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=style.TRUTH, linewidth=1.0, label="standard normal"
-    )
+    style.draw_line(axes, at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), style.TRUTH, 1.0, "standard normal")
     axes.set_xlim(-LARGEST_ERROR, LARGEST_ERROR)
-    inside = float((np.abs(errors) <= QUANTILE).mean())
-    axes.annotate(
-        f"{100.0 * inside:.0f} % inside\nthe 95 % band",
-        (0.98, 0.95),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=style.SMALL,
-        color=style.TRUTH,
-    )
-
-
-def _summary(forces: _Forces, index: int) -> str:
-    assert forces.truth is not None, "errors are drawn where the truth is known"
+    text = f"{100.0 * float((np.abs(errors) <= QUANTILE).mean()):.0f} % inside\nthe 95 % band"
+    corner: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+    axes.annotate(text, (0.98, 0.95), fontsize=style.SMALL, color=style.TRUTH, **corner)
     truth = forces.truth[:, index]
     error, size = (float(np.sqrt(np.square(x).mean())) for x in (forces.mean[:, index] - truth, truth))
     relative = f" ({100.0 * error / size:.2g} %)" if size else ""

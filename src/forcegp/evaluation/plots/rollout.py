@@ -27,7 +27,7 @@ def rollout_figure(
     figure = style.new_figure(11.0, 1.9 * grid_rows + 3.9)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.9 * grid_rows + 0.6, 3.3))
     above, below = halves
-    axes: np.ndarray = above.subplots(grid_rows, COLUMNS, sharex=True, squeeze=False)
+    axes = style.joint_panels(above, nv, COLUMNS)
     names, units = style.short_joint_names(dataset.joint_names), style.joint_units(dataset, "q")
     mean = rollout.q[0].cpu().numpy()
     band, label = None, ""
@@ -35,21 +35,16 @@ def rollout_figure(
         band = np.stack([end.cpu().numpy()[0] for end in rollout.interval()])
         label = "95 % interval" if rollout.samples is None else f"95 % of {len(rollout.samples.q)} samples"
         label = label if rollout.intervals is None else "95 % interval, calibrated"
-    for joint, panel in enumerate(axes.flat):
-        if joint >= nv:
-            panel.set_visible(False)
-            continue
+    for joint, (panel, lowest) in enumerate(axes):
         if band is not None:
             low, high = band[..., joint]
             panel.fill_between(errors.time, low, high, color=style.PREDICTION, alpha=0.25, linewidth=0, label=label)
-        panel.plot(errors.time, recorded.q[0, :, joint], color=style.TRUTH, linewidth=1.4, label="recorded")
-        dashed = {"linewidth": 1.4, "linestyle": style.DASHED, "label": "rollout of the mean"}
-        panel.plot(errors.time, mean[:, joint], color=style.PREDICTION, **dashed)
+        style.draw_line(panel, errors.time, recorded.q[0, :, joint], style.TRUTH, 1.4, "recorded")
+        dashed = {"label": "rollout of the mean", "linestyle": style.DASHED}
+        style.draw_line(panel, errors.time, mean[:, joint], style.PREDICTION, 1.4, **dashed)
         panel.margins(x=0)
-        last_of_column = joint + COLUMNS >= nv
-        panel.tick_params(labelbottom=last_of_column)
-        style.quiet(panel, title=names[joint], y=units[joint], x="time in s" if last_of_column else "")
-    style.legend_above(above, f"{title}; from row {recorded.rows[0]}", axes[0, 0])
+        style.quiet(panel, title=names[joint], y=units[joint], x="time in s" if lowest else "")
+    style.legend_above(above, f"{title}; from row {recorded.rows[0]}", axes[0][0])
     panels = [(_draw_joint_error, True), (_draw_tool, errors.tool is not None)]
     panels.append((_draw_constraint, errors.constraint is not None))
     drawn = [draw for draw, shown in panels if shown]
@@ -63,15 +58,8 @@ def _draw_joint_error(axes: Axes, rollout: Rollout, errors: RolloutErrors) -> No
     largest = errors.joint.max(-1)
     _draw_all(axes, errors.time, largest)
     if errors.spread is not None:
-        expected = _median(errors.spread.max(-1))
-        axes.plot(
-            errors.time[1:],
-            expected[1:],
-            color=style.TRUTH,
-            linewidth=1.2,
-            linestyle=":",
-            label="half the 95 % interval",
-        )
+        expected = _median(errors.spread.max(-1))[1:]
+        style.draw_line(axes, errors.time[1:], expected, style.TRUTH, 1.2, "half the 95 % interval", linestyle=":")
     _finish(axes, f"Largest joint error, {_of(errors)}", "")
 
 
@@ -89,14 +77,11 @@ def _draw_constraint(axes: Axes, rollout: Rollout, errors: RolloutErrors) -> Non
         lasting = sampled[np.isfinite(sampled).all(-1)]
         if len(lasting):
             low, high = np.maximum(np.quantile(lasting, INTERVAL, axis=0), SMALLEST_SHOWN)
-            axes.fill_between(
-                errors.time, low, high, color=style.PREDICTION, alpha=0.13, linewidth=0, label="95 % of samples"
-            )
+            middle, half = 0.5 * (high + low), 0.5 * (high - low)
+            style.draw_band(axes, errors.time, middle, half, alpha=0.13, label="95 % of samples")
     _draw_all(axes, errors.time, np.maximum(errors.constraint, SMALLEST_SHOWN), first=0)
     recorded = np.maximum(np.median(errors.recorded_constraint, axis=0), SMALLEST_SHOWN)
-    axes.plot(
-        errors.time, recorded, color=style.TRUTH, linewidth=1.2, linestyle=(0, (1, 1.5)), label="recorded, median"
-    )
+    style.draw_line(axes, errors.time, recorded, style.TRUTH, 1.2, "recorded, median", linestyle=(0, (1, 1.5)))
     _finish(axes, "Distance of the tool from the surface |c|", "m")
     shown = np.fmin(recorded, np.where(np.isfinite(errors.constraint), errors.constraint, np.inf).max(0))
     axes.set_ylim(bottom=max(SMALLEST_SHOWN, 1e-2 * float(shown.min())))  # where c changes sign, |c| falls without end

@@ -28,6 +28,7 @@ SERIES = (PREDICTION, KNOWN_PHYSICS, "#009E73", "#CC79A7", "#E69F00", "#56B4E9",
 DASHED = (0, (4, 1.5))
 SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
 RESOLUTION = 150  # dots per inch
+QUANTILE = 1.959963984540054  # of the standard normal distribution at 97.5 %
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -60,6 +61,20 @@ def draw_band(
 ) -> None:
     """The band from `mean - half` to `mean + half`, without a line around it."""
     axes.fill_between(x, mean - half, mean + half, color=color, alpha=alpha, linewidth=0, **more)
+
+
+def draw_line(axes: Axes, x: Any, y: Any, color: str, width: float, label: str | None = None, **more: Any) -> None:
+    """A line of that colour and width."""
+    axes.plot(x, y, color=color, linewidth=width, label=label, **more)
+
+
+def joint_panels(figure: FigureBase, count: int, columns: int) -> list[tuple[Axes, bool]]:
+    """Panels in rows of so many columns that share their times, and whether each is the lowest of its column."""
+    grid = figure.subplots(-(-count // columns), columns, sharex=True, squeeze=False).ravel()
+    for place, axes in enumerate(grid):
+        axes.tick_params(labelbottom=place + columns >= count)
+        axes.set_visible(place < count)
+    return [(axes, place + columns >= count) for place, axes in enumerate(grid[:count])]
 
 
 def heading(figure: Figure, text: str, *, size: float = LARGE) -> None:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.plots.style import NORMAL, QUIET, SMALL, TRUTH, new_figure, quiet, speed_colors
+from forcegp.evaluation.plots.style import KNOWN_PHYSICS, NORMAL, QUIET, SMALL, TRUTH, new_figure, quiet, speed_colors
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem, Plane
 from forcegp.models.protocol import Posterior
@@ -28,19 +28,29 @@ def tool_path_figure(posterior: Posterior, dataset: Dataset) -> Figure:
     """
     figure = new_figure(9.0, 4.6)
     path, height = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
-    lines = draw_tool_path(path, posterior, dataset)
-    fit_figure_to_path(figure, path, least=2.0, most=4.0)
-    finish_tool_path(figure, path, lines, tool_path_title(posterior.system, dataset))
+    _draw_tool_path(figure, path, posterior, dataset, (2.0, 4.0))
     _draw_height(height, posterior.system, dataset)
     return figure
 
 
-def draw_tool_path(axes: Axes, posterior: Posterior, dataset: Dataset, *, start: float = 0.0) -> LineCollection:
-    """The path of the test data coloured by speed (m/s) and the training points on top; returns the coloured lines.
+def _draw_tool_path(
+    figure: Figure,
+    axes: Axes,
+    posterior: Posterior,
+    whole: Dataset,
+    heights: tuple[float, float],
+    start: float = 0.0,
+) -> None:
+    """The path of the test data coloured by speed (m/s) and the training points; a tall one in a tall row.
 
-    Drawn are at most PATH_SECONDS of the recording, from `start` seconds on.
+    Drawn are at most PATH_SECONDS of the recording, from `start` seconds on; `heights` are the least and the most of
+    the row, the first one, in parts of the row heights.
     """
-    dataset = _path_rows(dataset, start)
+    order, elapsed = _elapsed(whole)
+    chosen = order[(elapsed >= start) & (elapsed <= start + PATH_SECONDS)]
+    if not chosen.size:
+        raise InvalidInput(f"no rows from {start} s on: the recording lasts {elapsed.max(initial=0.0):.3g} s.")
+    dataset = whole.rows(chosen)
     position, speed, _ = tool_motion(posterior.system, dataset.q, dataset.v)
     segments = np.stack([position[:-1, :2], position[1:, :2]], axis=1)
     pauses = np.diff(dataset.time)
@@ -52,43 +62,34 @@ def draw_tool_path(axes: Axes, posterior: Posterior, dataset: Dataset, *, start:
     axes.plot([], [], color=speed_colors()(0.55), linewidth=1.3, label="test: path of the tool")
     training = posterior.training
     points, _, _ = tool_motion(posterior.system, training.q.cpu().numpy(), training.v.cpu().numpy())
-    axes.plot(
-        points[:, 0],
-        points[:, 1],
-        "o",
-        color="white",
-        markersize=4.0,
-        markeredgecolor=TRUTH,
-        markeredgewidth=0.9,
-        label=f"training: {len(points)} points",
-    )
+    dots = {"color": "white", "markersize": 4.0, "markeredgecolor": TRUTH, "markeredgewidth": 0.9}
+    axes.plot(points[:, 0], points[:, 1], "o", label=f"training: {len(points)} points", **dots)
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")  # wider limits fill the panel; "box" would shrink it to a stamp
-    return lines
-
-
-def fit_figure_to_path(figure: Figure, axes: Axes, *, least: float, most: float) -> None:
-    """Let the first row of the figure grow for a tall path: `least` and `most` are its parts of the row heights."""
     grid = axes.get_gridspec()
     assert grid is not None  # the axes come from subplots
-    rows = [least, *list(grid.get_height_ratios())[1:]]  # type: ignore[arg-type]  # the stub omits that ratios are a sequence
+    rows = [heights[0], *list(grid.get_height_ratios())[1:]]  # type: ignore[arg-type]  # the stub omits that ratios are a sequence
     inch = figure.get_figheight() / sum(rows)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     wanted = 0.8 * figure.get_figwidth() * (high - low) / (right - left) / inch
-    rows[0] = float(np.clip(wanted, least, most))
+    rows[0] = float(np.clip(wanted, *heights))
     grid.set_height_ratios(rows)
     figure.set_figheight(inch * sum(rows))
-
-
-def tool_path_title(system: MechanicalSystem, dataset: Dataset, *, start: float = 0.0) -> str:
-    """What the map shows: from which side, and how much of the recording."""
-    surface = system.contacts[0].surface
+    quiet(axes, x="x in m", y="y in m")
+    surface = posterior.system.contacts[0].surface
     level = isinstance(surface, Plane) and bool(np.hypot(*surface.normal[:2]) < 1e-6)
     side = "seen from above" if level else "projected on x, y"
-    return f"Tool on the surface, {side}{excerpt(_path_rows(dataset, start), dataset, before=': ')}"
+    title = f"Tool on the surface, {side}{_excerpt(dataset, whole, before=': ')}"
+    axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH, pad=20.0)  # a row of its own above the legend
+    bar = figure.colorbar(lines, ax=axes, pad=0.01, aspect=12)
+    bar.set_label("speed in m/s", fontsize=SMALL, color=QUIET)
+    bar.ax.tick_params(labelsize=SMALL, labelcolor=QUIET)
+    bar.outline.set_visible(False)  # type: ignore[operator]  # the stubs call it a spine with another signature
+    close = {"bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1, "borderpad": 0.2}
+    axes.legend(loc="lower left", ncols=2, fontsize=SMALL, frameon=False, **close)
 
 
-def excerpt(part: Dataset, whole: Dataset, *, before: str = "", after: str = "") -> str:
+def _excerpt(part: Dataset, whole: Dataset, *, before: str = "", after: str = "") -> str:
     """`20 s of 100 s` between the given texts if the part is shorter than the whole, nothing otherwise."""
     shown, recorded = (_elapsed(dataset)[1].max(initial=0.0) for dataset in (part, whole))
     texts = [f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s" for seconds in (shown, recorded)]
@@ -101,33 +102,6 @@ def _elapsed(dataset: Dataset) -> tuple[Int[np.ndarray, " rows"], Float[np.ndarr
     steps = np.diff(dataset.time[order], prepend=dataset.time[order[:1]])
     steps[1:][np.diff(dataset.episode[order]) != 0] = 0.0
     return order, np.cumsum(steps)
-
-
-def _path_rows(dataset: Dataset, start: float) -> Dataset:
-    order, elapsed = _elapsed(dataset)
-    chosen = order[(elapsed >= start) & (elapsed <= start + PATH_SECONDS)]
-    if not chosen.size:
-        raise InvalidInput(f"no rows from {start} s on: the recording lasts {elapsed.max(initial=0.0):.3g} s.")
-    return dataset.rows(chosen)
-
-
-def finish_tool_path(figure: Figure, axes: Axes, lines: LineCollection, title: str) -> None:
-    """Labels, legend and the scale of speeds."""
-    quiet(axes, x="x in m", y="y in m")
-    axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH, pad=20.0)  # a row of its own above the legend
-    bar = figure.colorbar(lines, ax=axes, pad=0.01, aspect=12)
-    bar.set_label("speed in m/s", fontsize=SMALL, color=QUIET)
-    bar.ax.tick_params(labelsize=SMALL, labelcolor=QUIET)
-    bar.outline.set_visible(False)  # type: ignore[operator]  # the stubs call it a spine with another signature
-    axes.legend(
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        ncols=2,
-        fontsize=SMALL,
-        frameon=False,
-        borderaxespad=0.1,
-        borderpad=0.2,
-    )
 
 
 def tool_motion(
@@ -183,9 +157,7 @@ def summary_figure(
     figure = style.new_figure(10.0, 6.6)
     grid = figure.add_gridspec(3, len(joints), height_ratios=(1.15, 1.0, 1.0))
     top = figure.add_subplot(grid[0, :])
-    lines = draw_tool_path(top, posterior, dataset, start=start)
-    fit_figure_to_path(figure, top, least=1.4, most=2.0)
-    finish_tool_path(figure, top, lines, tool_path_title(posterior.system, dataset, start=start))
+    _draw_tool_path(figure, top, posterior, dataset, (1.4, 2.0), start)
     names = style.short_joint_names(rows.joint_names)
     units = {quantity: style.joint_units(rows, quantity) for quantity in ("a", "u")}
     for column, joint in enumerate(joints):
@@ -196,32 +168,21 @@ def summary_figure(
         style.quiet(above, title=names[joint], y="" if column else f"acceleration in {units['a'][joint]}")
         style.quiet(below, x="time in s", y="" if column else f"unknown force in {units['u'][joint]}")
         above.tick_params(labelbottom=False)
-    panels = figure.axes[-2:]
     figure.align_ylabels()
-    style.legend_below(figure, *panels, size=style.NORMAL, markerscale=4)
-    shown = excerpt(rows, dataset, before=" (time panels: ", after=")")
-    style.heading(figure, f"{len(posterior.training)} points teach {_what(posterior)}{shown}", size=style.LARGE + 1)
+    style.legend_below(figure, *figure.axes[-2:], size=style.NORMAL, markerscale=4)
+    shown = _excerpt(rows, dataset, before=" (time panels: ", after=")")
+    learned = f"the {posterior.description} all it has learned"
+    learned = "the force that nobody modelled" if posterior.predicts_forces else learned
+    style.heading(figure, f"{len(posterior.training)} points teach {learned}{shown}", size=style.LARGE + 1)
     return figure
-
-
-def _what(posterior: Posterior) -> str:
-    if posterior.predicts_forces:
-        return "the force that nobody modelled"
-    return f"the {posterior.description} all it has learned"
 
 
 def _draw_acceleration(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) -> None:
     axes.plot(rows.time, rows.a[:, joint], ".", color=style.MEASUREMENT, markersize=2.0, label="measured")
-    axes.plot(
-        rows.time,
-        predicted.known_physics[:, joint],
-        color=style.KNOWN_PHYSICS,
-        linewidth=1.1,
-        label="known physics alone",
-    )
+    style.draw_line(axes, rows.time, predicted.known_physics[:, joint], KNOWN_PHYSICS, 1.1, "known physics alone")
     mean, spread = predicted.mean[:, joint], 2.0 * predicted.measurement_std[:, joint]
     style.draw_band(axes, rows.time, mean, spread, alpha=0.3, label="2σ")
-    axes.plot(rows.time, mean, color=style.PREDICTION, linewidth=1.3, label="with the learned force")
+    style.draw_line(axes, rows.time, mean, style.PREDICTION, 1.3, "with the learned force")
     low, high = np.percentile(np.stack([rows.a[:, joint], predicted.known_physics[:, joint]]), (1, 99))
     axes.set_ylim(low - 0.15 * (high - low), high + 0.15 * (high - low))
     axes.margins(x=0)
