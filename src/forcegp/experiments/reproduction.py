@@ -74,7 +74,7 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
     "forces": (
         DataEfficiency(points=(10, 20, 50, 100), **FORCES),
         Friction(points=(200,), **FORCES),
-        OtherLaws(points=(200,), **FORCES),
+        OtherLaws(points=(200,), **{**FORCES, "seeds": FORCE_SEEDS[:3]}),
         Transfer(points=(100,), **FORCES),
         UnilateralContact(points=(200,), **FORCES),
         DeepKernel(points=(200,), **FORCES),
