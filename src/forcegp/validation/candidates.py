@@ -202,7 +202,11 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
         summary = f"{base.summary}; refined on the motions of all training rows"
         return replace(base, summary=summary, fit=partial(_fit_motions, base.fit), cost=5.0 * base.cost)
     if name.removeprefix(IDENTIFIED) in IDENTIFICATIONS and name.startswith(IDENTIFIED):
-        return _identified_candidate(name.removeprefix(IDENTIFIED))
+        method = name.removeprefix(IDENTIFIED)
+        chosen = IDENTIFICATIONS[method]
+        noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
+        summary = f"the system identified by {chosen.summary}; {noise}"
+        return Candidate(summary, "identified", partial(_fit_system, method), method, all_rows=chosen.all_rows)
     expression, at, mean = (part.strip() for part in name.partition(MEAN))
     mean = mean if at else "given"
     method = {"given": None, "identified": identification}.get(mean, mean)
@@ -228,13 +232,6 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
         cost=10.0,
         all_rows=has_few_inputs(prior, system.robot) and (method is None or IDENTIFICATIONS[method].all_rows),
     )
-
-
-def _identified_candidate(method: str) -> Candidate:
-    chosen = IDENTIFICATIONS[method]
-    noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
-    summary = f"the system identified by {chosen.summary}; {noise}"
-    return Candidate(summary, "identified", partial(_fit_system, method), method, all_rows=chosen.all_rows)
 
 
 def candidates(
