@@ -99,8 +99,8 @@ class BaseParameters:
         seen = np.flatnonzero(norms > RANK_TOLERANCE * norms.max())
         if norms.max() == 0.0:
             raise InvalidInput("the regressor is zero: nothing moves and nothing weighs, so no parameter shows.")
-        triangular, order = _pivoted(regressor[:, seen] / norms[seen])
-        diagonal = abs(triangular.diagonal())
+        triangular, order = scipy.linalg.qr(regressor[:, seen] / norms[seen], mode="r", pivoting=True)
+        diagonal = np.abs(triangular.diagonal())
         rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
         first, rest = seen[order[:rank]], seen[order[rank:]]
         scaled = scipy.linalg.solve_triangular(triangular[:rank, :rank], triangular[:rank, rank:])
@@ -150,11 +150,3 @@ def excitation(
     """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
     states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))
     return BaseParameters.of(torque_regressor(robot, *states).flatten(0, 1).cpu().numpy(), parameter_names(robot))
-
-
-def _pivoted(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R (p, p) and the order of columns of a QR decomposition with pivoting."""
-    if len(matrix) < matrix.shape[1]:
-        matrix = np.vstack([matrix, np.zeros((matrix.shape[1] - len(matrix), matrix.shape[1]))])
-    triangular, order = scipy.linalg.qr(matrix, mode="r", pivoting=True)
-    return triangular[: matrix.shape[1]], order

@@ -210,9 +210,11 @@ def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             moved = posterior.with_system(moved_system(posterior, system))
-            here, there = (_error(model, rows) for model in (posterior, moved))
+            with torch.no_grad():
+                means = [model.predict(rows.q, rows.v, rows.u, covariance=False).mean for model in (posterior, moved)]
     except ForceGPError:
         return ""  # it cannot be carried there
+    here, there = (float(np.abs(mean.cpu().numpy() - rows.a).mean()) for mean in means)
     if there < WORTH_MOVING * here:
         return (
             f"; carried over to them, the error of its mean is {there:.3g} instead of {here:.3g} on "
@@ -226,13 +228,6 @@ def moved_system(posterior: Posterior, system: MechanicalSystem) -> MechanicalSy
     if "learned" not in posterior.settings:
         return system
     return replace(posterior.system, contacts=system.contacts, baumgarte=system.baumgarte)
-
-
-def _error(posterior: Posterior, rows: Dataset) -> float:
-    """Mean absolute error of the mean acceleration."""
-    with torch.no_grad():
-        mean = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.cpu().numpy()
-    return float(np.abs(mean - rows.a).mean())
 
 
 def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:

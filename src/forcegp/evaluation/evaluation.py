@@ -141,7 +141,7 @@ def evaluate(
     require_type("posterior", posterior, Posterior, " of a fit, and the dataset after it")
     require_rows("dataset", dataset, posterior.joint_names, "the model")
     predicted = predict_rows(posterior, dataset, progress)
-    found = _against_measurements(predicted, dataset) | _against_truth(predicted, dataset) | _constraint(predicted)
+    found = _against_measurements(predicted, dataset) | _against_truth(predicted, dataset)
     scores: dict[str, Any] = {name: _numbers(x) if isinstance(x, np.ndarray) else x for name, x in found.items()}
     return Evaluation(
         rows=len(dataset),
@@ -178,11 +178,15 @@ def _noise_warnings(posterior: Posterior, dataset: Dataset) -> tuple[str, ...]:
 
 def _against_measurements(predicted: PredictedRows, dataset: Dataset) -> dict[str, Any]:
     a, measurement = dataset.a, predicted.measurement_variance
+    residual = metrics.constraint_residual(predicted.A, predicted.b, predicted.mean)
     return {
         "known_physics_mae_per_joint": metrics.mean_absolute_error(predicted.known_physics, a),
         "nlpd": float(predicted.negative_log_density.mean()),
         "nlpd_per_joint": metrics.marginal_negative_log_density(predicted.mean, measurement, a),
         **_errors("{}_per_joint", predicted.mean, measurement, a),
+        "constraint_error_per_contact": np.abs(residual).mean(axis=0),
+        "constraint_error_per_joint": np.abs(metrics.joint_space_residual(predicted.A, residual)).mean(axis=0),
+        "constraint_error_max": float(np.abs(residual).max(initial=0.0)),
     }
 
 
@@ -211,16 +215,6 @@ def _errors(name: str, mean: np.ndarray | None, variance: np.ndarray | None, tru
         name.format("mae"): metrics.mean_absolute_error(mean, truth),
         name.format("rmse"): metrics.root_mean_square_error(mean, truth),
         name.format("coverage_95"): metrics.interval_coverage(mean, variance, truth),
-    }
-
-
-def _constraint(predicted: PredictedRows) -> dict[str, Any]:
-    residual = metrics.constraint_residual(predicted.A, predicted.b, predicted.mean)
-    per_joint = metrics.joint_space_residual(predicted.A, residual)
-    return {
-        "constraint_error_per_contact": np.abs(residual).mean(axis=0),
-        "constraint_error_per_joint": np.abs(per_joint).mean(axis=0),
-        "constraint_error_max": float(np.abs(residual).max(initial=0.0)),
     }
 
 

@@ -146,7 +146,7 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     """Errors of the acceleration and, where the model has them, of the forces; plain JSON values."""
     assert test.system is not None, "simulated data carry their system"
     if posterior.predicts_forces:
-        posterior = posterior.with_system(test.system)
+        posterior = posterior.with_contacts(test.system.contacts)  # what was identified stays
     out = evaluate(posterior, test).to_dict()
     names = ("mae", "mae_noise_free", "nlpd", "coverage_95", "coverage_95_noise_free", "known_physics_mae")
     kept = {name: out[name] for name in names}

@@ -10,7 +10,7 @@ Terms of a sum have log-normal priors on their variances (`_sum_of`); a kernel b
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -160,17 +160,12 @@ _TOKEN = re.compile(r"[()+*]|[^()+*\s]+")
 class KernelExpression:
     """An expression, read once. Raises InvalidInput for unknown names or a wrong form, with what is allowed."""
 
-    def __init__(self, expression: str, factories: Mapping[str, KernelFactory]) -> None:
+    def __init__(self, expression: str) -> None:
         self.expression = expression
-        self.factories = factories
         self._tokens = _TOKEN.findall(expression)
-        self._build = self._sum()
+        self.build = self._sum()
         if self._tokens:
             raise self._wrong(f"{self._tokens[0]!r} is not expected there")
-
-    def kernel(self, dimension: int, variance: Tensor | float) -> Kernel:
-        """A fresh kernel for `dimension` features whose function starts with `variance` at standardised features."""
-        return self._build(dimension, variance)
 
     def _sum(self) -> KernelFactory:
         terms = [self._product()]
@@ -196,8 +191,8 @@ class KernelExpression:
         if name in "()+*":
             raise self._wrong(f"{name!r} stands where a name is expected")
         where = "the registry" if name == self.expression.strip() else repr(self.expression)
-        require_known("kernel", name, where, self.factories, synonyms=ELSEWHERE)
-        return self.factories[name]
+        require_known("kernel", name, where, KERNELS, synonyms=ELSEWHERE)
+        return KERNELS[name]
 
     def _accept(self, token: str) -> bool:
         if self._tokens[:1] == [token]:
@@ -208,7 +203,7 @@ class KernelExpression:
     def _wrong(self, what: str) -> InvalidInput:
         return InvalidInput(
             f"the kernel {self.expression!r} cannot be read: {what}; write names joined by '+' and '*', with "
-            f"parentheses where needed. Names: {', '.join(sorted(self.factories))}"
+            f"parentheses where needed. Names: {', '.join(sorted(KERNELS))}"
         )
 
 
@@ -274,11 +269,11 @@ def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kern
     ------
     InvalidInput: an unknown name, an expression that cannot be read, or a kernel that cannot have so many features.
     """
-    return KernelExpression(expression, KERNELS).kernel(dimension, variance)
+    return KernelExpression(expression).build(dimension, variance)
 
 
 def check_kernel(expression: object) -> None:
     """Raise InvalidInput if `expression` is no text, cannot be read or has an unknown name; for constructors."""
     if not isinstance(expression, str):
         raise InvalidInput(f"the kernel is {expression!r}; give an expression such as 'linear + squared-exponential'.")
-    KernelExpression(expression, KERNELS)
+    KernelExpression(expression)

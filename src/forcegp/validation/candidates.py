@@ -203,7 +203,11 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
         summary = f"{base.summary}; refined on the motions of all training rows"
         return replace(base, summary=summary, fit=partial(_fit_motions, base.fit), cost=5.0 * base.cost)
     if name.startswith(IDENTIFIED) and name.removeprefix(IDENTIFIED).partition(LAWS_AFTER)[0] in IDENTIFICATIONS:
-        return _identified_candidate(name.removeprefix(IDENTIFIED))
+        method = name.removeprefix(IDENTIFIED)
+        chosen = identification_named(method)
+        noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
+        summary = f"the system identified by {chosen.summary}; {noise}"
+        return Candidate(summary, "identified", partial(_fit_system, method), method, all_rows=chosen.all_rows)
     expression, at, mean = (part.strip() for part in name.partition(MEAN))
     mean, colon, laws = (mean if at else "given").partition(LAWS_AFTER)
     if mean not in ("given", "identified", *IDENTIFICATIONS) or (colon and mean == "given"):
@@ -230,13 +234,6 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
         cost=10.0,
         all_rows=has_few_inputs(prior, system.robot) and (method is None or identification_named(method).all_rows),
     )
-
-
-def _identified_candidate(method: str) -> Candidate:
-    chosen = identification_named(method)
-    noise = "noise learned" if chosen.noise is None else "noise from training rows held out"
-    summary = f"the system identified by {chosen.summary}; {noise}"
-    return Candidate(summary, "identified", partial(_fit_system, method), method, all_rows=chosen.all_rows)
 
 
 def candidates(

@@ -31,7 +31,8 @@ def page(document: Mapping[str, Any]) -> str:
         parts += _range(finished)
         parts += ["## By joint", *_by_joint(finished, document)]
         parts += ["## Predicted motions", _motions(finished, document)]
-    parts += ["## Models", _models(models)]
+    rows = [[name, model["kind"], model["summary"], str(model["runs"])] for name, model in models.items()]
+    parts += ["## Models", markdown_table(["model", "kind", "what it is", "finished runs"], rows)]
     parts += _failures(models, document)
     parts += _warnings(models)
     made = f"forcegp {document['configuration']['forcegp']}; {document['machine']}."
@@ -256,11 +257,6 @@ def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
         f"in steps of {first['dt']:.4g} s from recorded states under recorded forces. Errors are those of motions that "
         f"had not diverged.\n\n{table}\n\nBy joint after {last:g} s:\n\n{each}"
     )
-
-
-def _models(models: Mapping[str, Any]) -> str:
-    rows = [[name, model["kind"], model["summary"], str(model["runs"])] for name, model in models.items()]
-    return markdown_table(["model", "kind", "what it is", "finished runs"], rows)
 
 
 def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[str]:

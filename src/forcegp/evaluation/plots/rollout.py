@@ -60,7 +60,9 @@ def _draw_joint_error(axes: Axes, rollout: Rollout, errors: RolloutErrors) -> No
     if errors.spread is not None:
         expected = _median(errors.spread.max(-1))[1:]
         style.draw_line(axes, errors.time[1:], expected, style.TRUTH, 1.2, "half the 95 % interval", linestyle=":")
-    _finish(axes, f"Largest joint error, {_of(errors)}", "")
+    count, ended = len(errors.diverged_at), int((errors.diverged_at >= 0).sum())
+    motions = ("1 motion" if count == 1 else f"{count} motions") + (f", {ended} diverged" if ended else "")
+    _finish(axes, f"Largest joint error, {motions}", "")
 
 
 def _draw_tool(axes: Axes, rollout: Rollout, errors: RolloutErrors) -> None:
@@ -111,9 +113,3 @@ def _finish(axes: Axes, title: str, unit: str) -> None:
     axes.margins(x=0)
     style.quiet(axes, title=title, x="time in s", y=unit)
     axes.legend(fontsize=style.SMALL, frameon=False, loc="lower right")
-
-
-def _of(errors: RolloutErrors) -> str:
-    count, ended = len(errors.diverged_at), int((errors.diverged_at >= 0).sum())
-    motions = "1 motion" if count == 1 else f"{count} motions"
-    return f"{motions}, {ended} diverged" if ended else motions
