@@ -46,6 +46,20 @@ def fit_spec(**changes):
     return spec | {"region": False, "seed": 0, "restarts": 1, "iterations": 2, "tolerance": 1e-6} | changes
 
 
+def test_laws_that_were_identified_count_in_the_scores():
+    """Scores move a model to the contacts of the test trajectory; the friction that it identified goes with it."""
+    pytest.importorskip("pybullet")
+    from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+
+    config = KukaSurfaceConfig(seconds=3, seed=3, surface="none", joint_friction="coulomb")
+    rows = simulate_kuka_surface(config).rows(slice(0, None, 20))
+    errors = {}
+    for prior in (force_jobs.KNOWN_PHYSICS, force_jobs.LAWS):
+        model = force_jobs.fitted(fit_spec(prior=prior, iterations=60), rows)
+        errors[prior] = force_jobs.scores(model, rows)["mae"]
+    assert errors[force_jobs.LAWS] < 0.2 * errors[force_jobs.KNOWN_PHYSICS]
+
+
 def test_scores_are_what_they_say(rubbing):
     posterior, test = rubbing
     found = force_jobs.scores(posterior, test)

@@ -152,6 +152,7 @@ WRONG = {
     "Robot.from_urdf_text": {"text": None},
     "Robot.from_urdf_text ": {"inertias": np.ones((3, 3))},
     "Robot.from_urdf_text  ": {"locked": 5},
+    "Plane": {"normal": torch.tensor([0.0, 0.0, 1.0]).to_sparse()},
     "with_armature": {"armature": torch.ones(2, 3).to_sparse()},
     "MechanicalSystem": {"contacts": torch.tensor(1.0)},
     "MechanicalSystem ": {"baumgarte": 5.0},
