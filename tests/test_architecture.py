@@ -46,6 +46,7 @@ PACKAGES = {
         "inference",
         "integration",
     },
+    "control": {"errors", "summary", "robots", "mechanics", "integration", "models"},
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
 PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}

@@ -55,6 +55,9 @@ from .models import load_posterior as load_posterior
 from .models import casadi_function as casadi_function
 from .models import export_c as export_c
 
+# what is done with it
+from .control import MPPI as MPPI
+
 # the same without Gaussian processes
 from .analytical import identify_analytical as identify_analytical
 from .analytical import AnalyticalIdentification as AnalyticalIdentification

@@ -78,7 +78,7 @@ def compress(
         (D, left), (at, total) = _directions(latent, sample), _directions(latent, check)
         B, excess = D.new_zeros(0, D.shape[1]), total  # in units of the exact variance
         most, allowed = min(largest, *D.shape), (1.0 + tolerance) ** 2 - 1.0
-        while len(B) < most and float(excess.amax()) > allowed:
+        while len(B) < most and (not len(B) or float(excess.amax()) > allowed):  # one, where data add nothing
             # the leading half of the directions of which most is missing: what is small among them is better chosen
             # among all in the next round
             X = D[left.topk(min(DIRECTIONS, len(left))).indices]

@@ -1,0 +1,1 @@
+from .mppi import MPPI as MPPI

@@ -1,0 +1,138 @@
+"""Path integral control: what it finds is nearly optimal, within the limits, and it fails as documented."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+
+from forcegp import Dataset, JointFriction, MechanicalSystem, Noise, Robot, StructuredGP
+from forcegp.control import MPPI
+from forcegp.errors import InvalidInput, NumericalError
+
+MASS, DT, STEPS = 2.0, 0.05, 30
+STATE_COST, TORQUE_COST = np.diag([1.0, 0.1]), 0.01
+SLIDER = """<robot name="slider"><link name="base"/>
+<link name="cart"><inertial><mass value="2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="rail" type="prismatic"><parent link="base"/><child link="cart"/><axis xyz="1 0 0"/>
+<limit lower="-9" upper="9" velocity="9" effort="9"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    """A cart of 2 kg whose friction is nothing: what was learned is a double integrator."""
+    system = MechanicalSystem(Robot.from_urdf_text(SLIDER))
+    rng = np.random.default_rng(0)
+    q, v, u = rng.uniform(-2.0, 2.0, (3, 20, 1))
+    rows = Dataset(q=q, v=v, u=u, a=u / MASS, time=np.arange(20) * 0.1, system=system)
+    return StructuredGP(system, JointFriction(), noise=Noise(0.01, learn=False)).fit(rows, restarts=1).predictor()
+
+
+def cost(q, v, u):
+    state = torch.cat([q, v], dim=-1)
+    weights = torch.tensor(STATE_COST)
+    return ((state @ weights) * state).sum((-1, -2)) + TORQUE_COST * u.square().sum((-1, -2))
+
+
+def controller(predictor, **changes):
+    settings = {"dt": DT, "steps": STEPS, "torque_limits": 9.0, "integrator": "rk4", "seed": 1}
+    return MPPI(predictor, changes.pop("cost", cost), **settings | changes)
+
+
+def prepared(control):
+    """The controller with a first plan."""
+    for _ in range(20):
+        control.plan = control.improved(control.plan, torch.ones(1), torch.zeros(1))
+    return control
+
+
+def played(control, steps=80):
+    """Summed cost of a motion from 1 m at rest under a controller (q, v) -> u, in closed form for constant u."""
+    q, v, total, torques = np.array([1.0]), np.zeros(1), 0.0, []
+    for _ in range(steps):
+        u = np.asarray(control(q, v))
+        state = np.concatenate([q, v])
+        total += state @ STATE_COST @ state + TORQUE_COST * float(u @ u)
+        q, v = q + DT * v + 0.5 * DT**2 * u / MASS, v + DT * u / MASS
+        torques.append(u)
+    return total, np.array(torques)
+
+
+def test_the_cost_is_nearly_that_of_the_linear_quadratic_regulator(predictor):
+    A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.5 * DT**2 / MASS], [DT / MASS]])
+    P = scipy.linalg.solve_discrete_are(A, B, STATE_COST, np.array([[TORQUE_COST]]))
+    K = np.linalg.solve(TORQUE_COST + B.T @ P @ B, B.T @ P @ A)
+    best, _ = played(lambda q, v: -K @ np.concatenate([q, v]))
+    assert best == pytest.approx(P[0, 0], rel=0.01)
+    found, _ = played(prepared(controller(predictor)))
+    assert best * 0.999 < found < 1.03 * best
+    with_functions, _ = played(prepared(controller(predictor, functions=2)))
+    assert with_functions < 1.05 * best
+
+
+def test_torques_keep_their_limits_and_repeat_with_the_seed(predictor):
+    first = controller(predictor, torque_limits=[1.5])
+    _, torques = played(prepared(first), 20)
+    assert np.abs(torques).max() <= 1.5 + 1e-12
+    assert np.abs(torques[:3]).min() > 1.4  # far from the goal the limit binds
+    first.reset()
+    assert np.array_equal(played(prepared(first), 20)[1], torques)
+    assert not np.array_equal(played(prepared(controller(predictor, torque_limits=[1.5], seed=2)), 20)[1], torques)
+
+
+def test_another_round_never_forgets_the_best_sequence(predictor):
+    """The plan of many rounds from one state approaches the best that was found, and stays there."""
+    control, start = controller(predictor, steps=10), (torch.ones(1), torch.zeros(1))
+    costs = []
+    for _ in range(30):
+        control.plan = control.improved(control.plan, *start)
+        motion = predictor.rollouts(*start, control.plan, DT, integrator="rk4")
+        costs.append(float(cost(motion.q, motion.v, control.plan)))
+    assert costs[-1] <= min(costs) * 1.01
+    assert costs[-1] < costs[0]
+
+
+def test_without_a_finite_cost_it_raises_or_holds(predictor):
+    def broken_later(q, v, u):
+        return cost(q, v, u) * (float("nan") if float(q[..., 0, 0].max()) > 5.0 else 1.0)
+
+    with pytest.raises(NumericalError, match="none of 128 sequences"):
+        controller(predictor, cost=broken_later)([6.0], [0.0])
+    holding = controller(predictor, cost=broken_later, on_failure="hold")
+    safe = holding([1.0], [0.0])
+    assert torch.equal(holding([6.0], [0.0]), safe)
+    assert holding.held == 1
+    assert "held: 1" in repr(holding)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"torque_limits": 0.0}, "torque_limits are zero in every joint"),
+        ({"torque_limits": -1.0}, "give no negative number"),
+        ({"torque_limits": [1.0, 2.0]}, r"torque_limits has shape \(2,\); give one number, or 1"),
+        ({"torque_limits": np.nan}, "not finite"),
+        ({"steps": 0}, "steps"),
+        ({"samples": 1}, "samples"),
+        ({"dt": 0.0}, "time step"),
+        ({"temperature": -1.0}, "temperature"),
+        ({"correlation": 1.0}, "correlation"),
+        ({"on_failure": "stop"}, "'raise' or 'hold'"),
+        ({"cost": 3}, "give a function of motions"),
+        ({"integrator": "euler"}, "integrator"),
+    ],
+)
+def test_arguments_that_do_not_fit(predictor, changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        controller(predictor, **changes)([0.0], [0.0])
+
+
+def test_states_and_costs_of_another_shape(predictor):
+    with pytest.raises(InvalidInput, match="q is"):
+        controller(predictor)([0.0, 1.0], [0.0])
+    with pytest.raises(InvalidInput, match="v is"):
+        controller(predictor)([0.0], [np.nan])
+    with pytest.raises(InvalidInput, match="one number per motion"):
+        controller(predictor, cost=lambda q, v, u: q)([0.0], [0.0])
+    with pytest.raises(InvalidInput, match="give a Predictor"):
+        MPPI(None, cost, dt=DT, steps=2, torque_limits=1.0)
