@@ -56,6 +56,9 @@ from .models import casadi_function as casadi_function
 from .models import export_c as export_c
 
 # what is done with it
+from .control import ComputedTorque as ComputedTorque
+from .control import PDGravity as PDGravity
+from .control import HybridForce as HybridForce
 from .control import MPPI as MPPI
 
 # the same without Gaussian processes

@@ -75,7 +75,7 @@ def test_torques_keep_their_limits_and_repeat_with_the_seed(predictor):
     _, torques = played(prepared(first), 20)
     assert np.abs(torques).max() <= 1.5 + 1e-12
     assert np.abs(torques[:3]).min() > 1.4  # far from the goal the limit binds
-    first.reset()
+    first.restart()
     assert np.array_equal(played(prepared(first), 20)[1], torques)
     assert not np.array_equal(played(prepared(controller(predictor, torque_limits=[1.5], seed=2)), 20)[1], torques)
 
@@ -109,9 +109,10 @@ def test_without_a_finite_cost_it_raises_or_holds(predictor):
     ("changes", "message"),
     [
         ({"torque_limits": 0.0}, "torque_limits are zero in every joint"),
-        ({"torque_limits": -1.0}, "give no negative number"),
+        ({"torque_limits": -1.0}, "at least 0"),
         ({"torque_limits": [1.0, 2.0]}, r"torque_limits has shape \(2,\); give one number, or 1"),
-        ({"torque_limits": np.nan}, "not finite"),
+        ({"torque_limits": np.nan}, "at least 0"),
+        ({"torque_limits": np.inf}, "noise is infinite"),
         ({"steps": 0}, "steps"),
         ({"samples": 1}, "samples"),
         ({"dt": 0.0}, "time step"),

@@ -1,1 +1,3 @@
+from .hybrid_force import HybridForce as HybridForce
 from .mppi import MPPI as MPPI
+from .tracking import ComputedTorque as ComputedTorque, PDGravity as PDGravity

@@ -4,18 +4,18 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from forcegp.control.controller import Controller, OnFailure, per_joint
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.models.predictor import Predictor
-from forcegp.robots.arguments import finite_vector, real_tensor, require_finite, whole_number
-from forcegp.summary import Summary
+from forcegp.robots.arguments import finite_vector, whole_number
 
 Cost = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Costs (...) of whole motions q, v (..., T+1, nv) in rad, rad/s (m, m/s) under torques u (..., T, nv) in Nm (N)."""
@@ -26,7 +26,7 @@ SMALLEST_SCALE = 0.05
 """Of the noise: sequences far from the plan find another way, those near to it refine the one that it has."""
 
 
-class MPPI(Summary):
+class MPPI(Controller):
     """Torques that lower the expected cost of the next `steps` steps of `dt` seconds, found by random shooting.
 
     Every call draws `samples` sequences of torques around the plan, rolls all of them out by `predictor.rollouts` and
@@ -40,11 +40,12 @@ class MPPI(Summary):
       with so many functions drawn from the posterior, whose costs are averaged, so that no plan relies on a force that
       the data leave open.
     * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
-    * torque_limits: largest absolute torques in Nm (N), a number or one per joint; 0 for a joint without a motor.
+    * torque_limits: largest absolute torques in Nm (N), a number or one per joint, 0 for a joint without a motor; None
+      takes the efforts of the URDF.
     * noise: largest standard deviation of the sequences around the plan, as `torque_limits`; None for half of these. It
       falls to a twentieth of that from sequence to sequence. correlation: of two successive torques, in [0, 1).
     * temperature: in units of the cost; None takes 2 % of the distance from the least to the median cost.
-    * on_failure: "raise" or "hold", which repeats the last torque, zero at first, and counts it in `held`.
+    * on_failure: "raise", or "hold" for the last torque where none can be computed.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
     """
@@ -56,7 +57,7 @@ class MPPI(Summary):
         *,
         dt: float,
         steps: int,
-        torque_limits: Any,
+        torque_limits: Any = None,
         samples: int = 128,
         noise: Any = None,
         correlation: float = 0.95,
@@ -65,21 +66,20 @@ class MPPI(Summary):
         integrator: str = "implicit-midpoint",
         seed: int = 0,
         threads: int | None = 1,
-        on_failure: Literal["raise", "hold"] = "raise",
+        on_failure: OnFailure = "raise",
     ) -> None:
         require_type("predictor", predictor, Predictor)
         if not callable(cost):
             raise InvalidInput(f"cost is {cost!r}; give a function of motions q, v (..., T+1, nv) and u (..., T, nv).")
-        if on_failure not in ("raise", "hold"):
-            raise InvalidInput(f"on_failure is {on_failure!r}; give 'raise' or 'hold'.")
-        self.predictor, self.cost, self.on_failure, nv = predictor, cost, on_failure, predictor.nv
+        self.predictor, self.cost, nv = predictor, cost, predictor.nv
         check_time_step(dt)
         self.dt, self.steps = float(dt), whole_number("steps", steps, 1)
         self.samples, self.functions = whole_number("samples", samples, 2), whole_number("functions", functions, 0)
-        self.torque_limits = _per_joint("torque_limits", torque_limits, nv)
-        if not bool(self.torque_limits.any()):
-            raise InvalidInput("torque_limits are zero in every joint, so nothing can be controlled; give Nm or N.")
-        self.noise = 0.5 * self.torque_limits if noise is None else _per_joint("noise", noise, nv)
+        self._seed = whole_number("seed", seed, 0)
+        super().__init__(predictor.posterior.system.robot, torque_limits, on_failure)
+        self.noise = per_joint("noise", 0.5 * self.torque_limits if noise is None else noise, nv)
+        if not bool(self.noise.isfinite().all()):
+            raise InvalidInput("noise is infinite where torque_limits are; give noise in Nm or N, or finite limits.")
         self.temperature = temperature
         if temperature is not None and not 0.0 < temperature < math.inf:
             raise InvalidInput(f"temperature is {temperature!r}; give a positive number in units of the cost, or None.")
@@ -88,40 +88,33 @@ class MPPI(Summary):
         apart = torch.arange(self.steps, dtype=torch.float64)
         self._colour = torch.linalg.cholesky(correlation ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
-        self._seed = whole_number("seed", seed, 0)
         self._roll_out = partial(
             predictor.rollouts, dt=dt, integrator=integrator, functions=functions, seed=seed, threads=threads
         )
-        self.reset()
 
     @override
     def facts(self) -> Mapping[str, object]:
         """The horizon, and how it is searched."""
         horizon = f"{self.steps} steps of {self.dt:g} s"
-        return {"horizon": horizon, "sequences": self.samples, "functions": self.functions, "held": self.held}
+        return {**super().facts(), "horizon": horizon, "sequences": self.samples, "functions": self.functions}
 
-    def reset(self) -> None:
+    @override
+    def restart(self) -> None:
         """Forget the plan: no torque at all, and the random numbers of the seed again."""
-        self.plan = torch.zeros(self.steps, self.predictor.nv, dtype=torch.float64)
-        self.last = torch.zeros(self.predictor.nv, dtype=torch.float64)
-        self._best = self.plan
-        self.held = 0
+        super().restart()
+        self.plan = self._best = torch.zeros(self.steps, self.robot.nv, dtype=torch.float64)
         self._generator = torch.Generator().manual_seed(self._seed)
 
     def __call__(self, q: Any, v: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) for the next `dt` seconds from the state q, v (nv,) in rad, rad/s (m, m/s)."""
-        nv = self.predictor.nv
-        state = [torch.as_tensor(finite_vector(name, x, nv)) for name, x in (("q", q), ("v", v))]
-        try:
-            self.plan = self.improved(self.plan, *state)
-        except NumericalError:
-            if self.on_failure == "raise":
-                raise
-            self.held += 1
-            return self.last.clone()
-        self.last = self.plan[0].clone()
-        self.plan, self._best = (torch.cat([x[1:], x[-1:]]) for x in (self.plan, self._best))
-        return self.last.clone()
+        state = [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in (("q", q), ("v", v))]
+
+        def first() -> Tensor:
+            plan = self.improved(self.plan, *state)
+            self.plan, self._best = (torch.cat([x[1:], x[-1:]]) for x in (plan, self._best))
+            return plan[0]
+
+        return self.limited(first)
 
     def improved(self, plan: Tensor, q: Tensor, v: Tensor) -> Float[Tensor, "steps nv"]:
         """The plan (steps, nv) after one round of random sequences from the state q, v (nv,)."""
@@ -155,14 +148,3 @@ class MPPI(Summary):
         if temperature is None:
             temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)
         return torch.einsum("s,stj->tj", torch.softmax((best - costs) / temperature, dim=0), torques)
-
-
-def _per_joint(name: str, given: Any, nv: int) -> Float[Tensor, " nv"]:
-    """One number that is not negative per joint, of one for all or one each."""
-    values = real_tensor(name, given, torch.device("cpu"))
-    if values.shape not in ((), (nv,)):
-        raise InvalidInput(f"{name} has shape {tuple(values.shape)}; give one number, or {nv}.")
-    require_finite(name, values)
-    if bool((values < 0.0).any()):
-        raise InvalidInput(f"{name} is {given!r}; give no negative number.")
-    return values.expand(nv).clone()

@@ -1,0 +1,180 @@
+"""Tracking of a reference in joint space, with and without a model of the forces."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.control.controller import Controller, OnFailure, per_joint
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.integration.integrators import check_time_step
+from forcegp.mechanics import MechanicalSystem
+from forcegp.models.predictor import Predictor
+from forcegp.robots import Robot
+from forcegp.robots.arguments import finite_vector
+from forcegp.robots.compiled import CompiledRobot
+
+Model = MechanicalSystem | Predictor
+ROUNDS = 20  # of Newton's method; one where no force depends on u
+CLOSE = 1e-9  # relative to the acceleration
+
+
+class TrackingController(Controller):
+    """Feedback on a reference q_d, v_d, a_d (nv,), as an acceleration: a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum.
+
+    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically, 2 sqrt(Kp).
+      integral Ki in 1/s^3 needs the time `dt` between calls; a joint at its limit does not add to it.
+    * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
+    * on_failure: "raise", or "hold" for the last torque where none can be computed.
+
+    Raises InvalidInput for arguments that do not fit and a reference outside of the joints' range, NumericalError where
+    no torque is found.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        stiffness: Any,
+        damping: Any = None,
+        integral: Any = 0.0,
+        dt: float | None = None,
+        torque_limits: Any = None,
+        on_failure: OnFailure = "raise",
+    ) -> None:
+        super().__init__(robot, torque_limits, on_failure)
+        self.stiffness = per_joint("stiffness", stiffness, robot.nv)
+        self.damping = 2.0 * self.stiffness.sqrt() if damping is None else per_joint("damping", damping, robot.nv)
+        self.integral = per_joint("integral", integral, robot.nv)
+        if dt is not None or bool(self.integral.any()):
+            check_time_step(dt)
+        self.dt = dt or 0.0
+        self._range = tuple(torch.tensor([getattr(j, end) for j in robot.joints]) for end in ("lower", "upper"))
+
+    @override
+    def restart(self) -> None:
+        """Forget earlier calls and the integral of the error."""
+        super().restart()
+        self.summed = torch.zeros(self.robot.nv, dtype=torch.float64)
+
+    def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any) -> Float[Tensor, " nv"]:
+        """The torques (nv,) in Nm (N) at the state q, v under this reference, in rad, rad/s, rad/s^2 (m, ...)."""
+        q, v, q_d, v_d, a_d = self._checked(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)
+        self.summed = self.summed + self.dt * torch.where(self.saturated, 0.0, q_d - q)
+        return self.limited(lambda: self._torques(q, v, v_d, a_d, q_d - q, v_d - v))
+
+    def _checked(self, **given: Any) -> list[Tensor]:
+        """The vectors as tensors, with a reference that the joints can reach."""
+        values = {name: torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()}
+        low, high = self._range
+        beyond = torch.nonzero((values["q_d"] < low) | (values["q_d"] > high))[:, 0].tolist()
+        if beyond:
+            j = beyond[0]
+            raise InvalidInput(
+                f"the reference asks {self.robot.joint_names[j]} to be at {float(values['q_d'][j]):.4g}, and it moves "
+                f"between {float(low[j]):.4g} and {float(high[j]):.4g}; change q_d, or the limits in the URDF."
+            )
+        return list(values.values())
+
+    def feedback(self, e: Tensor, e_v: Tensor, factor: Tensor | float = 1.0) -> Tensor:
+        """The acceleration against errors of position and velocity, with gains `factor` times as stiff."""
+        root = factor**0.5
+        return factor * self.stiffness * e + root * self.damping * e_v + factor * root * self.integral * self.summed
+
+    @abstractmethod
+    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
+        """Before limits."""
+
+
+class PDGravity(TrackingController):
+    """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): no model but masses, the baseline of the others.
+
+    `robot` may be `robot.compile()`, which is fast. Gains as `TrackingController` has them.
+    """
+
+    def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
+        self._dynamics = robot
+        super().__init__(robot.robot if isinstance(robot, CompiledRobot) else robot, **settings)  # type: ignore[arg-type]  # it is a Robot
+
+    @override
+    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
+        return self._dynamics.mass_matrix(q) @ self.feedback(e, e_v) + self._dynamics.gravity_forces(q)
+
+
+class ComputedTorque(TrackingController):
+    """u = M (a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum) + h - Q_U: all forces compensated, also those learned.
+
+    * model: `posterior.predictor()`, which answers in some ten microseconds, or a `MechanicalSystem` without anything
+      learned, in milliseconds. Gains as `TrackingController` has them.
+    * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). Dry friction at the
+      measured velocity changes its sign with the noise of v and with every overshoot, one sample late; v_d does not.
+    * gain_factor: a factor (nv,) on the stiffness from the standard deviations (nv,) of the model's acceleration in
+      rad/s^2 (m/s^2): firm where the model is not sure, as in Beckers, Kulic, Hirche (2019), "Stable Gaussian process
+      based tracking control". It needs a predictor with covariance.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        forces_at: Literal["desired", "measured"] = "desired",
+        gain_factor: Callable[[Tensor], Tensor] | None = None,
+        **settings: Any,
+    ) -> None:
+        system = system_of(model)
+        if system.contacts:
+            raise InvalidInput(
+                "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
+                "posterior.with_contacts([])."
+            )
+        if forces_at not in ("desired", "measured"):
+            raise InvalidInput(f"forces_at is {forces_at!r}; give 'desired' or 'measured'.")
+        if gain_factor is not None and not (isinstance(model, Predictor) and model.kind != "none"):
+            raise InvalidInput("gain_factor needs standard deviations: give posterior.predictor() with a covariance.")
+        self.model, self.forces_at, self.gain_factor = model, forces_at, gain_factor
+        super().__init__(system.robot, **settings)
+
+    @override
+    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
+        at, factor = v_d if self.forces_at == "desired" else v, 1.0
+        if self.gain_factor is not None and isinstance(self.model, Predictor):
+            factor = self.gain_factor(self.model(q, at, self.last)[1].diagonal().sqrt())
+        return torques_for(self.model, q, at, a_d + self.feedback(e, e_v, factor), self.last)
+
+
+def system_of(model: Model) -> MechanicalSystem:
+    """The robot and known forces of a model. Raises InvalidInput for what is none."""
+    if isinstance(model, MechanicalSystem):
+        return model
+    if isinstance(model, Predictor):
+        return model.posterior.system
+    raise InvalidInput(f"model is a {type(model).__name__}; give posterior.predictor() or a MechanicalSystem.")
+
+
+def torques_for(model: Model, q: Tensor, v: Tensor, a: Tensor, start: Tensor) -> Float[Tensor, " nv"]:
+    """The u (nv,) whose acceleration at q, v (nv,) is a, by Newton's method from `start`: friction may depend on u.
+
+    Raises NumericalError where there is none.
+    """
+    u = start
+    for _ in range(ROUNDS if bool(a.isfinite().all()) else 0):
+        if isinstance(model, Predictor):
+            found = model.linearize(q, v, u)
+            missing, response = a - found.a, found.da_du
+        else:
+            offset, response = model.dynamics(q, v, u).acceleration_map()
+            missing = a - offset
+        if float(missing.abs().max()) <= CLOSE * (1.0 + float(a.abs().max())):
+            return u
+        try:
+            u = u + torch.linalg.solve(response, missing)
+        except torch.linalg.LinAlgError:
+            break
+    raise NumericalError(
+        "no torques give the wanted acceleration: it is not finite, friction takes as much as they add, or a joint is "
+        "not actuated; check the reference, the gains and the model's friction."
+    )

@@ -1,0 +1,222 @@
+"""Tracking controllers: torques against Pinocchio, errors against the size of a step, and what is refused."""
+
+import warnings
+
+import numpy as np
+import pinocchio
+import pytest
+import torch
+from tests.models.arm import arm_data, arm_system
+
+from forcegp import ComputedTorque, HybridForce, MechanicalSystem, PDGravity, Robot, StructuredGP, ViscousJointFriction
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Actuation, RigidBodyBias
+from forcegp.priors import ContactFriction, JointForces, JointFriction
+
+LINK = """<link name="{0}"><inertial><origin xyz="0 0.02 -0.2"/><mass value="{1}"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0.001" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><origin xyz="0 0 {3}"/>
+<axis xyz="{4}"/><limit lower="-3" upper="3" velocity="9" effort="60"/></joint>"""
+URDF = "".join(
+    [
+        '<robot name="arm"><link name="base"/>',
+        LINK.format("upper", 2.0),
+        LINK.format("fore", 1.5),
+        JOINT.format("shoulder", "base", "upper", 0.0, "0 1 0"),
+        JOINT.format("elbow", "upper", "fore", -0.4, "0.6 0.8 0"),
+        "</robot>",
+    ]
+)
+ROBOT = Robot.from_urdf_text(URDF)
+VISCOUS = (0.7, 0.3)
+URDF_ALONE = MechanicalSystem(ROBOT)
+TRUE = MechanicalSystem(ROBOT, known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(VISCOUS)))
+GAINS = {"stiffness": 100.0}
+STILL = [0.3, -0.4], [0.0, 0.0]
+
+
+def rnea(q, v, a):
+    model = pinocchio.buildModelFromXML(URDF)
+    return pinocchio.rnea(model, model.createData(), *(np.asarray(x, float) for x in (q, v, a)))
+
+
+@pytest.mark.parametrize("forces_at", ["desired", "measured"])
+def test_the_torque_is_that_of_inverse_dynamics_with_friction(forces_at):
+    q, v, q_d, v_d, a_d = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 2))
+    control = ComputedTorque(TRUE, stiffness=[100.0, 50.0], damping=[3.0, 4.0], forces_at=forces_at)
+    at = v_d if forces_at == "desired" else v
+    wanted = a_d + np.array([100.0, 50.0]) * (q_d - q) + np.array([3.0, 4.0]) * (v_d - v)
+    np.testing.assert_allclose(control(q, v, q_d, v_d, a_d), rnea(q, at, wanted) + VISCOUS * at, rtol=1e-9)
+
+
+def test_gravity_compensation_is_that_of_a_robot_at_rest():
+    q, v, q_d, v_d, a_d = np.random.default_rng(1).uniform(-1.0, 1.0, (5, 2))
+    expected = rnea(q, 0 * q, 100.0 * (q_d - q) + 20.0 * (v_d - v))  # M (...) + g, since h(q, 0) = g
+    for robot in (ROBOT, ROBOT.compile()):
+        np.testing.assert_allclose(PDGravity(robot, **GAINS)(q, v, q_d, v_d, a_d), expected, rtol=1e-9)
+
+
+def reference(time):
+    size, rate = np.array([0.8, 0.6]), np.array([3.0, 4.0])
+    return size * np.sin(rate * time), size * rate * np.cos(rate * time), -size * rate**2 * np.sin(rate * time)
+
+
+def largest_error(control, dt, fine=8, push=(0.0, 0.0), seconds=2.0, friction=VISCOUS):
+    """Of a motion whose torques are held for dt, integrated in steps dt / fine."""
+    (q, v, _), errors = reference(0.0), []
+    for k in range(round(seconds / dt)):
+        q_d, v_d, a_d = reference(k * dt)
+        errors.append(np.abs(q_d - q).max())
+        u = np.asarray(control(q, v, q_d, v_d, a_d)) + push
+        for _ in range(fine):
+            at = [torch.tensor(x) for x in (q + 0.5 * dt / fine * v, v, u - np.array(friction) * v)]
+            v = v + dt / fine * ROBOT.forward_dynamics(*at).numpy()
+            q = q + dt / fine * v
+    return np.array(errors)
+
+
+def test_with_the_true_model_the_error_vanishes_with_the_step():
+    coarse, fine = (largest_error(ComputedTorque(TRUE, **GAINS), dt, seconds=1.0).max() for dt in (0.02, 0.01))
+    assert fine < 0.6 * coarse
+    assert fine < 0.2 * largest_error(ComputedTorque(URDF_ALONE, **GAINS), 0.01, seconds=1.0).max()
+
+
+def test_the_integral_removes_what_a_constant_push_leaves():
+    push = (4.0, -2.0)
+    without = largest_error(ComputedTorque(TRUE, **GAINS), 0.02, push=push)
+    summed = largest_error(ComputedTorque(TRUE, **GAINS, integral=300.0, dt=0.02), 0.02, push=push)
+    assert summed[-20:].max() < 0.3 * without[-20:].max()
+
+
+def test_torques_keep_their_limits_and_the_integral_waits():
+    control = ComputedTorque(URDF_ALONE, **GAINS, integral=10.0, dt=0.01, torque_limits=[500.0, 1.0])
+    u = control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
+    assert float(u[1].abs()) == 1.0
+    assert control.saturated.tolist() == [False, True]
+    before = control.summed
+    control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
+    assert (control.summed - before).tolist() == pytest.approx([0.017, 0.0])
+    control.restart()
+    assert not control.summed.any()
+    assert float(ComputedTorque(URDF_ALONE, **GAINS).torque_limits.max()) == 60.0  # of the URDF
+
+
+@pytest.fixture(scope="module")
+def touching():
+    """What was learned of an arm of three joints on a sphere, with friction under load."""
+    prior = JointFriction() + ContactFriction(load=True, expected=0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        options = OptimizerOptions(iterations=3)
+        return StructuredGP(arm_system(), prior).fit(arm_data(30, 0), restarts=1, options=options)
+
+
+def state(posterior):
+    data = arm_data(1, 1)
+    return data.q[0], data.v[0]
+
+
+def test_learned_forces_are_compensated_and_uncertainty_stiffens(touching):
+    free = touching.with_contacts([])
+    predictor = free.predictor(covariance="exact")
+    q, v = state(free)
+    e, e_v, a_d = np.full(3, 0.01), np.full(3, -0.02), np.array([1.0, 2.0, -1.0])
+    limits = {"torque_limits": 1e6, "forces_at": "measured"}
+    u = ComputedTorque(predictor, **GAINS, **limits)(q, v, q + e, v + e_v, a_d)
+    np.testing.assert_allclose(free.predict(q, v, u).mean, a_d + 100.0 * e + 20.0 * e_v, rtol=1e-7)
+    stds = []
+
+    def fourfold(std):
+        stds.append(std)
+        return torch.full((3,), 4.0)
+
+    u = ComputedTorque(predictor, **GAINS, **limits, gain_factor=fourfold)(q, v, q + e, v + e_v, a_d)
+    np.testing.assert_allclose(free.predict(q, v, u).mean, a_d + 400.0 * e + 40.0 * e_v, rtol=1e-7)
+    expected = free.predict(q, v, np.zeros(3)).covariance.diagonal().sqrt()
+    np.testing.assert_allclose(stds[0], expected, rtol=1e-6)
+
+
+def test_forces_that_depend_on_the_torque_are_compensated():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = StructuredGP(arm_system(), JointForces()).fit(
+            arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3)
+        )
+    free = model.with_contacts([])
+    q, v = state(free)
+    wanted = np.array([1.0, -2.0, 0.5])
+    control = ComputedTorque(free.predictor(covariance="none"), **GAINS, torque_limits=1e6)
+    np.testing.assert_allclose(free.predict(q, v, control(q, v, q, v, wanted)).mean, wanted, rtol=1e-6)
+
+
+def test_motion_and_force_are_those_of_the_dense_equations(touching):
+    """[M -A^T; A 0] [a; lambda] = [Q; b] solved for the torque: forwards the wanted force comes out."""
+    q, v = state(touching)
+    control = HybridForce(touching.predictor(covariance="none"), **GAINS, torque_limits=1e6)
+    wanted = np.array([5.0, -3.0, 2.0])
+    u = control(q, v, q, v, wanted, [7.0])
+    found = touching.predict(q, v, u)
+    assert float(found.multiplier.mean) == pytest.approx(7.0, rel=1e-8)
+    at = touching.system.dynamics(*(torch.tensor(x) for x in (q, v)), torch.zeros(3).double())
+    M, A, b = (x.numpy() for x in (at.M, at.A, at.b))
+    dense = np.linalg.solve(np.block([[M, -A.T], [A, np.zeros((1, 1))]]), np.concatenate([M @ wanted, b]))
+    np.testing.assert_allclose(found.mean, dense[:3], rtol=1e-8)
+
+
+@pytest.mark.parametrize("force", [None, -1.0, [1.0, 2.0], np.nan])
+def test_normal_forces_that_mean_nothing(touching, force):
+    q, v = state(touching)
+    control = HybridForce(touching.predictor(covariance="none"), **GAINS)
+    with pytest.raises(InvalidInput, match=r"one per contact \(1\)"):
+        control(q, v, q, v, v, force)
+
+
+def test_models_with_and_without_contacts(touching):
+    with pytest.raises(InvalidInput, match="use HybridForce"):
+        ComputedTorque(touching.predictor(covariance="none"), **GAINS)
+    with pytest.raises(InvalidInput, match="this model has none"):
+        HybridForce(touching.with_contacts([]).predictor(covariance="none"), **GAINS)
+    with pytest.raises(InvalidInput, match=r"give posterior\.predictor\(\)"):
+        ComputedTorque(touching, **GAINS)
+    with pytest.raises(InvalidInput, match="with a covariance"):
+        ComputedTorque(URDF_ALONE, **GAINS, gain_factor=lambda std: std)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stiffness": -1.0}, "stiffness is -1.0; give numbers of at least 0"),
+        ({"stiffness": [1.0, 2.0, 3.0]}, r"stiffness has shape \(3,\)"),
+        ({"damping": np.nan}, "damping"),
+        ({"integral": 1.0}, "dt is None"),
+        ({"torque_limits": 0.0}, "torque_limits are zero"),
+        ({"forces_at": "both"}, "'desired' or 'measured'"),
+        ({"on_failure": "zero"}, "'raise' or 'hold'"),
+    ],
+)
+def test_settings_that_mean_nothing(changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        ComputedTorque(URDF_ALONE, **GAINS | changes)
+
+
+def test_references_and_states_that_cannot_be():
+    control = ComputedTorque(URDF_ALONE, **GAINS)
+    with pytest.raises(InvalidInput, match=r"asks elbow to be at 3\.5, and it moves between -3 and 3"):
+        control(*STILL, [0.0, 3.5], [0.0, 0.0], [0.0, 0.0])
+    with pytest.raises(InvalidInput, match="v_d is"):
+        control(*STILL, [0.0, 0.0], [0.0], [0.0, 0.0])
+    with pytest.raises(InvalidInput, match="q is"):
+        control([np.nan, 0.0], *STILL, *STILL)
+
+
+def test_it_raises_or_holds_but_never_gives_nan():
+    stiff = {"stiffness": 1e308, "damping": 0.0}
+    still = [0.0, 0.0]
+    with pytest.raises(NumericalError):
+        ComputedTorque(URDF_ALONE, **stiff)([2.9, 0.0], still, [-2.9, 0.0], still, still)
+    control = ComputedTorque(URDF_ALONE, **stiff, on_failure="hold")
+    safe = control(STILL[0], still, STILL[0], still, [1.0, 0.0])
+    assert torch.equal(control([2.9, 0.0], still, [-2.9, 0.0], still, still), safe)
+    assert control.held == 1
+    assert "held: 1" in repr(control)
