@@ -164,13 +164,14 @@ def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: A
         )
     require_finite("normal_force", wanted)
 
-    def surplus(u: Tensor) -> Tensor:
+    def surplus(u: Tensor, learned: bool = True) -> Tensor:
         at = posterior.dynamics(q, v, u)
-        Q_U = posterior.latents(at, False).through(posterior.model.prior.mixing(at)).mean
-        return at.Q_K + Q_U + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
+        Q = at.Q_K + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
+        return Q + posterior.latents(at, False).through(posterior.model.prior.mixing(at)).mean if learned else Q
 
     with torch.no_grad():
-        u, found = find_roots(surplus, torch.zeros_like(a))
+        # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
+        u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))
         if not bool(found.all()):
             raise NumericalError(
                 f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration: friction takes as much "
