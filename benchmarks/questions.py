@@ -10,6 +10,9 @@ TITLES = {
     "incremental": "Learning while the robot works",
     "prediction": "Predictions at control rates",
     "programs": "Models as programs",
+    "tracking": "Tracking with learned friction",
+    "normal_force": "A normal force without a sensor",
+    "swing_up": "A swing-up by path integral control",
     "searches": "Searches for hyper-parameters",
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
@@ -144,6 +147,32 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "c_parity_n1000": ("<= 1e-11", "the same, N = 1000"),
         "casadi_parity": ("<= 1e-12", "CasADi function of the first prior against predict"),
         "casadi_jacobian_parity": ("<= 1e-12", "its Jacobian against the predictor's"),
+    },
+    "tracking": {
+        "tracking_excitation_over_urdf": (
+            "<= 0.033",
+            "error of computed torque, 100 rows of another motion: learned / URDF",
+        ),
+        "tracking_excitation_over_laws": (
+            "<= 0.25",
+            "the same: learned / Coulomb's and viscous friction of the same rows",
+        ),
+        "tracking_task_over_urdf": ("<= 0.2", "100 rows of the task itself: learned / URDF"),
+        "tracking_task_over_laws": ("", "the same: learned / Coulomb's and viscous friction of the same rows"),
+        "tracking_payload_over_urdf": ("<= 0.1", "inertias 10 % wrong, 0.5 kg unknown: identified and learned / URDF"),
+        "tracking_payload_over_identified": ("", "the same: identified and learned / identified"),
+    },
+    "normal_force": {
+        "normal_force_force_learned": ("<= 0.2", "15 N wanted on a plane, 100 rows: RMSE of the normal force [N]"),
+        "normal_force_path_learned": ("<= 1", "the same: RMSE of the tool's place [mm]"),
+        "normal_force_force_urdf": ("", "the same force on the URDF alone [N]"),
+        "normal_force_path_urdf": ("", "the same place on the URDF alone [mm]"),
+    },
+    "swing_up": {
+        "swing_up_learned_over_true": ("<= 1.05", "cost of a swing-up by MPPI at 50 Hz: learned / true model"),
+        "swing_up_laws_over_true": ("", "the same: Coulomb's and viscous friction of the same rows / true model"),
+        "swing_up_urdf_over_true": ("", "the same: URDF / true model"),
+        "swing_up_step_ms": ("<= 8", "CPU time of one call [ms]"),
     },
     "searches": {
         "search_evaluations_n100": (
