@@ -112,8 +112,8 @@ class ComputedTorque(TrackingController):
 
     * model: `posterior.predictor()`, which answers in some ten microseconds, or a `MechanicalSystem` without anything
       learned, in milliseconds. Gains as `TrackingController` has them.
-    * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). Dry friction at the
-      measured velocity changes its sign with the noise of v and with every overshoot, one sample late; v_d does not.
+    * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
+      velocity dry friction follows the noise of v and every overshoot, one sample late (measured in docs/control.md).
     * gain_factor: a factor (nv,) on the stiffness from the standard deviations (nv,) of the model's acceleration in
       rad/s^2 (m/s^2): firm where the model is not sure, as in Beckers, Kulic, Hirche (2019), "Stable Gaussian process
       based tracking control". It needs a predictor with covariance.
