@@ -58,6 +58,7 @@ PACKAGES["cli"] = set(PACKAGES)
 # at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
     "casadi": (),
+    "gymnasium": ("forcegp.control.environments",),
     "pybullet": (),
     "matplotlib": ("forcegp.evaluation.plots", "forcegp.experiments", "forcegp.validation.figures"),
     "joblib": (),

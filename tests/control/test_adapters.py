@@ -18,9 +18,11 @@ def examples() -> list[str]:
     return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
-def test_the_first_example_runs(examples, tmp_path):
+def test_the_examples_run(examples, tmp_path):
     pytest.importorskip("pybullet")
-    limited, plan, states = run_example(examples[0], tmp_path).splitlines()
+    pytest.importorskip("gymnasium")
+    limited, plan, states, many = run_example(examples[0] + examples[1], tmp_path).splitlines()
+    assert many == "(64, 14)"
     assert limited == "torch.Size([7]) tensor(False)"
     assert (plan, states) == ("torch.Size([7])", "torch.Size([5, 14])")
 
@@ -47,7 +49,7 @@ def test_dynamics_for_planners_in_torch(predictor):
 def test_the_crocoddyl_model_has_the_derivatives_of_its_accelerations(examples, predictor):
     crocoddyl = pytest.importorskip("crocoddyl", reason="crocoddyl is not installed")
     names = {}
-    exec(examples[1], names)
+    exec(examples[2], names)
     state = crocoddyl.StateVector(2)
     costs = crocoddyl.CostModelSum(state, 1)
     costs.addCost("u", crocoddyl.CostModelResidual(state, crocoddyl.ResidualModelControl(state, 1)), 0.1)

@@ -66,3 +66,15 @@ def test_the_jacobian_of_rows_is_that_of_torch():
     value, J = rows_jacobian(function, x)
     torch.testing.assert_close(value, function(x))
     torch.testing.assert_close(J, torch.func.vmap(torch.func.jacrev(function))(x))
+
+
+def test_a_root_is_found_where_no_eigenvalues_are(monkeypatch):
+    """LAPACK can fail on ordinary matrices whose eigenvalues repeat."""
+
+    def fails(_):
+        raise torch.linalg.LinAlgError("the algorithm failed to converge")
+
+    monkeypatch.setattr(torch.linalg, "eigvals", fails)
+    x, found = find_roots(lambda x: x + 0.5 * torch.tanh(x.roll(1, -1)) - 1.0, torch.zeros(2, 3).double())
+    assert found.all()
+    torch.testing.assert_close(x + 0.5 * torch.tanh(x.roll(1, -1)), torch.ones(2, 3).double())

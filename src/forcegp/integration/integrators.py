@@ -165,7 +165,10 @@ def find_roots(
             finite = torch.isfinite(r).all(-1) & torch.isfinite(J).flatten(1).all(-1)
             identity = torch.eye(J.shape[-1], dtype=J.dtype, device=J.device)
             J = torch.where(finite[:, None, None], J, identity)
-            least = torch.linalg.eigvals(J).real.amin(-1)
+            try:
+                least = torch.linalg.eigvals(J).real.amin(-1)
+            except torch.linalg.LinAlgError:  # LAPACK may fail where eigenvalues repeat; this one is never larger
+                least = torch.linalg.eigvalsh(0.5 * (J + J.mT)).amin(-1)
             J = J + (SMALLEST_SLOPE - least).clamp_min(0.0)[:, None, None] * identity
             d = torch.where((finite & ~found)[:, None], -_solve(J, r), 0.0)
             small = torch.linalg.vector_norm(d, dim=-1) <= TOLERANCE * (1.0 + torch.linalg.vector_norm(x, dim=-1))

@@ -199,6 +199,7 @@ class Predictor(Summary):
         *,
         integrator: str = "symplectic-euler",
         functions: int = 0,
+        divided: bool = False,
         seed: int = 0,
         threads: int | None = None,
     ) -> Motions:
@@ -206,8 +207,9 @@ class Predictor(Summary):
 
         As `posterior.rollout` with the predictor's own system: rad, rad/s, Nm and s (m, m/s, N); what diverges is NaN
         from the row `diverged_at` on. Under the mean, or with `functions` once under each of so many functions drawn
-        from the posterior, which then are the first dimension. A compiled predictor steps many motions at once, without
-        Python in between, on `threads` threads (None: as many as torch has). Without a graph.
+        from the posterior, which then are the first dimension; `divided` takes motions (functions, ..., nv) instead,
+        each under the function of its own. A compiled predictor steps many motions at once, without Python in between,
+        on `threads` threads (None: as many as torch has). Without a graph.
         Raises InvalidInput for arguments that do not fit.
         """
         most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
@@ -227,8 +229,11 @@ class Predictor(Summary):
             def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
                 return by_sample(model.sampled(functions, seed), functions)(q, v, u)
 
-            start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
-            batch = (functions, *batch)
+            if not divided:
+                start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
+                batch = (functions, *batch)
+            elif tuple(batch[:1]) != (functions,):
+                raise InvalidInput(f"divided motions need a first dimension of {functions} functions; given: {batch}.")
         with torch.no_grad():
             if loops is None:
                 motion = integrate(method, acceleration, start, v, forces, dt)

@@ -1,0 +1,166 @@
+"""Gymnasium environments whose robot moves as a model predicts; importing this module registers forcegp/Robot-v0."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from typing_extensions import override
+
+from forcegp.control.controller import per_joint
+from forcegp.errors import InvalidInput
+from forcegp.integration.integrators import check_time_step
+from forcegp.models import load_posterior
+from forcegp.models.predictor import Predictor
+from forcegp.robots.arguments import whole_number
+
+
+class RobotVectorEnv(VectorEnv):
+    """`num_envs` robots at once under the learned forces, by `predictor.rollouts`; the task is the caller's.
+
+    Observations are [q, v] (num_envs, 2 nv), actions torques u (num_envs, nv) in Nm (N), held for `dt` seconds. An
+    episode that ended begins anew with the next step (`AutoresetMode.NEXT_STEP`).
+
+    * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean of the learned forces, k draws
+      k functions from the posterior with `function_seed`, and every episode takes one of them: domain randomisation in
+      those directions that the data leave open.
+    * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,) and start(generator, n) -> q, v take and return
+      arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode.
+    * torque_limits: as in `ComputedTorque`; they have to be finite.
+
+    A motion that diverges ends its episode (`terminated`, and `info["diverged"]`) at its last state; no observation is
+    NaN. Raises InvalidInput for settings that do not fit.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        model: Any,
+        draw: int = 0,
+        dt: float = 0.02,
+        steps: int | None = None,
+        torque_limits: Any = None,
+        reward: Callable[..., np.ndarray] | None = None,
+        terminated: Callable[..., np.ndarray] | None = None,
+        start: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None,
+        integrator: str = "implicit-midpoint",
+        function_seed: int = 0,
+        threads: int | None = 1,
+    ) -> None:
+        model = load_posterior(model) if isinstance(model, str | Path) else model
+        self.predictor = model if isinstance(model, Predictor) else model.predictor(covariance="none")
+        self.num_envs, self.draw = whole_number("num_envs", num_envs, 1), whole_number("draw", draw, 0)
+        self.steps = None if steps is None else whole_number("steps", steps, 1)
+        check_time_step(dt)
+        self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
+        self._how = {"integrator": integrator, "seed": function_seed, "threads": threads}
+        robot = self.predictor.posterior.system.robot
+        limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
+        limits = per_joint("torque_limits", limits, robot.nv).numpy()
+        if not limits.any() or not np.isfinite(limits).all():
+            raise InvalidInput(f"torque_limits are {limits.tolist()}; give finite ones in Nm or N, not all zero.")
+        self.single_observation_space = Box(-np.inf, np.inf, (2 * robot.nv,), np.float64)
+        self.single_action_space = Box(-limits, limits, dtype=np.float64)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+        self.q = self.v = np.zeros((num_envs, robot.nv))
+        self.function, self.age = np.zeros(num_envs, int), np.zeros(num_envs, int)
+        self._ended = np.ones(num_envs, bool)
+
+    @override
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """First observations (num_envs, 2 nv); a seed decides the functions and what `start` draws."""
+        super().reset(seed=seed)
+        self._begin(np.ones(self.num_envs, bool))
+        return self._observed(), {}
+
+    @override
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of `dt`; robots whose episode had ended begin a new one instead, with reward 0."""
+        u = np.clip(np.asarray(actions, float).reshape(self.q.shape), *self._limits())
+        anew, q, v = self._ended, self.q, self.v
+        q_next, v_next = self._moved(u)
+        lasted = anew | np.isfinite(q_next + v_next).all(axis=1)
+        self.q, self.v = q_next, v_next
+        if anew.any() or not lasted.all():
+            moves = (lasted & ~anew)[:, None]
+            self.q, self.v = np.where(moves, q_next, q), np.where(moves, v_next, v)
+        rewards = np.zeros(self.num_envs) if self.reward is None else self.reward(q, v, u, self.q, self.v)
+        over = ~lasted | (False if self.terminated is None else self.terminated(self.q, self.v))
+        self.age = self.age + 1
+        late = np.zeros(self.num_envs, bool) if self.steps is None else self.age >= self.steps
+        if anew.any():
+            rewards, over, late = np.where(anew, 0.0, rewards), over & ~anew, late & ~anew
+            self._begin(anew)
+        self._ended = over | late
+        return self._observed(), rewards, over, late, {"diverged": ~lasted}
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.single_action_space.low, self.single_action_space.high  # type: ignore[attr-defined]  # it is a Box
+
+    def _begin(self, which: np.ndarray) -> None:
+        count, nv = int(which.sum()), self.q.shape[1]
+        q, v = (np.zeros((count, nv)),) * 2 if self.start is None else self.start(self.np_random, count)
+        self.q, self.v, self.age = self.q.copy(), self.v.copy(), np.where(which, 0, self.age)
+        self.q[which], self.v[which], self._ended = q, v, np.zeros(self.num_envs, bool)
+        if self.draw:
+            self.function = self.function.copy()
+            self.function[which] = self.np_random.integers(self.draw, size=count)
+
+    def _observed(self) -> np.ndarray:
+        return np.concatenate([self.q, self.v], axis=1)
+
+    def _moved(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """q, v of all robots after a step, each under its own function."""
+        if not self.draw:
+            motion = self.predictor.rollouts(self.q, self.v, u[:, None], self.dt, **self._how)
+            return motion.q[:, 1].numpy(), motion.v[:, 1].numpy()
+        order, counts = np.argsort(self.function, kind="stable"), np.bincount(self.function, minlength=self.draw)
+        first = np.cumsum(counts) - counts  # of each function's robots in that order
+        rank = np.argsort(order) - first[self.function]
+        rows = np.zeros((self.draw, counts.max()), int)  # short groups are filled up with the first robot
+        rows[self.function, rank] = np.arange(self.num_envs)
+        how = {"functions": self.draw, "divided": True, **self._how}
+        motion = self.predictor.rollouts(self.q[rows], self.v[rows], u[rows][:, :, None], self.dt, **how)
+        q, v = (x[:, :, 1].numpy()[self.function, rank] for x in (motion.q, motion.v))
+        return q, v
+
+
+class RobotEnv(gymnasium.Env):
+    """One robot of `RobotVectorEnv`, with its settings: gymnasium.make("forcegp/Robot-v0", model=..., draw=...).
+
+    reward, terminated and start take and return arrays of one row.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        self.robots = RobotVectorEnv(1, **settings)
+        self.metadata = {"render_modes": []}
+        self.observation_space, self.action_space = (
+            self.robots.single_observation_space,
+            self.robots.single_action_space,
+        )
+
+    @override
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """The first observation (2 nv,)."""
+        super().reset(seed=seed)
+        return self.robots.reset(seed=seed)[0][0], {}
+
+    @override
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Observation (2 nv,), reward, terminated, truncated and info after `dt` seconds."""
+        seen, rewards, over, late, info = self.robots.step(np.asarray(action)[None])
+        return seen[0], float(rewards[0]), bool(over[0]), bool(late[0]), {"diverged": bool(info["diverged"][0])}
+
+
+gymnasium.register(
+    "forcegp/Robot-v0",
+    entry_point="forcegp.control.environments:RobotEnv",
+    vector_entry_point="forcegp.control.environments:RobotVectorEnv",
+)

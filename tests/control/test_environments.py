@@ -1,0 +1,101 @@
+"""Environments of gymnasium: its own checks, the motion against the predictor's, and one function per episode."""
+
+import numpy as np
+import pytest
+from tests.control.test_mppi import predictor
+
+from forcegp.errors import InvalidInput
+
+gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from forcegp.control.environments import RobotVectorEnv  # noqa: E402
+
+__all__ = ["predictor"]  # a fixture
+
+
+def near(generator, count):
+    return generator.uniform(-0.5, 0.5, (count, 1)), np.zeros((count, 1))
+
+
+def reached(q, v, u, q_next, v_next):
+    return -np.square(q_next).sum(axis=1)
+
+
+@pytest.fixture
+def settings(predictor):
+    return {"model": predictor, "torque_limits": 5.0, "dt": 0.05, "start": near, "reward": reached}
+
+
+@pytest.mark.parametrize("draw", [0, 3])
+@pytest.mark.filterwarnings("ignore")  # advice on bounds and rendering
+def test_gymnasiums_own_checks_find_nothing(settings, draw):
+    env = gymnasium.make("forcegp/Robot-v0", **settings, draw=draw, max_episode_steps=5)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.reset(seed=1)
+    ends = [env.step(env.action_space.sample())[3] for _ in range(5)]
+    assert ends == [False] * 4 + [True]
+    assert gymnasium.make_vec("forcegp/Robot-v0", num_envs=4, **settings).reset(seed=0)[0].shape == (4, 2)
+
+
+def test_the_step_is_the_predictors_and_the_reward_the_callers(settings, predictor):
+    env = RobotVectorEnv(3, **settings)
+    seen, _ = env.reset(seed=2)
+    u = np.array([[1.0], [-2.0], [99.0]])
+    after, rewards, over, late, info = env.step(u)
+    q, v = predictor.step(seen[:, :1], seen[:, 1:], u.clip(-5.0, 5.0), 0.05, "implicit-midpoint")
+    np.testing.assert_allclose(after, np.hstack([q, v]), rtol=1e-9)
+    np.testing.assert_allclose(rewards, -(q[:, 0].numpy() ** 2))
+    for flags in (over, late, info["diverged"]):
+        assert not flags.any()
+    assert np.array_equal(RobotVectorEnv(3, **settings).reset(seed=2)[0], seen)
+
+
+def test_every_episode_has_one_drawn_function(settings, predictor):
+    env = RobotVectorEnv(7, **settings, draw=3, steps=2)
+    seen, _ = env.reset(seed=4)
+    drawn = env.function
+    u = np.linspace(-3.0, 3.0, 7)[:, None]
+    after = env.step(u)[0]
+    every = predictor.rollouts(
+        seen[:, :1], seen[:, 1:], u[:, None], 0.05, integrator="implicit-midpoint", functions=3, seed=0
+    )
+    np.testing.assert_allclose(after[:, 0], every.q[drawn, np.arange(7), 1, 0], rtol=1e-12)
+    np.testing.assert_allclose(after[:, 1], every.v[drawn, np.arange(7), 1, 0], rtol=1e-12)
+    assert np.array_equal(env.function, drawn)  # until the episode ends
+    assert env.step(u)[3].all()
+    again, rewards, *_ = env.step(u)
+    assert not rewards.any()
+    assert not again[:, 1].any()  # at rest again
+    assert not np.array_equal(env.function, drawn)
+
+
+def test_a_motion_that_diverges_ends_its_episode_at_its_last_state(settings):
+    env = RobotVectorEnv(2, **settings | {"start": lambda _, n: (np.zeros((n, 1)), np.full((n, 1), 99.9))})
+    seen, _ = env.reset(seed=0)
+    with pytest.warns(UserWarning, match="diverged"):
+        after, _, over, _, info = env.step(np.array([[5.0], [-5.0]]))
+    assert over.tolist() == info["diverged"].tolist() == [True, False]
+    assert np.array_equal(after[0], seen[0])
+    assert np.isfinite(after).all()
+
+
+def test_motions_are_divided_among_as_many_functions_as_there_are(predictor):
+    with pytest.raises(InvalidInput, match="first dimension of 3 functions"):
+        predictor.rollouts(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((2, 4, 1)), 0.05, functions=3, divided=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"torque_limits": 0.0}, "not all zero"),
+        ({"torque_limits": np.inf}, "give finite ones"),
+        ({"draw": -1}, "draw"),
+        ({"num_envs": 0}, "num_envs"),
+        ({"dt": -0.1}, "time step"),
+        ({"steps": 0}, "steps"),
+    ],
+)
+def test_settings_that_mean_nothing(settings, changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        RobotVectorEnv(**settings | changes)
