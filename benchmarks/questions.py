@@ -13,6 +13,7 @@ TITLES = {
     "tracking": "Tracking with learned friction",
     "normal_force": "A normal force without a sensor",
     "swing_up": "A swing-up by path integral control",
+    "planned_swing_up": "A swing-up planned by IPOPT",
     "searches": "Searches for hyper-parameters",
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
@@ -173,6 +174,12 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "swing_up_laws_over_true": ("", "the same: Coulomb's and viscous friction of the same rows / true model"),
         "swing_up_urdf_over_true": ("", "the same: URDF / true model"),
         "swing_up_step_ms": ("<= 8", "CPU time of one call [ms]"),
+    },
+    "planned_swing_up": {
+        "planned_swing_up_learned_rad": ("<= 0.01", "angle from upright at the end, planned on what was learned [rad]"),
+        "planned_swing_up_laws_rad": ("", "the same: Coulomb's and viscous friction of the same rows [rad]"),
+        "planned_swing_up_urdf_rad": ("", "the same: URDF [rad]"),
+        "planned_swing_up_true_rad": ("", "the same: true model [rad]"),
     },
     "searches": {
         "search_evaluations_n100": (
