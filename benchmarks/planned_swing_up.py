@@ -2,8 +2,8 @@
 
 The arm, its motors and the recordings are those of `swing_up`. The plan of 2 s in steps of 20 ms obeys the implicit
 midpoint rule of `casadi_function(posterior)` and ends upright at rest, with the least torques, at most nine tenths of
-the motors'; IPOPT begins with the plan of the URDF. It is played under the linear quadratic regulator of the same model along the plan (`linearize_step`). The
-error is the largest angle from upright at the end. Five seeds, medians.
+the motors'; IPOPT begins with the plan of the URDF. It is played under the linear quadratic regulator of the same
+model along the plan (`linearize_step`). The error is the largest angle from upright at the end. Five seeds, medians.
 
     python -m benchmarks planned_swing_up
 """

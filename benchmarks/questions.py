@@ -211,7 +211,6 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "slope_exact": ("", "exact engine: CPU time grows as N to this power (last three points)"),
         "slope_iterative": ("", "conjugate gradients: the same"),
         "slope_inducing": ("", "inducing points of the prior tool-friction: the same"),
-        "slope_stochastic": ("", "mini-batches (100 steps), then one pass: the same"),
     },
     "backends": {
         "joblib_speedup_8_restarts": (

@@ -26,7 +26,7 @@ from benchmarks.large_data import RECORDINGS, in_own_process, peak_bytes, record
 from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_posterior
 from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
-from forcegp.inference import ENGINES, Inducing, Stochastic
+from forcegp.inference import ENGINES, Inducing
 from forcegp.models.structured.refinement import on_all_rows
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
@@ -35,13 +35,11 @@ CASES: dict[str, tuple[int, ...]] = {
     "exact": (100, 200, 400, 800, 1500, 2500),
     "iterative": (300, 1000, 3000, 10_000),
     "inducing": (100, 1000, 10_000, 100_000),
-    "stochastic": (1000, 10_000, 100_000),
 }
 LABELS = {
     "exact": "exact, joint prior",
     "iterative": "conjugate gradients, joint prior",
     "inducing": "inducing points, tool-friction prior",
-    "stochastic": "mini-batches (100 steps) and inducing points, joint prior",
 }
 PRIORS = {"inducing": ToolForces()}
 
@@ -62,7 +60,7 @@ def condition(engine: str, count: int) -> dict[str, Any]:
     posterior = load_posterior(hyperparameters(engine))
     data = recording(SEED, SECONDS)
     rows = data.rows(np.linspace(0, len(data) - 1, count).round().astype(int))
-    chosen = {"inducing": Inducing(refine=0), "stochastic": Stochastic(points=100, steps=100)}
+    chosen = {"inducing": Inducing(refine=0)}
     before, cpu = psutil.Process().memory_info().rss, time.process_time()
     conditioned = on_all_rows(posterior, rows, chosen.get(engine, ENGINES[engine]()), {}, True)
     conditioned.predict(rows.q[:100], rows.v[:100], rows.u[:100], covariance=False)

@@ -69,7 +69,6 @@ from .analytical import AnalyticalIdentification as AnalyticalIdentification
 from .inference import Exact as Exact
 from .inference import Iterative as Iterative
 from .inference import Inducing as Inducing
-from .inference import Stochastic as Stochastic
 from .parallel import Serial as Serial
 from .parallel import Joblib as Joblib
 from .parallel import Ray as Ray

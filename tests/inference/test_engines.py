@@ -13,7 +13,6 @@ from forcegp.inference.engines import (
     Inducing,
     Iterative,
     ProblemSize,
-    Stochastic,
     choose_engine,
     engine_from_dict,
 )
@@ -42,7 +41,6 @@ def free(monkeypatch):
         (Iterative(points=100), [(300, 1000), *[(300, 300)] * 3, (12 * 1000, 3 * 2)]),
         (Inducing(100), [*[(300, 300)] * 3, (20_000, 100), (12 * 1000, 3 * 2)]),
         # its batch: ten matrices of the points and the rows of all latents
-        (Stochastic(100, batch=50), [*[(300, 300)] * 3, (20_000, 100), (12 * 1000, 3 * 2), *[(450, 450)] * 10]),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
@@ -65,7 +63,7 @@ def test_the_engine_follows_rows_features_and_memory(free):
     assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000
     assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Iterative()
     assert choose_engine(replace(SIZE, rows=20_000), CPU).engine == Iterative()
-    assert choose_engine(replace(SIZE, rows=20_001), CPU).engine == Stochastic()
+    assert choose_engine(replace(SIZE, rows=20_001), CPU).engine == Inducing()
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU).engine == Inducing()
     assert choose_engine(replace(SIZE, rows=1501, features=4), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU, inducing=False).engine == Exact()
@@ -92,11 +90,6 @@ def test_the_engine_follows_rows_features_and_memory(free):
         (Inducing, {"points": 1}, {"points": 0}),
         (Inducing, {"tolerance": 0.0}, {"tolerance": -1e-9}),
         (Inducing, {"refine": 0}, {"refine": -1}),
-        (Stochastic, {"batch": 1}, {"batch": 0}),
-        (Stochastic, {"steps": 0}, {"steps": -1}),
-        (Stochastic, {"seed": 0}, {"seed": "1"}),
-        (Stochastic, {"rate": 1e-9}, {"rate": 0.0}),
-        (Stochastic, {"rate": 2.0}, {"rate": math.inf}),
     ],
     ids=str,
 )
@@ -110,6 +103,11 @@ def test_settings_up_to_their_bounds(kind, fine, wrong):
 
 @pytest.mark.parametrize("stored", [["exact"], {"name": "gone"}, {"name": "exact", "points": 3}, {"points": 3}])
 def test_what_is_no_stored_engine_is_refused(stored):
-    with pytest.raises(InvalidInput, match="exact, iterative, inducing, stochastic"):
+    with pytest.raises(InvalidInput, match="exact, iterative, inducing"):
         engine_from_dict(stored)
     assert engine_from_dict(None) == Exact()
+
+
+def test_an_engine_that_is_gone_loads_as_the_one_that_computed_its_posterior():
+    stored = {"name": "stochastic", "points": 60, "steps": 5, "batch": 10, "rate": 0.01, "seed": 0}
+    assert engine_from_dict(stored) == Inducing(points=60, tolerance=0.0)

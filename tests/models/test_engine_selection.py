@@ -10,7 +10,7 @@ from tests.models.arm import arm_data
 
 from forcegp import JointAccelerations, JointFriction, NoForces, StructuredGP, load_posterior, save_posterior
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalError, NumericalWarning
-from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, ProblemSize, Stochastic, choose_engine
+from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, ProblemSize, choose_engine
 from forcegp.inference import memory as memory_module
 from forcegp.models.structured.refinement import _moved_to
 
@@ -107,16 +107,6 @@ def test_refining_on_all_rows_lowers_the_objective(data):
     assert refined.negative_log_likelihood < rough.negative_log_likelihood
 
 
-def test_mini_batches_of_all_rows_lower_the_objective(data):
-    with pytest.warns(NumericalWarning, match="leave out"):
-        still = fit(data, Stochastic(points=20, steps=0), learning_points=15, points=60)
-    engine = Stochastic(points=20, steps=40, batch=30, rate=0.05)
-    with pytest.warns(NumericalWarning, match="leave out"):
-        moved = fit(data, engine, learning_points=15, points=60)
-    assert moved.negative_log_likelihood < still.negative_log_likelihood
-    assert "30 rows each" in moved.settings["refined"]
-
-
 @pytest.mark.parametrize("engine", [Iterative(tolerance=1e-8, points=20), Inducing(points=60)], ids=["cg", "inducing"])
 def test_stored_and_loaded_it_predicts_the_same(data, states, engine, tmp_path):
     posterior = fit(data, engine, learning_points=30)
@@ -162,8 +152,6 @@ def test_unknown_engines(data, given, message):
         lambda: Iterative(tolerance=2.0),
         lambda: Inducing(points=0),
         lambda: Inducing(refine=-1),
-        lambda: Stochastic(rate=0.0),
-        lambda: Stochastic(batch=0),
     ],
 )
 def test_settings_are_checked(make):
@@ -192,7 +180,7 @@ def test_functions_are_drawn_and_curves_read_from_every_engine(data, states):
         assert bool((curve.std > 0).all())
 
 
-@pytest.mark.parametrize("engine", ["auto", "exact", "iterative", "inducing", "stochastic"])
+@pytest.mark.parametrize("engine", ["auto", "exact", "iterative", "inducing"])
 def test_without_unknown_forces_every_engine_is_the_exact_one(data, states, engine, monkeypatch):
     monkeypatch.setattr("forcegp.inference.engines.MOST_EXACT_ROWS", 10)
     posterior = fit(data, engine, prior=NoForces())
@@ -206,23 +194,6 @@ def test_too_few_inducing_points_are_said(data):
         posterior = fit(data, Inducing(points=5))
     assert posterior.latent.left_out > 0.02
     assert "refined" not in posterior.settings
-
-
-@pytest.mark.parametrize(("rate", "seed"), [(1.0, 0), (5.0, 0), (5.0, 1)])
-def test_mini_batches_that_make_it_worse_change_nothing_and_say_so(data, rate, seed):
-    """At rate 5 every step multiplies length scales by 150 or divides them: some end where rounding hides the bound."""
-    still = fit(data, Stochastic(points=60, steps=0))
-    with pytest.warns(NumericalWarning, match=rf"raise the bound on all rows .* nothing was changed; .* rate \({rate}"):
-        tried = fit(data, Stochastic(points=60, steps=10, batch=10, rate=rate, seed=seed))
-    assert tried.settings["refined"].startswith("unchanged: 10 steps on 10 rows each would raise")
-    for name, value in still.parameters.items():
-        assert torch.equal(tried.parameters[name], value)
-
-
-def test_mini_batches_at_the_optimum_may_end_less_than_a_nat_above_it(data):
-    """They change nothing then, and there is nothing to warn of: warnings are errors here."""
-    tried = fit(data, Stochastic(points=60, steps=5, batch=10, rate=0.01, seed=0))
-    assert tried.settings["refined"].startswith("unchanged: 5 steps on 10 rows each would raise")
 
 
 def test_the_time_of_refining_is_added(data):
@@ -249,9 +220,9 @@ def test_a_damaged_engine_is_refused(data, stored, tmp_path):
         load_posterior(tmp_path / "model")
 
 
-def test_many_rows_of_many_features_take_mini_batches():
+def test_many_rows_of_many_features_take_inducing_points():
     chosen = choose_engine(ProblemSize(60_000, 7, 6, 7, 21), torch.device("cpu"))
-    assert chosen.engine == Stochastic()
+    assert chosen.engine == Inducing()
     assert "hours" in chosen.reason
 
 

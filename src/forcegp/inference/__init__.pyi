@@ -2,7 +2,7 @@ from .block_cross_validation import LeaveOut as LeaveOut, leave_blocks_out as le
 from .dense_kernels import LatentKernels as LatentKernels
 from .engines import (
     ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing, Iterative as
-    Iterative, ProblemSize as ProblemSize, Stochastic as Stochastic, choose_engine as choose_engine, engine_from_dict as
+    Iterative, ProblemSize as ProblemSize, choose_engine as choose_engine, engine_from_dict as
     engine_from_dict, engine_of as engine_of,
 )
 from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound

@@ -5,7 +5,6 @@
 | `Exact` | exact, from the factorised covariance | (rN)^3 | (rN)^2 |
 | `Iterative` | exact mean by conjugate gradients, covariance of a low-rank model | iterations C N^2 | N P |
 | `Inducing` | variational, through inducing points, with a bound on what that costs | N P^2 | P^2 |
-| `Stochastic` | the same, hyper-parameters from mini-batches of all rows | steps P^3 + N P^2 | P^2 |
 
 with N rows, r the rank of the mixing vectors, C latents and P points of all latents together.
 """
@@ -221,40 +220,6 @@ class Inducing(Engine):
 
 
 @dataclass(frozen=True)
-class Stochastic(Engine):
-    """Inducing points whose hyper-parameters are improved on mini-batches of all rows: for many features and many rows.
-
-    `points` of each latent, `steps` on `batch` rows each with Adam's `rate`, rows drawn by `seed`. The posterior is the
-    variational one at the parameters that were found, from one pass over all rows.
-    """
-
-    name: ClassVar[str] = "stochastic"
-    remedy: ClassVar[str] = "give Stochastic fewer points or smaller batches, or fewer rows"
-    points: int = 200
-    steps: int = 200
-    batch: int = 128
-    rate: float = 0.01
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        _require_whole(self, 1, "points", "batch")
-        _require_whole(self, 0, "steps", "seed")
-        _require_number(self, "rate", "positive", lambda x: 0.0 < x < math.inf)
-
-    @override
-    def required_bytes(self, size: ProblemSize) -> int:
-        inside = size.latents * (self.points + self.batch)
-        return Inducing(self.points).required_bytes(size) + 80 * inside**2
-
-    @override
-    def condition(
-        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
-    ) -> LatentPosterior:
-        self.require_memory(ProblemSize.of(terms), terms.W.device)
-        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=0.0)
-
-
-@dataclass(frozen=True)
 class InducingWeights(Engine):
     """Weights of inducing points that were found elsewhere, as from motions: `points` of each latent.
 
@@ -290,9 +255,7 @@ class InducingWeights(Engine):
         return torch.cat([*(z.flatten() for z in space.points), space.mean, space.precision.lower.tril().flatten()])
 
 
-ENGINES: dict[str, type[Engine]] = {
-    kind.name: kind for kind in (Exact, Iterative, Inducing, Stochastic, InducingWeights)
-}
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing, InducingWeights)}
 
 
 @dataclass(frozen=True)
@@ -320,6 +283,8 @@ def engine_from_dict(stored: object) -> Engine:
         return Exact()
     if not isinstance(stored, Mapping):
         raise InvalidInput(f"stored engine {stored!r} is not a name with settings; there are {', '.join(ENGINES)}")
+    if stored.get("name") == "stochastic":  # of version 0.2: the posterior was that of its inducing points
+        stored = {"name": "inducing", "points": stored.get("points", 200), "tolerance": 0.0}
     kind = ENGINES.get(str(stored.get("name")))
     known = {field.name for field in fields(kind)} if kind is not None else set()  # type: ignore[arg-type]  # a dataclass
     settings = {name: value for name, value in stored.items() if name != "name"}
@@ -342,8 +307,8 @@ def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = T
     if fits and size.rows * size.rank <= MOST_EXACT_ENTRIES:
         return Choice(exact, f"exact: {rows} need {gib(needed)}, {gib(free)} are free")
     if size.rows > MOST_ITERATIVE_ROWS:
-        reason = f"stochastic: {rows} of {size.features} features, on which conjugate gradients would take hours"
-        return Choice(Stochastic(), reason)
+        reason = f"inducing: {rows} of {size.features} features, on which conjugate gradients would take hours"
+        return Choice(Inducing(), reason)
     iterative = Iterative()
     iterative.require_memory(size, device)
     return Choice(iterative, f"iterative: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")

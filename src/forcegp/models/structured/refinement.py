@@ -4,7 +4,6 @@ docs/large-data.md describes the first. Solved for the second, Q_U would no long
 and inference no longer exact (`python -m benchmarks.force_pictures contact-friction` draws the curve with and without).
 """
 
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -13,7 +12,7 @@ from typing import Any
 import torch
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
+from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference import (
     Choice,
     Engine,
@@ -23,7 +22,6 @@ from forcegp.inference import (
     OptimizationResult,
     OptimizerOptions,
     ProblemSize,
-    Stochastic,
     choose_engine,
     minimize_objective,
 )
@@ -31,7 +29,6 @@ from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS, MOST_ITERATIVE_RO
 from forcegp.inference.iterative import Iteration
 from forcegp.inference.linear_functionals import require_memory_for_functionals
 from forcegp.inference.memory import require_memory
-from forcegp.inference.stochastic import stochastic_search
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -124,9 +121,6 @@ def on_all_rows(
 TOLERANCE = 1e-6
 """Fraction of the bound by which an iteration must lower it for the search to go on."""
 
-NOISE = 1.0
-"""Nats by which noisy steps may end above a start that was at the optimum, without a warning."""
-
 
 def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration | None = None) -> StructuredPosterior:
     """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
@@ -146,32 +140,6 @@ def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration 
     if isinstance(engine, Inducing) and engine.refine and latent.left_out <= engine.tolerance:
         options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
         return _checked(_moved_to(posterior, minimize_objective(objective, start, options, report)))
-    if isinstance(engine, Stochastic) and engine.steps:
-        result = stochastic_search(
-            kernels,
-            latent,
-            lambda parameters: likelihood.terms({**held, **parameters}),
-            start,
-            lambda parameters: -objective.log_prior(parameters),
-            steps=engine.steps,
-            batch=engine.batch,
-            rate=engine.rate,
-            seed=engine.seed,
-            report=report,
-        )
-        with torch.no_grad():  # steps are noisy: the bound on all rows decides
-            before = float(objective(start))
-            try:
-                after = float(objective(result.parameters))
-            except NumericalError:  # steps so wide that no bound can be computed where they ended
-                after = math.inf
-        if not after <= before:
-            outcome = f"{result.status} would raise the bound on all rows from {before:.1f} to {after:.1f} nats"
-            if not after <= before + NOISE:
-                remedy = f"give Stochastic a smaller rate ({engine.rate} now), a larger batch or more steps"
-                warnings.warn(f"{outcome}, so that nothing was changed; {remedy}", NumericalWarning, stacklevel=3)
-            return _checked(posterior.with_settings(refined=f"unchanged: {outcome}"))
-        return _checked(_moved_to(posterior, replace(result, history=(before, after), value=after)))
     return _checked(posterior)
 
 
