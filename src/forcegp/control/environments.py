@@ -61,7 +61,7 @@ class RobotVectorEnv(VectorEnv):
         self._how = {"integrator": integrator, "seed": function_seed, "threads": threads}
         robot = self.predictor.posterior.system.robot
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
-        limits = per_joint("torque_limits", limits, robot.nv).numpy()
+        self._limits = limits = per_joint("torque_limits", limits, robot.nv).numpy()
         if not limits.any() or not np.isfinite(limits).all():
             raise InvalidInput(f"torque_limits are {limits.tolist()}; give finite ones in Nm or N, not all zero.")
         self.single_observation_space = Box(-np.inf, np.inf, (2 * robot.nv,), np.float64)
@@ -83,7 +83,7 @@ class RobotVectorEnv(VectorEnv):
     @override
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of `dt`; robots whose episode had ended begin a new one instead, with reward 0."""
-        u = np.clip(np.asarray(actions, float).reshape(self.q.shape), *self._limits())
+        u = np.clip(np.asarray(actions, float).reshape(self.q.shape), -self._limits, self._limits)
         anew, q, v = self._ended, self.q, self.v
         q_next, v_next = self._moved(u)
         lasted = anew | np.isfinite(q_next + v_next).all(axis=1)
@@ -100,9 +100,6 @@ class RobotVectorEnv(VectorEnv):
             self._begin(anew)
         self._ended = over | late
         return self._observed(), rewards, over, late, {"diverged": ~lasted}
-
-    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.single_action_space.low, self.single_action_space.high  # type: ignore[attr-defined]  # it is a Box
 
     def _begin(self, which: np.ndarray) -> None:
         count, nv = int(which.sum()), self.q.shape[1]

@@ -95,7 +95,7 @@ class TrackingController(Controller):
 class PDGravity(TrackingController):
     """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): no model but masses, the baseline of the others.
 
-    `robot` may be `robot.compile()`, which is fast. Gains as `TrackingController` has them.
+    `robot` may be `robot.compile()`. Gains as `TrackingController` has them.
     """
 
     def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
@@ -110,8 +110,8 @@ class PDGravity(TrackingController):
 class ComputedTorque(TrackingController):
     """u = M (a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum) + h - Q_U: all forces compensated, also those learned.
 
-    * model: `posterior.predictor()`, which answers in some ten microseconds, or a `MechanicalSystem` without anything
-      learned, in milliseconds. Gains as `TrackingController` has them.
+    * model: `posterior.predictor()`, or a `MechanicalSystem` without anything learned, which takes longer. Gains as
+      `TrackingController` has them.
     * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
       velocity dry friction follows the noise of v and every overshoot, one sample late (measured in docs/control.md).
     * gain_factor: a factor (nv,) on the stiffness from the standard deviations (nv,) of the model's acceleration in

@@ -1,6 +1,6 @@
 """Forces of a fitted model, each by itself, and those of the actuators that make a wanted acceleration."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -144,6 +144,21 @@ class Curve:
         return self.mean - quantile * self.std, self.mean + quantile * self.std
 
 
+def surplus_of(posterior: Any, x: Float[Tensor, "n rows"], wanted: Tensor) -> Callable[..., Tensor]:
+    """u (n, nv) -> the force Q_K + Q_U + A^T lambda - M a that is left over at rows x = [q, v, a] with this lambda.
+
+    learned=False leaves Q_U out.
+    """
+    q, v, a = x.detach().chunk(3, dim=-1)
+
+    def surplus(u: Tensor, learned: bool = True) -> Tensor:
+        at = posterior.dynamics(q, v, u)
+        Q = at.Q_K + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
+        return Q + posterior.latents(at, False).through(posterior.model.prior.mixing(at)).mean if learned else Q
+
+    return surplus
+
+
 def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: Any, covariance: bool) -> Gaussian:
     """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a StructuredPosterior at rows x = [q, v, a].
 
@@ -164,11 +179,7 @@ def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: A
         )
     require_finite("normal_force", wanted)
 
-    def surplus(u: Tensor, learned: bool = True) -> Tensor:
-        at = posterior.dynamics(q, v, u)
-        Q = at.Q_K + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
-        return Q + posterior.latents(at, False).through(posterior.model.prior.mixing(at)).mean if learned else Q
-
+    surplus = surplus_of(posterior, x, wanted)
     with torch.no_grad():
         # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
         u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))
