@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from tests.control.test_mppi import predictor
 
+from forcegp import Dataset, NoForces, Noise, StructuredGP
 from forcegp.errors import InvalidInput
 
 gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
@@ -99,3 +100,16 @@ def test_motions_are_divided_among_as_many_functions_as_there_are(predictor):
 def test_settings_that_mean_nothing(settings, changes, message):
     with pytest.raises(InvalidInput, match=message):
         RobotVectorEnv(**settings | changes)
+
+
+def test_models_that_have_no_functions_or_are_none(settings, predictor):
+    rows = predictor.posterior.training
+    data = Dataset(
+        q=rows.q, v=rows.v, u=rows.u, a=rows.a, time=np.arange(len(rows.q)), system=predictor.posterior.system
+    )
+    bare = StructuredGP(data.system, NoForces(), noise=Noise(0.01, learn=False)).fit(data, restarts=1)
+    with pytest.raises(InvalidInput, match="draw=2 functions are asked for, and this model has none"):
+        RobotVectorEnv(**settings | {"model": bare, "draw": 2})
+    assert RobotVectorEnv(**settings | {"model": bare}).reset(seed=0)[0].shape == (1, 2)
+    with pytest.raises(InvalidInput, match="model is a int; give a Posterior"):
+        RobotVectorEnv(**settings | {"model": 3})

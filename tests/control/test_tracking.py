@@ -191,8 +191,8 @@ def test_models_with_and_without_contacts(touching):
         ({"damping": np.nan}, "damping"),
         ({"integral": 1.0}, "dt is None"),
         ({"torque_limits": 0.0}, "torque_limits are zero"),
-        ({"forces_at": "both"}, "'desired' or 'measured'"),
-        ({"on_failure": "zero"}, "'raise' or 'hold'"),
+        ({"forces_at": "both"}, "desired, measured"),
+        ({"on_failure": "zero"}, "hold, raise"),
     ],
 )
 def test_settings_that_mean_nothing(changes, message):

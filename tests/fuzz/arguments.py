@@ -169,6 +169,15 @@ def _engine(kind: Any, **arguments: Any) -> Any:
     )
 
 
+def _control(kind: Any, of: Callable[[], Any], *more: Any, **arguments: Any) -> Any:
+    return kind(of(), *more, **arguments)(*STATE[:2], *(() if more else (STATE[0], STATE[1], STATE[2])))
+
+
+def _cost(q: torch.Tensor, v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    return q.square().sum((-1, -2))
+
+
+TRACKING = {"stiffness": 10.0, "damping": None, "integral": 0.0, "dt": 0.01, "torque_limits": 50.0}
 FIT = {"points": 6, "restarts": 1, "seed": 0, "options": QUICK}
 SURFACES = {"normal": (0.0, 0.0, 1.0), "offset": 0.1}
 CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
@@ -321,6 +330,27 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Preparation": (
         lambda **k: forcegp.Preparation(**k).apply(INPUTS.free),
         lambda: {"cutoff": 20.0, "order": 2, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
+    ),
+    "ComputedTorque": (
+        functools.partial(_control, forcegp.ComputedTorque, lambda: arm_system(0)),
+        lambda: {**TRACKING, "forces_at": "desired", "gain_factor": None, "on_failure": "raise"},
+    ),
+    "PDGravity": (functools.partial(_control, forcegp.PDGravity, _robot), lambda: {**TRACKING, "on_failure": "hold"}),
+    "MPPI": (
+        functools.partial(_control, forcegp.MPPI, lambda: INPUTS.predictor, _cost),
+        lambda: {
+            "dt": 0.01,
+            "steps": 2,
+            "torque_limits": 5.0,
+            "samples": 3,
+            "noise": None,
+            "correlation": 0.5,
+            "temperature": None,
+            "functions": 0,
+            "integrator": "rk4",
+            "seed": 0,
+            "on_failure": "raise",
+        },
     ),
     "evaluate": (forcegp.evaluate, lambda: {"posterior": INPUTS.posterior, "dataset": INPUTS.data}),
     "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "system": None, "preparation": None}),

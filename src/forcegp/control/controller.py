@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.robots import Robot
 from forcegp.robots.arguments import real_tensor
 from forcegp.summary import Summary
@@ -24,8 +24,7 @@ class Controller(Summary):
     """
 
     def __init__(self, robot: Robot, torque_limits: Any, on_failure: OnFailure) -> None:
-        if on_failure not in ("raise", "hold"):
-            raise InvalidInput(f"on_failure is {on_failure!r}; give 'raise' or 'hold'.")
+        require_known("on_failure", on_failure, type(self).__name__, ("raise", "hold"))
         self.robot, self.on_failure = robot, on_failure
         stated = [joint.effort_limit for joint in robot.joints]
         self.torque_limits = per_joint("torque_limits", stated if torque_limits is None else torque_limits, robot.nv)
@@ -69,8 +68,8 @@ class Controller(Summary):
 def per_joint(name: str, given: Any, nv: int) -> Float[Tensor, " nv"]:
     """One number that is not negative per joint, of one for all or one each; infinite ones are allowed."""
     values = real_tensor(name, given, torch.device("cpu"))
-    if values.shape not in ((), (nv,)):
-        raise InvalidInput(f"{name} has shape {tuple(values.shape)}; give one number, or {nv}.")
+    if values.shape not in ((), (nv,)) or values.is_meta:
+        raise InvalidInput(f"{name} has shape {tuple(values.shape)} on {values.device}; give one number, or {nv}.")
     if not bool((values >= 0.0).all()):
         raise InvalidInput(f"{name} is {given!r}; give numbers of at least 0.")
     return values.expand(nv).clone()

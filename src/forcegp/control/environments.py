@@ -12,10 +12,11 @@ from gymnasium.vector.utils import batch_space
 from typing_extensions import override
 
 from forcegp.control.controller import per_joint
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.models import load_posterior
 from forcegp.models.predictor import Predictor
+from forcegp.models.protocol import Posterior
 from forcegp.robots.arguments import whole_number
 
 
@@ -53,8 +54,12 @@ class RobotVectorEnv(VectorEnv):
         threads: int | None = 1,
     ) -> None:
         model = load_posterior(model) if isinstance(model, str | Path) else model
-        self.predictor = model if isinstance(model, Predictor) else model.predictor(covariance="none")
+        if not isinstance(model, Predictor):
+            model = require_type("model", model, Posterior).predictor(covariance="none")
+        self.predictor = model
         self.num_envs, self.draw = whole_number("num_envs", num_envs, 1), whole_number("draw", draw, 0)
+        if draw and not len(model.latent.features):
+            raise InvalidInput(f"draw={draw} functions are asked for, and this model has none; give draw=0.")
         self.steps = None if steps is None else whole_number("steps", steps, 1)
         check_time_step(dt)
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start

@@ -81,9 +81,9 @@ class MPPI(Controller):
         if not bool(self.noise.isfinite().all()):
             raise InvalidInput("noise is infinite where torque_limits are; give noise in Nm or N, or finite limits.")
         self.temperature = temperature
-        if temperature is not None and not 0.0 < temperature < math.inf:
+        if temperature is not None and not (isinstance(temperature, int | float) and 0.0 < temperature < math.inf):
             raise InvalidInput(f"temperature is {temperature!r}; give a positive number in units of the cost, or None.")
-        if not 0.0 <= correlation < 1.0:
+        if not (isinstance(correlation, int | float) and 0.0 <= correlation < 1.0):
             raise InvalidInput(f"correlation is {correlation!r}; give a number of at least 0 and below 1.")
         apart = torch.arange(self.steps, dtype=torch.float64)
         self._colour = torch.linalg.cholesky(correlation ** (apart[:, None] - apart).abs())
@@ -133,10 +133,8 @@ class MPPI(Controller):
                 f"cost returned shape {tuple(costs.shape)} for motions {tuple(motions.q.shape)}; return one number per "
                 f"motion, {tuple(motions.diverged_at.shape)}."
             )
-        costs = costs.double().masked_fill(motions.diverged_at >= 0, math.inf)
-        if self.functions:
-            costs = costs.mean(0)
-        costs = torch.where(costs.isnan(), math.inf, costs)
+        costs = costs.double().masked_fill((motions.diverged_at >= 0) | costs.isnan(), math.inf)
+        costs = costs.mean(0) if self.functions else costs
         best = float(costs.min())
         if not math.isfinite(best):
             raise NumericalError(

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.control.controller import Controller, OnFailure, per_joint
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.predictor import Predictor
@@ -133,8 +133,7 @@ class ComputedTorque(TrackingController):
                 "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
                 "posterior.with_contacts([])."
             )
-        if forces_at not in ("desired", "measured"):
-            raise InvalidInput(f"forces_at is {forces_at!r}; give 'desired' or 'measured'.")
+        require_known("forces_at", forces_at, "ComputedTorque", ("desired", "measured"))
         if gain_factor is not None and not (isinstance(model, Predictor) and model.kind != "none"):
             raise InvalidInput("gain_factor needs standard deviations: give posterior.predictor() with a covariance.")
         self.model, self.forces_at, self.gain_factor = model, forces_at, gain_factor
