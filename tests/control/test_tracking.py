@@ -164,6 +164,20 @@ def test_motion_and_force_are_those_of_the_dense_equations(touching):
     np.testing.assert_allclose(found.mean, dense[:3], rtol=1e-8)
 
 
+def test_joint_forces_are_those_of_predict_and_of_torch(touching):
+    compiled, plain = (touching.predictor(covariance="none", compile=compile) for compile in (True, False))
+    q, v = (torch.tensor(x) for x in state(touching))
+    u = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+    found, expected, dynamics = compiled.joint_forces(q, v, u), plain.joint_forces(q, v, u), touching.dynamics(q, v, u)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(found.Q, dynamics.Q_K + touching.components(q, v, u).total.mean, rtol=1e-8, atol=1e-10)
+    step = 1e-5 * torch.eye(3, dtype=torch.float64)
+    ahead, back = ([plain.joint_forces(q, v, u + sign * row).Q for row in step] for sign in (1.0, -1.0))
+    difference = (torch.stack(ahead, -1) - torch.stack(back, -1)) / 2e-5
+    torch.testing.assert_close(found.dQ_du, difference, rtol=1e-5, atol=1e-7)
+
+
 @pytest.mark.parametrize("force", [None, -1.0, [1.0, 2.0], np.nan])
 def test_normal_forces_that_mean_nothing(touching, force):
     q, v = state(touching)
@@ -220,3 +234,16 @@ def test_it_raises_or_holds_but_never_gives_nan():
     assert torch.equal(control([2.9, 0.0], still, [-2.9, 0.0], still, still), safe)
     assert control.held == 1
     assert "held: 1" in repr(control)
+
+
+def test_a_broken_sensor_is_held_and_leaves_the_integral_alone():
+    control = ComputedTorque(URDF_ALONE, **GAINS, integral=10.0, dt=0.01, torque_limits=0.5, on_failure="hold")
+    q_d = [0.1, -0.1]
+    safe, summed = control(*STILL, q_d, [0.0, 0.0], [0.0, 0.0]), control.summed
+    assert control.saturated.any()
+    assert torch.equal(control([np.nan, 0.0], [0.0, 0.0], q_d, [0.0, 0.0], [0.0, 0.0]), safe)
+    assert control.held == 1
+    assert torch.equal(control.summed, summed)
+    assert not control.saturated.any()
+    with pytest.raises(InvalidInput, match="give 2 finite numbers"):
+        control([0.0], [0.0, 0.0], q_d, [0.0, 0.0], [0.0, 0.0])

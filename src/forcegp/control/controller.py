@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.robots import Robot
-from forcegp.robots.arguments import real_tensor
+from forcegp.robots.arguments import finite_vector, real_tensor
 from forcegp.summary import Summary
 
 OnFailure = Literal["raise", "hold"]
@@ -46,6 +46,19 @@ class Controller(Summary):
         """The robot, and how often it had to hold."""
         return {"robot": self.robot.name, "on failure": self.on_failure, "held": self.held}
 
+    def vectors(self, **given: Any) -> list[Tensor]:
+        """The vectors (nv,) as tensors, called within `limited`.
+
+        Raises InvalidInput for what is none, NumericalError for one that is not finite where that is to be held.
+        """
+        try:
+            return [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()]
+        except InvalidInput as error:
+            shapes = {real_tensor(name, x, torch.device("cpu")).shape for name, x in given.items()}
+            if self.on_failure == "hold" and shapes == {(self.robot.nv,)}:
+                raise NumericalError(str(error)) from None
+            raise
+
     def limited(self, compute: Callable[[], Tensor]) -> Float[Tensor, " nv"]:
         """The torques (nv,) that `compute` returns, within the limits.
 
@@ -59,6 +72,7 @@ class Controller(Summary):
             if self.on_failure == "raise":
                 raise
             self.held += 1
+            self.saturated = torch.zeros_like(self.saturated)
             return self.last.clone()
         self.last = torch.minimum(torch.maximum(asked, -self.torque_limits), self.torque_limits)
         self.saturated: Bool[Tensor, " nv"] = self.last != asked

@@ -10,7 +10,7 @@ from typing_extensions import override
 from forcegp.control.tracking import CLOSE, ROUNDS, TrackingController
 from forcegp.errors import InvalidInput, require_type
 from forcegp.models.predictor import Predictor
-from forcegp.models.structured.components import surplus_of
+from forcegp.models.structured.components import require_actuated
 from forcegp.robots.arguments import real_tensor
 
 
@@ -22,8 +22,8 @@ class HybridForce(TrackingController):
     under load, learned or known, is that of lambda_d. So the force is right where the model is: no sensor is read.
 
     * predictor: `posterior.predictor()` of a model with contacts and analytical mean. Gains as `TrackingController`
-      has them. Forces are evaluated at (q, v_d), as in `ComputedTorque`; a call takes milliseconds: Broyden's method
-      goes on from the torques and the Jacobian of the last call.
+      has them. Forces are evaluated at (q, v_d), as in `ComputedTorque`. Newton's method goes on from the torques of
+      the last call, for friction under load depends on them.
     """
 
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
@@ -34,13 +34,8 @@ class HybridForce(TrackingController):
                 "HybridForce wants a force against a contact, and this model has none; name it in "
                 "posterior.with_contacts([...]), or use ComputedTorque."
             )
+        require_actuated(predictor.posterior)
         super().__init__(self.system.robot, **settings)
-
-    @override
-    def restart(self) -> None:
-        """Forget earlier calls and the integral of the error."""
-        super().restart()
-        self._u, self._inverse = self.last, torch.eye(self.robot.nv, dtype=torch.float64)
 
     @override
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
@@ -60,20 +55,18 @@ class HybridForce(TrackingController):
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at = self.system.dynamics(q, v_d, torch.zeros_like(q))
+        at = self.predictor.joint_forces(q, v_d, self.last)
         free = a_d + self.feedback(e, e_v)
-        a = at.acceleration_map(known=False)((at.M @ free[..., None])[..., 0])  # M^-1 Q_b + H M a
-        surplus = surplus_of(self.predictor.posterior, torch.cat([q, v_d, a])[None], self.wanted[None])
-        with torch.no_grad():
-            u, inverse, r = self._u, self._inverse, surplus(self._u[None])[0]
-            for _ in range(ROUNDS):
-                if float(r.abs().max()) <= CLOSE * (1.0 + float(u.abs().max())):
-                    self._u, self._inverse = u, inverse
-                    return u
-                d = -inverse @ r
-                u, before = u + d, r
-                r = surplus(u[None])[0]
-                back = inverse @ (r - before)  # Broyden 1965, "A class of methods for solving nonlinear equations"
-                inverse = inverse + torch.outer(d - back, d @ inverse) / (d @ back)
-        self._u = self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean  # Newton's method, or its error
-        return self._u
+        towards = torch.linalg.solve(at.M, at.A.mT)  # M^-1 A^T
+        a = free + towards @ torch.linalg.lstsq(at.A @ towards, at.b - at.A @ free, driver="gelsd").solution
+        needed, u = at.M @ a - at.A.mT @ self.wanted, self.last
+        for _ in range(ROUNDS):
+            missing = needed - at.Q
+            if float(missing.abs().max()) <= CLOSE * (1.0 + float(needed.abs().max())):
+                return u
+            step, singular = torch.linalg.solve_ex(at.dQ_du, missing)
+            if int(singular) or not bool(step.isfinite().all()):
+                break
+            u = u + step
+            at = self.predictor.joint_forces(q, v_d, u)
+        return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean  # with shorter steps, or its error

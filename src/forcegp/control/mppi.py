@@ -15,7 +15,7 @@ from forcegp.control.controller import Controller, OnFailure, per_joint
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.models.predictor import Predictor
-from forcegp.robots.arguments import finite_vector, whole_number
+from forcegp.robots.arguments import whole_number
 
 Cost = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Costs (...) of whole motions q, v (..., T+1, nv) in rad, rad/s (m, m/s) under torques u (..., T, nv) in Nm (N)."""
@@ -107,10 +107,9 @@ class MPPI(Controller):
 
     def __call__(self, q: Any, v: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) for the next `dt` seconds from the state q, v (nv,) in rad, rad/s (m, m/s)."""
-        state = [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in (("q", q), ("v", v))]
 
         def first() -> Tensor:
-            plan = self.improved(self.plan, *state)
+            plan = self.improved(self.plan, *self.vectors(q=q, v=v))
             self.plan, self._best = (torch.cat([x[1:], x[-1:]]) for x in (plan, self._best))
             return plan[0]
 

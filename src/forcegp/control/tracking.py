@@ -15,7 +15,6 @@ from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.predictor import Predictor
 from forcegp.robots import Robot
-from forcegp.robots.arguments import finite_vector
 from forcegp.robots.compiled import CompiledRobot
 
 Model = MechanicalSystem | Predictor
@@ -29,7 +28,8 @@ class TrackingController(Controller):
     * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically, 2 sqrt(Kp).
       integral Ki in 1/s^3 needs the time `dt` between calls; a joint at its limit does not add to it.
     * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
-    * on_failure: "raise", or "hold" for the last torque where none can be computed.
+    * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite; the
+      integral then stays as it was.
 
     Raises InvalidInput for arguments that do not fit and a reference outside of the joints' range, NumericalError where
     no torque is found.
@@ -65,22 +65,24 @@ class TrackingController(Controller):
 
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) at the state q, v under this reference, in rad, rad/s, rad/s^2 (m, ...)."""
-        q, v, q_d, v_d, a_d = self._checked(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)
-        self.summed = self.summed + self.dt * torch.where(self.saturated, 0.0, q_d - q)
-        return self.limited(lambda: self._torques(q, v, v_d, a_d, q_d - q, v_d - v))
+        summed, held = self.summed, self.held
+        u = self.limited(lambda: self._asked(*self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)))
+        if self.held > held:
+            self.summed = summed
+        return u
 
-    def _checked(self, **given: Any) -> list[Tensor]:
-        """The vectors as tensors, with a reference that the joints can reach."""
-        values = {name: torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()}
+    def _asked(self, q: Tensor, v: Tensor, q_d: Tensor, v_d: Tensor, a_d: Tensor) -> Tensor:
+        """Before limits, under a reference that the joints can reach."""
         low, high = self._range
-        beyond = torch.nonzero((values["q_d"] < low) | (values["q_d"] > high))[:, 0].tolist()
+        beyond = torch.nonzero((q_d < low) | (q_d > high))[:, 0].tolist()
         if beyond:
             j = beyond[0]
             raise InvalidInput(
-                f"the reference asks {self.robot.joint_names[j]} to be at {float(values['q_d'][j]):.4g}, and it moves "
+                f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}, and it moves "
                 f"between {float(low[j]):.4g} and {float(high[j]):.4g}; change q_d, or the limits in the URDF."
             )
-        return list(values.values())
+        self.summed = self.summed + self.dt * torch.where(self.saturated, 0.0, q_d - q)
+        return self._torques(q, v, v_d, a_d, q_d - q, v_d - v)
 
     def feedback(self, e: Tensor, e_v: Tensor, factor: Tensor | float = 1.0) -> Tensor:
         """The acceleration against errors of position and velocity, with gains `factor` times as stiff."""

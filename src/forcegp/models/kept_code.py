@@ -101,9 +101,13 @@ def kept_covariance(key: str | None, make: Callable[[], CompressedCovariance]) -
 
 @dataclass(eq=False)
 class KeptCode:
-    """The programs of a predictor of `nv` joints: found, or made of the code that `trace` returns."""
+    """The programs of a predictor: found, or made of the code that `trace` returns.
+
+    `nv` joints and `contacts` decide how many numbers they give.
+    """
 
     nv: int
+    contacts: int
     trace: Callable[[], PredictorCode]
     key: str | None
 
@@ -119,9 +123,10 @@ class KeptCode:
 
     def function(self, kind: str) -> RowFunction:
         """As `PredictorCode.function`."""
-        sizes = {"mean": [], "linearize": [3 * self.nv**2], "covariance": [self.nv**2]}[kind]
+        nv, m = self.nv, self.contacts
+        sizes = {"linearize": [3 * nv**2], "covariance": [nv**2], "forces": [2 * nv**2 + m * nv + m]}.get(kind, [])
         library, tables = self._program(kind)
-        return RowFunction(library, [self.nv] * 3, [self.nv, *sizes], tables)
+        return RowFunction(library, [nv] * 3, [nv, *sizes], tables)
 
     def loops(self, integrator: str, latent: LatentPosterior, samples: int, seed: int) -> list[FusedLoop] | None:
         """As `PredictorCode.loops`."""

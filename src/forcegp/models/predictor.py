@@ -25,7 +25,7 @@ from forcegp.models.kept_code import KeptCode
 from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_code import TermsFunction
 from forcegp.models.rollout import StepLinearization, by_sample, checked_start, linearized_step, stepped
-from forcegp.models.structured.components import Components, inverse_dynamics
+from forcegp.models.structured.components import Components, forces_around, inverse_dynamics
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
 from forcegp.summary import Summary
 
@@ -45,6 +45,16 @@ class Linearization(NamedTuple):
     da_dq: Tensor
     da_dv: Tensor
     da_du: Tensor
+
+
+class JointForces(NamedTuple):
+    """Q_K + Q_U (nv,) at a state under its u, dQ/du and M (nv, nv), A (m, nv) and b (m,)."""
+
+    Q: Tensor
+    dQ_du: Tensor
+    M: Tensor
+    A: Tensor
+    b: Tensor
 
 
 class Motions(NamedTuple):
@@ -247,6 +257,16 @@ class Predictor(Summary):
         self._states(q, v, u)
         return self.posterior.components(q, v, u, covariance=covariance)
 
+    def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
+        """Known and learned forces at one state (nv,) and what they act on, without a graph."""
+        program, nv, m = self.compiled("forces"), self.nv, len(self.posterior.system.contacts)
+        if program and _is_one_state((q, v, u), nv):
+            Q, around = self._at_one("forces", program, q, v, u)
+        else:
+            Q, around = (x[0] for x in self.run("forces", self._states(q[None], v[None], u[None])[0]))
+        slope, M, A, b = around.split([nv**2, nv**2, m * nv, m])
+        return JointForces(Q, slope.view(nv, nv), M.view(nv, nv), A.view(m, nv), b)
+
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
 
@@ -283,6 +303,8 @@ class Predictor(Summary):
         for part in self._blocks(states):
             if kind == "linearize":
                 parts.append(self._linearize(part))
+            elif kind == "forces":
+                parts.append(forces_around(self.posterior, *part))
             else:
                 mean, W, *latents = self._mean(*part)
                 parts.append((mean, W @ self._covariance(W, *latents) @ W.mT) if kind == "covariance" else (mean,))

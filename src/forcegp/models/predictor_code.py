@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,8 @@ TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 """States (n, nv) -> [offset (n, nv), W (n, nv, C), features of every process (n, d)], where a = offset + W f."""
 
 PURPOSE = Purpose("a compiled predictor", "the environment variable XDG_CACHE_HOME", "give compile=False")
+
+WITH_SLOPES = ("linearize", "forces")
 
 COVARIANCE = """
 static APART void covariance(const double *const *t, const double *y, double *out) {
@@ -71,6 +74,8 @@ class PredictorCode:
     a: list[int]
     W: list[list[int]]
     features: list[list[int]]
+    forces: list[int]
+    around: list[int]
     compressed: CompressedCovariance | None
     widening: float
 
@@ -93,8 +98,9 @@ class PredictorCode:
         sums = latent_calls(latent, prepared, compressed)
         latents = sum(len(part.latents) for part in sums)
         graph, found = trace(traced, [*example, torch.ones(1, latents, dtype=torch.float64)])
-        a, W, *features = (nodes[0].tolist() for nodes in found)
-        return cls(example[0].shape[-1], sums, graph, a, W, features, compressed, widening)
+        (a, W, Q, *around), features = ([x[0].tolist() for x in part] for part in (found[:6], found[6:]))
+        flat = [int(node) for values in around for node in np.ravel(values)]
+        return cls(example[0].shape[-1], sums, graph, a, W, features, Q, flat, compressed, widening)
 
     @property
     def _latents(self) -> list[int]:
@@ -102,13 +108,17 @@ class PredictorCode:
         return [c for part in self.sums for c in part.latents]
 
     def program(self, kind: str) -> Program:
-        """The program "mean", "linearize" or "covariance"."""
-        graph, f = Graph(3 * self.nv), {}
+        """The program "mean", "linearize", "covariance" or "forces"."""
+        graph, f, slopes = Graph(3 * self.nv), {}, kind in WITH_SLOPES
         copied = Copier(graph, self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
         features = [copied(self.features[part.latents[0]]) for part in self.sums]
         for part, z in zip(self.sums, features, strict=True):
-            f |= dict(zip(part.latents, part.call(graph, z, kind == "linearize"), strict=True))
+            f |= dict(zip(part.latents, part.call(graph, z, slopes), strict=True))
         copied.known.update(zip(self.physics.inputs[3 * self.nv :], (f[c] for c in sorted(f)), strict=True))
+        if kind == "forces":
+            Q = copied(self.forces)
+            slope = [node for row in jacobian(graph, Q, graph.inputs[2 * self.nv :]) for node in row]
+            return Program(graph, dict.fromkeys("qvu", self.nv), {"Q": Q, "around": slope + copied(self.around)})
         a = copied(self.a)
         match kind:
             case "mean":
@@ -129,7 +139,7 @@ class PredictorCode:
         integrator, loop = kind, kind in STEPS
         if loop:
             kind = "linearize" if integrator == "implicit-midpoint" else "mean"
-        program, slopes = self.program(kind), kind == "linearize"
+        program, slopes = self.program(kind), kind in WITH_SLOPES
         names = [part.name + ("_slopes" if slopes else "") for part in self.sums]
         text = [head(lanes), *(part.c_source(lanes, slopes) for part in self.sums)]
         finish = None

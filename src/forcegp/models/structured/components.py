@@ -1,6 +1,6 @@
 """Forces of a fitted model, each by itself, and those of the actuators that make a wanted acceleration."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -144,19 +144,25 @@ class Curve:
         return self.mean - quantile * self.std, self.mean + quantile * self.std
 
 
-def surplus_of(posterior: Any, x: Float[Tensor, "n rows"], wanted: Tensor) -> Callable[..., Tensor]:
-    """u (n, nv) -> the force Q_K + Q_U + A^T lambda - M a that is left over at rows x = [q, v, a] with this lambda.
+def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:
+    """Q_K + Q_U, the mean of what acts on the joints of a StructuredPosterior beside the contacts."""
+    Q_U = posterior.latents(dynamics, False).through(posterior.model.prior.mixing(dynamics)).mean
+    return Q_U if posterior.carries_known_forces else dynamics.Q_K + Q_U
 
-    learned=False leaves Q_U out.
-    """
-    q, v, a = x.detach().chunk(3, dim=-1)
 
-    def surplus(u: Tensor, learned: bool = True) -> Tensor:
-        at = posterior.dynamics(q, v, u)
-        Q = at.Q_K + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
-        return Q + posterior.latents(at, False).through(posterior.model.prior.mixing(at)).mean if learned else Q
+def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Q_K + Q_U (n, nv) at states (n, nv), and the entries (n, k) of dQ/du, M, A and b one after the other."""
+    Q, slope = rows_jacobian(lambda u: joint_force(posterior, posterior.dynamics(q, v, u)), u)
+    at = posterior.dynamics(q, v, u)
+    return Q, torch.cat([slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b], dim=-1).detach()
 
-    return surplus
+
+def require_actuated(posterior: Any) -> None:
+    """Raises InvalidInput for a StructuredPosterior of which no u can be solved for."""
+    actuated = any(isinstance(force, Actuation) for force in posterior.system.known_forces)
+    if posterior.carries_known_forces or not actuated:
+        lacks = "analytical mean (fit with mean='analytical')" if actuated else "Actuation() among its known_forces"
+        raise InvalidInput(f"this model has no {lacks}, so no u can be solved for; call `predict` or give it one.")
 
 
 def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: Any, covariance: bool) -> Gaussian:
@@ -166,10 +172,7 @@ def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: A
     and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
     J = d(Q_K + Q_U)/du and the covariance S of the processes, that of u is to first order J^-1 B S B^T J^-T.
     """
-    actuated = any(isinstance(force, Actuation) for force in posterior.system.known_forces)
-    if posterior.carries_known_forces or not actuated:
-        lacks = "analytical mean (fit with mean='analytical')" if actuated else "Actuation() among its known_forces"
-        raise InvalidInput(f"this model has no {lacks}, so no u can be solved for; call `predict` or give it one.")
+    require_actuated(posterior)
     q, v, a = x.detach().chunk(3, dim=-1)
     shape = (len(q), len(posterior.system.contacts))
     wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
@@ -179,7 +182,12 @@ def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: A
         )
     require_finite("normal_force", wanted)
 
-    surplus = surplus_of(posterior, x, wanted)
+    def surplus(u: Tensor, learned: bool = True) -> Tensor:
+        """What is left over of Q_K + Q_U + A^T lambda - M a."""
+        at = posterior.dynamics(q, v, u)
+        Q = joint_force(posterior, at) if learned else at.Q_K
+        return Q + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
+
     with torch.no_grad():
         # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
         u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))

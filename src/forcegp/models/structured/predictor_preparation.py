@@ -52,11 +52,12 @@ class PredictorPhysics:
         return [affine.offset, affine.matrix @ self.prior.mixing(dynamics), *self._features(dynamics)]
 
     def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
-        """[a, W, features ...]: what programs are written from, with few operations to differentiate."""
+        """[a, W, Q_K + Q_U, M, A, b, features ...]: what programs are written from, easily differentiated."""
         dynamics = self.system.dynamics(q, v, u, self.inertials)
         B = self.prior.mixing(dynamics)
         Q = (B @ f[..., None])[..., 0] + (dynamics.Q_K if self.analytical else 0.0)
-        return [dynamics.acceleration_under(Q), dynamics.H @ B, *self._features(dynamics)]
+        around = dynamics.M, dynamics.A, dynamics.b
+        return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
 
     def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:
         return list(self.standardization(self.prior.features(dynamics)))
@@ -112,7 +113,7 @@ def prepared_predictor(
     if compile:
         example = [x[:1] for x in (training.q, training.v, training.u)]
         given = (physics.traced, example, latent, prepared, compressed, widening)
-        code = KeptCode(nv, partial(PredictorCode.of, *given), key)
+        code = KeptCode(nv, len(physics.system.contacts), partial(PredictorCode.of, *given), key)
     made = Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, 0.0)
     first = "mean" if compressed is None else "covariance"
     if made.compiled(first) and code is not None and not code.is_traced:
