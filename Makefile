@@ -54,11 +54,11 @@ help:  ## list the targets
 # A larger installation contains the smaller ones, so it stamps them too.
 $(VENV)/.demo: EXTRAS := sim
 $(VENV)/.demo: STAMPS := $(VENV)/.demo
-$(VENV)/.test: EXTRAS := sim,test,scale,logs
+$(VENV)/.test: EXTRAS := sim,test,logs
 $(VENV)/.test: STAMPS := $(VENV)/.demo $(VENV)/.test
-$(VENV)/.check: EXTRAS := sim,test,scale,logs,dev
+$(VENV)/.check: EXTRAS := sim,test,logs,dev
 $(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
-$(VENV)/.mutants: EXTRAS := sim,test,scale,logs,mutants
+$(VENV)/.mutants: EXTRAS := sim,test,logs,mutants
 $(VENV)/.mutants: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.mutants
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.

@@ -21,7 +21,7 @@ and never by hand. Every table can be had again by its command. Times are CPU se
 ratios compare both sides in the same process on one thread.
 
 What the engines are: [large-data.md](large-data.md); predictors: [control-rate.md](control-rate.md); compiled dynamics:
-[compiled-dynamics.md](compiled-dynamics.md); clusters: [clusters.md](clusters.md); updates: [incremental.md](incremental.md);
+[compiled-dynamics.md](compiled-dynamics.md); updates: [incremental.md](incremental.md);
 solvers that were tried and not taken: [solvers.md](solvers.md). No GPU has been measured yet: [gpu.md](gpu.md).
 """  # noqa: E501  # one line of the page each
 

@@ -218,9 +218,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "8 restarts, N = 200: wall-clock time in this process / in two warm processes (joblib)",
         ),
         "joblib_cold_seconds": ("", "what the first call takes longer, which starts the processes [s, wall-clock]"),
-        "ray_overhead_seconds": ("", "the same on a Ray cluster of this machine: time beyond joblib's [s, wall-clock]"),
-        "ray_cold_seconds": ("", "what its first call takes longer, which starts the cluster [s, wall-clock]"),
-        "backends_identical": (">= 1", "1 if all parameters are the same to the last bit on all three backends"),
+        "backends_identical": (">= 1", "1 if all parameters are the same to the last bit on both backends"),
     },
     "importing": {
         "import_csv_1gb_s": (

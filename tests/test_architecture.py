@@ -62,7 +62,6 @@ IMPORTED_WHERE_USED = {
     "pybullet": (),
     "matplotlib": ("forcegp.evaluation.plots", "forcegp.experiments", "forcegp.validation.figures"),
     "joblib": (),
-    "ray": (),
     "rosbags": (),
     "tyro": ("forcegp.cli",),
     "rich": ("forcegp.cli",),

@@ -71,7 +71,6 @@ from .inference import Iterative as Iterative
 from .inference import Inducing as Inducing
 from .parallel import Serial as Serial
 from .parallel import Joblib as Joblib
-from .parallel import Ray as Ray
 
 # how good it is
 from .evaluation import evaluate as evaluate

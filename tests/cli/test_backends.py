@@ -1,7 +1,6 @@
 """`--backend`: the same model wherever it is computed; what is wrong is one line and exit code 2."""
 
 import json
-import socket
 
 import pytest
 from tests.models.arm import arm_data
@@ -18,14 +17,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.fixture
-def dead_address():
-    """A port of this machine on which nothing listens: bound, so that nobody else takes it, and not listening."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        yield f"127.0.0.1:{taken.getsockname()[1]}"
-
-
 def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
     for backend, more in (("serial", ()), ("joblib", ("--jobs", 2))):
         done = forcegp(*FIT, "--backend", backend, *more, "--out", backend, "--json", folder=folder)
@@ -36,26 +27,11 @@ def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
     assert one.settings["restart_objective"] == pytest.approx(two.settings["restart_objective"], rel=1e-9)
 
 
-@pytest.mark.parametrize("command", [(*FIT, "--out", "run"), ("reproduce", "fig2c", "--out", "run")])
-def test_a_dead_cluster_is_one_line(forcegp, folder, dead_address, command):
-    pytest.importorskip("ray")
-    pytest.importorskip("pybullet")
-    refused = forcegp(*command, "--backend", "ray", "--address", dead_address, folder=folder)
-    assert refused.returncode == 2
-    assert len(refused.stderr.strip().splitlines()) == 1
-    assert refused.stderr.startswith(f"forcegp: no Ray cluster answers at {dead_address}")
-    assert "ray start --head" in refused.stderr
-    assert not (folder / "run" / "config.json").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--backend", "dask"), "no backend 'dask'; choose serial, joblib, ray"),
+        (("--backend", "dask"), "no backend 'dask'; choose serial, joblib"),
         (("--jobs", 0), "jobs is 0; give"),
-        (("--address", "10.0.0.1:6379"), "add --backend ray"),
-        (("--backend", "joblib", "--address", "10.0.0.1:6379"), "backend joblib uses none; choose ray"),
-        (("--backend", "ray", "--address", "head"), "give HOST:PORT"),
         (("--backend", "serial", "--jobs", 2), "choose joblib"),
         (("--model", "neural-network", "--backend", "joblib"), "--backend means nothing to --model neural-network"),
     ],

@@ -14,8 +14,7 @@ from forcegp.errors import ForceGPError
 from forcegp.models import StructuredGP
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|`?ray [a-z]+|xcode-select|start one with)[^;)`]* --[a-z]")
-ALLOWED = {"parallel/cluster.py": "--port and --address of ray"}
+OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|xcode-select|start one with)[^;)`]* --[a-z]")
 
 
 @pytest.mark.parametrize(
@@ -77,7 +76,7 @@ def test_below_the_command_line_no_message_names_a_bare_option():
     found = {
         (name, text)
         for path in sorted(package.rglob("*.py"))
-        if (name := path.relative_to(package).as_posix()).partition("/")[0] != "cli" and name not in ALLOWED
+        if (name := path.relative_to(package).as_posix()).partition("/")[0] != "cli"
         for text in flags_without_a_command(path)
     }
     assert found == set()

@@ -145,7 +145,6 @@ WRONG = [
     (f"validate log.h5 {OUT} --identification magic", "no identification is called 'magic'"),
     (f"validate log.h5 {OUT} --cutoff 80", "cutoff is 80.0 Hz"),
     (f"validate log.h5 {OUT} --identification acceleration --measured-torque", "needs a noise of the forces"),
-    (f"validate log.h5 {OUT} --backend ray", "does not share files"),
     ("validate log.h5 --out log.h5", "log.h5 would be written over log.h5"),
 ]
 

@@ -11,7 +11,7 @@ import pytest
 
 from forcegp.errors import BackendError, FitError, OutdatedWarning, WorkerWarning
 from forcegp.jobs import Job, JobStore, digests, run_jobs
-from forcegp.parallel import Joblib, Serial, Shared
+from forcegp.parallel import Joblib, Serial
 
 TOY = "tests.jobs.toy_tasks"
 
@@ -116,19 +116,13 @@ def test_other_code_is_seen_and_computed_anew_with_one_sentence(results, monkeyp
 
 
 def test_arguments_reach_the_task_wherever_it_runs(results):
-    shared = Shared({"factor": 3})
-    for number, backend in enumerate((Serial(), Joblib(2), Unshared())):
+    shared = {"factor": 3}
+    for number, backend in enumerate((Serial(), Joblib(2))):
         job = Job(f"times/{number}", f"{TOY}:times", {"number": 5}, arguments=(shared, 2))
         after = Job(f"after/{number}", f"{TOY}:square", {"before": job.name}, (job.name,))
         assert run_jobs(results, [after, job], backend) == 2
         assert results.result(job.name)["value"] == 5 * 3 * 2
         assert results.result(after.name)["value"] == 31
-
-
-class Unshared(Serial):
-    """The same process, as if its tasks did not see the files."""
-
-    shares_files = False
 
 
 def test_warnings_are_kept_with_the_job(results):

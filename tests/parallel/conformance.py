@@ -6,7 +6,7 @@ import pytest
 from tests.parallel import tasks
 
 from forcegp.errors import BackendError, WorkerWarning
-from forcegp.parallel import MOST_DEATHS, Serial, Shared
+from forcegp.parallel import MOST_DEATHS, Serial
 
 
 class BackendConformance:
@@ -54,7 +54,7 @@ class BackendConformance:
 
     def test_tasks_of_a_pool_are_submitted_while_others_are_at_work(self, backend):
         """Each task needs the outcome of the one before."""
-        numbers = Shared([1, 2, 3])
+        numbers = [1, 2, 3]
         with backend.pool() as pool:
             pool.submit("a", lambda shared, extra: sum(shared) + extra, numbers, 10)
             [(key, future)] = pool.finished()
@@ -68,9 +68,6 @@ class BackendConformance:
 class WorkersConformance(BackendConformance):
     """More that backends promise which compute elsewhere than in this process."""
 
-    notice = WorkerWarning
-    """The warning after a death; None for backends that tell it otherwise."""
-
     def test_workers_are_kept_between_calls_and_compute_on_one_thread(self, backend):
         first = set(backend.map(tasks.process, range(6)))
         again = set(backend.map(tasks.process, range(6)))
@@ -83,11 +80,8 @@ class WorkersConformance(BackendConformance):
         arguments = [tmp_path / "marker", *(tmp_path / f"done{index}" for index in range(3))]
         for path in arguments[1:]:
             path.touch()  # these survive at once
-        if self.notice is None:
+        with pytest.warns(WorkerWarning, match="a process died while task"):
             found = list(backend.map(tasks.die_once, arguments))
-        else:
-            with pytest.warns(self.notice, match="a process died while task"):
-                found = list(backend.map(tasks.die_once, arguments))
         assert found == ["survived"] * 4
 
     @pytest.mark.nightly

@@ -67,29 +67,3 @@ def threads(_):
     from threadpoolctl import threadpool_info
 
     return [torch.get_num_threads(), *(library["num_threads"] for library in threadpool_info())]
-
-
-def node(_):
-    import ray
-
-    time.sleep(0.3)
-    return ray.get_runtime_context().get_node_id()
-
-
-def wait_for_the_gate(folder):
-    """Leave a file with the name of the node, and wait for the file "gate"."""
-    import ray
-
-    here = ray.get_runtime_context().get_node_id()
-    (Path(folder) / here).touch()
-    for _ in range(12_000):
-        if (Path(folder) / "gate").exists():
-            return here
-        time.sleep(0.05)
-    return "the gate stayed shut"
-
-
-def begin_and_wait(begun):
-    """Tell the process, then wait long."""
-    Path(begun).write_text(str(os.getpid()))
-    time.sleep(3600.0)

@@ -2,14 +2,13 @@
 
 import inspect
 import os
-import sys
 
 import pytest
 from tests.parallel import tasks
 from tests.parallel.conformance import BackendConformance, WorkersConformance
 
-from forcegp.errors import BackendError, InvalidInput, MissingExtra
-from forcegp.parallel import Joblib, Ray, Serial, backend_for, backend_of, cluster
+from forcegp.errors import InvalidInput
+from forcegp.parallel import Joblib, Serial, backend_for, backend_of
 
 
 class TestSerial(BackendConformance):
@@ -39,8 +38,6 @@ def test_backends_by_name():
     assert backend_of("serial") == Serial() == backend_of("serial", 1)
     assert backend_of("joblib", 3) == Joblib(3)
     assert backend_of("joblib") == Joblib(os.cpu_count())
-    assert backend_of("ray") == Ray()
-    assert backend_of("ray", 4, "10.0.0.1:6379") == Ray("10.0.0.1:6379", 4)
 
 
 def test_what_functions_mean_by_jobs_and_backend():
@@ -54,46 +51,21 @@ def test_what_functions_mean_by_jobs_and_backend():
     )
     with pytest.raises(InvalidInput, match=r"jobs=3 contradicts backend=Joblib\(jobs=2\)"):
         backend_for(Joblib(2), 3)
-    with pytest.raises(InvalidInput, match=r"int; .*Serial\(\), Joblib\(jobs\), Ray\(address\)"):
+    with pytest.raises(InvalidInput, match=r"int; .*Serial\(\), Joblib\(jobs\)"):
         inspect.unwrap(backend_for)(2)  # without the run-time checks of tests, which users do not have
 
 
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda: backend_of("dask"), "no backend 'dask'; choose serial, joblib, ray"),
+        (lambda: backend_of("dask"), "no backend 'dask'; choose serial, joblib"),
         (lambda: backend_of("joblib", 0), "jobs is 0; give the number of tasks at once, at least 1"),
         (lambda: backend_for(None, -2), "jobs is -2; give"),
         (lambda: Joblib(1.5), "jobs is 1.5; give"),  # type: ignore[arg-type]  # the mistake that is told
-        (lambda: Ray(jobs=0), "jobs is 0; give"),
         (lambda: backend_of("serial", 2), "serial does one task at a time, not 2; choose joblib"),
-        (lambda: backend_of("joblib", 2, "10.0.0.1:6379"), "backend joblib uses none; choose ray"),
-        (lambda: Ray("ray://head:10001"), "'ray://head:10001'; give HOST:PORT of its head"),
-        (lambda: Ray("head"), "'head'; give HOST:PORT of its head"),
-        (lambda: Ray("head:0"), "'head:0'; give HOST:PORT of its head"),
     ],
 )
 def test_wrong_arguments_are_told(make, told):
     with pytest.raises(InvalidInput) as caught:
         make()
     assert told in str(caught.value)
-
-
-def test_ray_that_is_not_installed_is_told_with_its_command(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)  # what Python keeps for a package that cannot be imported
-    with pytest.raises(MissingExtra, match=r"pip install 'forcegp\[scale\]'"):
-        next(Ray().map(tasks.process, [0]))
-
-
-def test_a_port_on_which_nothing_listens_is_told(dead_address):
-    pytest.importorskip("ray")
-    with pytest.raises(BackendError, match=rf"no Ray cluster answers at {dead_address} .*ray start --head") as caught:
-        next(Ray(dead_address).map(tasks.process, [0]))
-    assert "\n" not in str(caught.value)
-
-
-def test_something_else_that_answers_is_told(silent_address, monkeypatch):
-    pytest.importorskip("ray")
-    monkeypatch.setattr(cluster, "JOIN_SECONDS", 3.0)
-    with pytest.raises(BackendError, match=rf"what answers at {silent_address} is no Ray cluster"):
-        next(Ray(silent_address).map(tasks.process, [0]))

@@ -177,7 +177,6 @@ WRONG = [
     ({"models": ("joint@measured",)}, "takes its mean from 'measured'"),
     ({"models": ("joint:colour=red",)}, "cannot take 'colour=red'"),
     ({"seeds": 0}, "number of seeds is 0"),
-    ({"backend": "ray"}, "does not share files"),
 ]
 
 

@@ -40,7 +40,6 @@ class Fit(ModelOptions):
       forcegp fit train.h5 --points 100 --out run
       forcegp fit train.h5 --prior tool-friction --prior joint-friction --points 100 --out run
       forcegp fit train.h5 --model independent-gp --points 100 --out baseline
-      forcegp fit train.h5 --points 100 --restarts 8 --backend ray --address 10.0.0.1:6379 --out run
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
       forcegp fit raw.h5 --learn-from weak-form --window 0.1 --points 100 --out run
       forcegp fit log.h5 --identified identified --prior joint-friction --points 400 --motions 1 --out run

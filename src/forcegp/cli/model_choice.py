@@ -106,7 +106,6 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "learn_from": ("structured", "unconstrained", "analytical"),
     "motions": ("structured", "analytical"),
     "backend": SEARCHED,
-    "address": SEARCHED,
     "adam_steps": (*SEARCHED, "analytical"),
     "hyperprior": (*SEARCHED, "analytical"),
 }

@@ -26,7 +26,6 @@ class Reproduce(BackendOptions):
       forcegp reproduce all --preset smoke
       forcegp reproduce fig2b --preset paper --jobs 2
       forcegp reproduce fig2b --points 50 100 --seeds 7 8 --out my-curves
-      forcegp reproduce all --preset paper --backend ray --address 10.0.0.1:6379
     """
 
     interrupted: ClassVar[str] = "finished jobs are kept, and the same command goes on from there"

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from forcegp import __version__
 from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, require_writable, write_json
 from forcegp.errors import BackendError, FileFormatError, FitError, ForceGPError, InvalidInput, OutdatedWarning
 from forcegp.jobs.job import Job, digests, machine
-from forcegp.parallel import Backend, Joblib, Pool, Shared
+from forcegp.parallel import Backend, Joblib
 
 FORMAT_VERSION = 2
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
@@ -144,19 +143,6 @@ class JobStore:
             folder.mkdir()
             yield folder
 
-    def files(self, name: str) -> dict[str, bytes]:
-        """The files of a finished job by their place in its folder, to be sent to where the store cannot be seen."""
-        folder = self.place(name)
-        files = sorted(file for file in folder.rglob("*") if file.is_file())
-        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
-
-    def put(self, name: str, files: Mapping[str, bytes]) -> None:
-        """Store a job from its files."""
-        with self.writing(name) as folder:
-            for place, content in files.items():
-                (folder / place).parent.mkdir(parents=True, exist_ok=True)
-                (folder / place).write_bytes(content)
-
     def remove_leftovers(self) -> None:
         """Delete what killed runs left half written; call it under the lock."""
         remove_leftovers(self.folder)
@@ -169,8 +155,6 @@ def _is_own_start(entry: Path) -> bool:
 
 Progress = Callable[[int, int, str], None]
 """Called as `progress(work done, work in total, note)`; work is an estimate in CPU seconds."""
-
-Files = Mapping[str, bytes]
 
 
 def run_jobs(
@@ -227,7 +211,6 @@ class _Run:
         self.done: list[str] = []
         self.done_cost = 0.0
         self.failed: dict[str, str] = {}
-        self.sent: dict[str, Shared] = {}
         self.stopped = False
 
     def on(self, backend: Backend) -> None:
@@ -236,7 +219,9 @@ class _Run:
             with backend.pool() as pool:
                 while self.waiting or len(pool):
                     for job in self._ready(pool.free):
-                        self._submit(pool, job, shares_files=backend.shares_files)
+                        bare = replace(job, arguments=())  # arguments go by themselves
+                        known = {"digest": self.digests[job.name], "code": job.code_digest}
+                        pool.submit(job.name, compute, self.store, bare, known, *job.arguments)
                     if not len(pool):
                         break  # what still waits depends on jobs that failed
                     for name, future in pool.finished():
@@ -250,25 +235,6 @@ class _Run:
             others = f" and {len(self.failed) - 1} more failed" if len(self.failed) > 1 else " failed"
             skipped = f", {len(self.waiting)} that need them were left out" if self.waiting else ""
             raise FitError(f"{name}{others}{skipped} ({cause}); {self._kept()}")
-
-    def _submit(self, pool: Pool, job: Job, *, shares_files: bool) -> None:
-        digests = {"digest": self.digests[job.name], "code": job.code_digest}
-        bare = replace(job, arguments=())  # arguments go by themselves, for a pool sends those that are shared once
-        if shares_files:
-            pool.submit(job.name, compute, self.store, bare, digests, *job.arguments)
-            return
-        inputs = self._all_inputs(job)
-        for name in inputs:
-            self.sent.setdefault(name, Shared(self.store.files(name)))
-        files = [self.sent[name] for name in inputs]
-        pool.submit(job.name, computed_elsewhere, bare, digests, inputs, *files, *job.arguments)
-
-    def _all_inputs(self, job: Job) -> list[str]:
-        """The inputs and what these were made from in turn, each once."""
-        found: dict[str, None] = {}
-        for name in job.inputs:
-            found |= dict.fromkeys([*self._all_inputs(self.jobs[name]), name])
-        return list(found)
 
     def _kept(self) -> str:
         return f"{len(self.done)} of {self.count} jobs are kept, so the same command goes on from here"
@@ -289,11 +255,9 @@ class _Run:
             (self._work_behind(other.name) for other in self.waiting.values() if name in other.inputs), default=0.0
         )
 
-    def _record(self, job: Job, future: Future[Files | None]) -> None:
+    def _record(self, job: Job, future: Future[None]) -> None:
         try:
-            files = future.result()
-            if files is not None:
-                self.store.put(job.name, files)
+            future.result()
             self.done.append(job.name)
             self.finished.add(job.name)
         except ForceGPError as error:
@@ -327,13 +291,3 @@ def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: A
             "warnings": sorted({str(warning.message) for warning in caught}),
         }
         write_json(folder / RESULT_FILE, stored)
-
-
-def computed_elsewhere(job: Job, digests: Mapping[str, str], inputs: Sequence[str], *more: Any) -> Files:
-    """Compute one job where the store cannot be seen, from the files of its inputs, which `more` begins with."""
-    with tempfile.TemporaryDirectory(prefix="forcegp-") as folder:
-        store = JobStore(Path(folder))
-        for name, files in zip(inputs, more, strict=False):
-            store.put(name, files)
-        compute(store, job, digests, *more[len(inputs) :])
-        return store.files(job.name)

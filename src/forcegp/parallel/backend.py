@@ -25,13 +25,6 @@ MOST_DEATHS = 3
 """So often a task whose worker died begins anew; the death after these is an error."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shared:
-    """An argument that many tasks of a pool have in common; a cluster receives it once. The task gets the `value`."""
-
-    value: Any
-
-
 class Pool(ABC):
     """Up to `jobs` tasks at work. Use it as a context manager: leaving it by an error stops what is at work."""
 
@@ -83,8 +76,6 @@ class Backend(ABC):
     # These constructors are the check, with messages for people; run-time checks of annotations come too early.
     __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str]
-    shares_files: ClassVar[bool] = True
-    """Whether a task finds the files of this machine."""
 
     @abstractmethod
     def pool(self) -> Pool:
@@ -137,7 +128,7 @@ class _ThisProcess(Pool):
         key, (function, arguments) = self._at_work.popitem()
         future: Future[Any] = Future()
         try:
-            future.set_result(function(*unshared(arguments)))
+            future.set_result(function(*arguments))
         except Exception as error:
             future.set_exception(error)
         return [(key, future)]
@@ -145,11 +136,6 @@ class _ThisProcess(Pool):
     @override
     def stop(self) -> None:
         self._at_work.clear()
-
-
-def unshared(arguments: Iterable[Any]) -> tuple[Any, ...]:
-    """The arguments as the function is to see them."""
-    return tuple(argument.value if isinstance(argument, Shared) else argument for argument in arguments)
 
 
 def check_jobs(jobs: object) -> None:
@@ -198,7 +184,7 @@ def recorded(function: Callable[..., Any], arguments: Sequence[Any]) -> tuple[An
     """The outcome, and every warning on the way."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        outcome = function(*unshared(arguments))
+        outcome = function(*arguments)
     return outcome, [(str(each.message), each.category, each.filename, each.lineno) for each in caught]
 
 
@@ -312,3 +298,42 @@ class _Processes(Pool):
         )
         for task in tasks:
             self._begin(task)
+
+
+BACKENDS: dict[str, type[Backend]] = {kind.name: kind for kind in (Serial, Joblib)}
+
+
+def backend_of(name: str, jobs: int | None = None) -> Backend:
+    """The backend of this name: serial or joblib.
+
+    jobs: tasks at once; None is as many as this machine has cores. Raises InvalidInput for another name, and for more
+    than one job of serial.
+    """
+    if name not in BACKENDS:
+        raise InvalidInput(f"there is no backend {name!r}; choose {', '.join(BACKENDS)}")
+    if jobs is not None:
+        check_jobs(jobs)
+    if name == Joblib.name:
+        return Joblib(os.cpu_count() or 1 if jobs is None else jobs)
+    if jobs not in (None, 1):
+        raise InvalidInput(f"backend serial does one task at a time, not {jobs}; choose joblib, or leave jobs out")
+    return Serial()
+
+
+def backend_for(given: Backend | str | None, jobs: int | None = None) -> Backend:
+    """What a function means that takes both: a backend, its name, or None for processes as soon as jobs is above 1.
+
+    Raises InvalidInput as `backend_of`, and for a backend with jobs of its own together with others.
+    """
+    if given is None:
+        given = Serial.name if jobs in (None, 1) else Joblib.name
+    if isinstance(given, str):
+        return backend_of(given, jobs)
+    if not isinstance(given, Backend):
+        raise InvalidInput(
+            f"backend is a {type(given).__name__}; give Serial(), Joblib(jobs), or one of the names "
+            f"{', '.join(BACKENDS)}"
+        )
+    if jobs is not None and jobs != getattr(given, "jobs", 1):
+        raise InvalidInput(f"jobs={jobs} contradicts backend={given}; give one of them")
+    return given

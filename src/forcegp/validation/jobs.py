@@ -19,7 +19,6 @@ from forcegp.data import Dataset
 from forcegp.errors import DataWarning, FileFormatError, ForceGPError
 from forcegp.jobs import Job, JobStore
 from forcegp.mechanics import MechanicalSystem
-from forcegp.parallel import Shared
 from forcegp.validation.candidates import Candidate, Training
 from forcegp.validation.comparison import Comparison, Identification, identification_named, training_subset
 from forcegp.validation.scores import acceleration_scores, mass_matrices, motion_scores, outside_range
@@ -30,7 +29,6 @@ IDENTIFICATION, MODEL = "identification", "model"
 
 def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Job], list[Job]]:
     """Identifications, and the models, which read their results; those that use all rows with the first seed only."""
-    shared = Shared(comparison)
     configuration = hashlib.sha256(json.dumps(comparison.configuration(), sort_keys=True).encode()).hexdigest()
     wanted = {each.identification for each in models.values() if each.identification is not None}
     identifications: dict[str, Job] = {}
@@ -43,7 +41,7 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
         inputs = tuple(sorted({*read.values()}))
         place = job_name(comparison.splits[split], seed, kind, name)
         cost = work.cost if isinstance(work, Candidate) else 1.0
-        return Job(place, f"{__name__}:compute", spec, inputs, cost, (shared, work), _modules(work))
+        return Job(place, f"{__name__}:compute", spec, inputs, cost, (comparison, work), _modules(work))
 
     for seed in range(seeds):
         for split in range(len(comparison.splits)):

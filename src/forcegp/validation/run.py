@@ -209,8 +209,6 @@ def validate(
     """
     require_type("comparison", comparison, Comparison)
     workers = backend_for(backend, jobs)
-    if not workers.shares_files:
-        raise InvalidInput(f"the backend {workers.name} does not share files; choose serial or joblib.")
     if isinstance(seeds, bool) or seeds < 1:
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     if not 0.0 <= margin < 1.0:

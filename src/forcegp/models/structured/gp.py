@@ -92,8 +92,8 @@ class StructuredGP(StructuredModel):
             500 of the rows ended.
         seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
         jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
-        backend: where restarts run: `Serial()`, `Joblib(jobs)`, `Ray(address)` or a name, "serial", "joblib", "ray"
-            (docs/clusters.md). None is this process for one job and processes of this machine for several.
+        backend: where restarts run: `Serial()`, `Joblib(jobs)`, a `Backend` of your own, or a name, "serial", "joblib".
+            None is this process for one job and processes of this machine for several.
         hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
             maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
         options: the search itself; None is `models.search.default_options`, which is content sooner beyond 400 points.
