@@ -12,6 +12,7 @@ TITLES = {
     "programs": "Models as programs",
     "tracking": "Tracking with learned friction",
     "normal_force": "A normal force without a sensor",
+    "contact_monitor": "Contacts seen without a sensor",
     "swing_up": "A swing-up by path integral control",
     "planned_swing_up": "A swing-up planned by IPOPT",
     "searches": "Searches for hyper-parameters",
@@ -168,6 +169,15 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "normal_force_path_learned": ("<= 1", "the same: RMSE of the tool's place [mm]"),
         "normal_force_force_urdf": ("", "the same force on the URDF alone [N]"),
         "normal_force_path_urdf": ("", "the same place on the URDF alone [mm]"),
+    },
+    "contact_monitor": {
+        "monitor_5n": (">= 0.99", "pushes of 5 N at the elbow that are found, one false alarm in 10 hours asked for"),
+        "monitor_5n_delay_ms": ("<= 60", "the same: delay [ms]"),
+        "monitor_3n": (">= 0.95", "the same: pushes of 3 N"),
+        "monitor_false_alarms": ("<= 0", "false alarms in 10 min of free motion, most of five seeds"),
+        "monitor_3n_laws": ("", "pushes of 3 N found with Coulomb's and viscous friction of the same rows"),
+        "monitor_3n_urdf": ("", "pushes of 3 N found with the URDF alone"),
+        "monitor_call_ms": ("<= 1", "CPU time of one call [ms]"),
     },
     "swing_up": {
         "swing_up_learned_over_true": ("<= 1.05", "cost of a swing-up by MPPI at 50 Hz: learned / true model"),

@@ -38,6 +38,7 @@ from forcegp import (
     identify_analytical,
 )
 from forcegp.data import farthest_rows
+from forcegp.models import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 from forcegp.simulation.kuka_motion import kuka_urdf
 
@@ -111,8 +112,8 @@ def rows_of(motion: dict[str, np.ndarray], system: MechanicalSystem, seed: int, 
     return farthest_rows(data, count)
 
 
-def controllers(data: Dataset, given: MechanicalSystem, true: Robot, seed: int) -> dict[str, Callable]:
-    """Name -> controller; all but the first three learn from the same rows."""
+def fits(data: Dataset, given: MechanicalSystem, seed: int) -> dict[str, StructuredPosterior]:
+    """Name -> model; all but the first learn from the same rows."""
     laws = replace(
         given,
         known_forces=(
@@ -122,12 +123,18 @@ def controllers(data: Dataset, given: MechanicalSystem, true: Robot, seed: int) 
         ),
     )
     learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
-    fits = {
+    return {
         "URDF": StructuredGP(given, NoForces()).fit(data, restarts=1, seed=seed),
         "Coulomb's and viscous friction": StructuredGP(laws, NoForces()).identify(data, learn, restarts=1, seed=seed),
         "learned": StructuredGP(given, JointFriction()).fit(data, restarts=1, seed=seed),
     }
-    made = {name: ComputedTorque(fit.predictor(covariance="none"), **GAINS) for name, fit in fits.items()}
+
+
+def controllers(data: Dataset, given: MechanicalSystem, true: Robot, seed: int) -> dict[str, Callable]:
+    """Name -> controller."""
+    made = {
+        name: ComputedTorque(fit.predictor(covariance="none"), **GAINS) for name, fit in fits(data, given, seed).items()
+    }
     return {"PD + gravity": PDGravity(given.robot.compile(), **GAINS), **made, "true model": TrueModel(true)}
 
 

@@ -46,7 +46,7 @@ PACKAGES = {
         "inference",
         "integration",
     },
-    "control": {"errors", "summary", "robots", "mechanics", "integration", "models"},
+    "control": {"errors", "summary", "robots", "mechanics", "analytical", "integration", "models"},
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
 PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}
@@ -59,6 +59,7 @@ PACKAGES["cli"] = set(PACKAGES)
 IMPORTED_WHERE_USED = {
     "casadi": (),
     "gymnasium": ("forcegp.control.environments",),
+    "mujoco": ("forcegp.control.mujoco_forces",),
     "pybullet": (),
     "matplotlib": ("forcegp.evaluation.plots", "forcegp.experiments", "forcegp.validation.figures"),
     "joblib": (),

@@ -58,6 +58,7 @@ from .models import export_c as export_c
 # what is done with it
 from .control import ComputedTorque as ComputedTorque
 from .control import PDGravity as PDGravity
+from .control import ContactMonitor as ContactMonitor
 from .control import HybridForce as HybridForce
 from .control import MPPI as MPPI
 

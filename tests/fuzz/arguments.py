@@ -336,6 +336,10 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {**TRACKING, "forces_at": "desired", "gain_factor": None, "on_failure": "raise"},
     ),
     "PDGravity": (functools.partial(_control, forcegp.PDGravity, _robot), lambda: {**TRACKING, "on_failure": "hold"}),
+    "ContactMonitor": (
+        lambda **k: forcegp.ContactMonitor(arm_system(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
+        lambda: {"dt": 0.01, "bandwidth": 5.0, "covariance": "noise"},
+    ),
     "MPPI": (
         functools.partial(_control, forcegp.MPPI, lambda: INPUTS.predictor, _cost),
         lambda: {

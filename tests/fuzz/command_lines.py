@@ -38,6 +38,7 @@ VALID = {
     "identify": ("identify", "test.h5", "--model", "least-squares", "--out", "out"),
     "evaluate": ("evaluate", "carried", "train.h5"),
     "rollout": ("rollout", "carried", "train.h5", "--starts", "1", "--seconds", "0.02", "--out", "out"),
+    "monitor": ("monitor", "carried", "train.h5", "--free-seconds", "0.1", "--out", "out"),
     "export": ("export", "carried", "--to", "c", "--unchecked", "--out", "out"),
     "validate": ("validate", "test.h5", "--models", "none-such", "--out", "out"),
     "simulate": ("simulate", "none-such", "--out", "out.h5"),

@@ -24,6 +24,7 @@ from forcegp.cli.export import Export
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
 from forcegp.cli.import_log import Import
+from forcegp.cli.monitor import Monitor
 from forcegp.cli.prepare import Prepare
 from forcegp.cli.reproduce import Reproduce
 from forcegp.cli.rollout import Rollout
@@ -57,6 +58,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
+    "monitor": (Monitor, "when a robot was touched, where and how hard, from a log without force sensor"),
     "export": (Export, "write a fitted model as a C program"),
     "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
 }

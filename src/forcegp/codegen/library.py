@@ -144,17 +144,22 @@ def default_folder() -> Path:
 
 
 def load_library(
-    name: str, key: str, write: Callable[[VectorUnit], str], folder: Path, purpose: Purpose
+    name: str,
+    key: str,
+    write: Callable[[VectorUnit], str],
+    folder: Path,
+    purpose: Purpose,
+    options: Sequence[str] = (),
 ) -> tuple[ctypes.CDLL, Path]:
     """The library with the function `evaluate` that `write` gives the C text of, and its file.
 
     From ``folder`` if a file of that name and key is there, else compiled into it. ``key`` must hold everything that
-    decides the text beside the code of this package. Raises :class:`~forcegp.errors.CompilerError` where there is no C
-    compiler, where it fails, where ``folder`` cannot be written to, and where others than the user can write to it or
-    to a folder above it.
+    decides the text beside the code of this package; ``options`` are more of the compiler's.
+    Raises :class:`~forcegp.errors.CompilerError` where there is no C compiler, where it fails, where ``folder`` cannot
+    be written to, and where others than the user can write to it or to a folder above it.
     """
     unit = VectorUnit.of_this_processor()
-    parts = (key, repr(unit), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
+    parts = (key, *options, repr(unit), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     path = own_folder(folder, purpose) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
     if not path.exists():
@@ -162,7 +167,7 @@ def load_library(
         try:
             with atomic_file(path) as library:  # whoever else compiles the same meanwhile
                 compile_library(
-                    source, (*OPTIONS, *unit.options), library, "evaluate", purpose
+                    source, (*OPTIONS, *unit.options, *options), library, "evaluate", purpose
                 )  # tried before it is kept
                 library.chmod(0o700)
         except OSError as error:

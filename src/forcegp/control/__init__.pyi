@@ -1,3 +1,4 @@
 from .hybrid_force import HybridForce as HybridForce
+from .monitor import ContactMonitor as ContactMonitor
 from .mppi import MPPI as MPPI
 from .tracking import ComputedTorque as ComputedTorque, PDGravity as PDGravity

@@ -13,6 +13,7 @@ from .plots.prediction import (
     likelihood_figure as likelihood_figure, normal_force_figure as normal_force_figure, prediction_figure as
     prediction_figure,
 )
+from .plots.contacts import contacts_figure as contacts_figure
 from .plots.rollout import rollout_figure as rollout_figure
 from .plots.style import save_figure as save_figure
 from .plots.tool_path import summary_figure as summary_figure, tool_path_figure as tool_path_figure

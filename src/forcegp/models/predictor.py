@@ -48,7 +48,7 @@ class Linearization(NamedTuple):
 
 
 class JointForces(NamedTuple):
-    """Q_K + Q_U (nv,) at a state under its u, dQ/du and M (nv, nv), A (m, nv) and b (m,)."""
+    """Q_K + Q_U (..., nv) at states under their u, dQ/du and M (..., nv, nv), A (..., m, nv) and b (..., m)."""
 
     Q: Tensor
     dQ_du: Tensor
@@ -258,14 +258,15 @@ class Predictor(Summary):
         return self.posterior.components(q, v, u, covariance=covariance)
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
-        """Known and learned forces at one state (nv,) and what they act on, without a graph."""
+        """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""
         program, nv, m = self.compiled("forces"), self.nv, len(self.posterior.system.contacts)
         if program and _is_one_state((q, v, u), nv):
             Q, around = self._at_one("forces", program, q, v, u)
         else:
-            Q, around = (x[0] for x in self.run("forces", self._states(q[None], v[None], u[None])[0]))
-        slope, M, A, b = around.split([nv**2, nv**2, m * nv, m])
-        return JointForces(Q, slope.view(nv, nv), M.view(nv, nv), A.view(m, nv), b)
+            states, single = self._states(q, v, u)
+            Q, around = (_single(x, single) for x in self.run("forces", states))
+        slope, M, A, b = around.split([nv**2, nv**2, m * nv, m], dim=-1)
+        return JointForces(Q, slope.unflatten(-1, (nv, nv)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b)
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).

@@ -76,6 +76,7 @@ class PredictorCode:
     features: list[list[int]]
     forces: list[int]
     around: list[int]
+    passive: list[int]
     compressed: CompressedCovariance | None
     widening: float
 
@@ -98,9 +99,9 @@ class PredictorCode:
         sums = latent_calls(latent, prepared, compressed)
         latents = sum(len(part.latents) for part in sums)
         graph, found = trace(traced, [*example, torch.ones(1, latents, dtype=torch.float64)])
-        (a, W, Q, *around), features = ([x[0].tolist() for x in part] for part in (found[:6], found[6:]))
+        (a, W, Q, passive, *around), features = ([x[0].tolist() for x in part] for part in (found[:7], found[7:]))
         flat = [int(node) for values in around for node in np.ravel(values)]
-        return cls(example[0].shape[-1], sums, graph, a, W, features, Q, flat, compressed, widening)
+        return cls(example[0].shape[-1], sums, graph, a, W, features, Q, flat, passive, compressed, widening)
 
     @property
     def _latents(self) -> list[int]:
@@ -108,7 +109,7 @@ class PredictorCode:
         return [c for part in self.sums for c in part.latents]
 
     def program(self, kind: str) -> Program:
-        """The program "mean", "linearize", "covariance" or "forces"."""
+        """The program "mean", "linearize", "covariance", "forces", or "passive" ones: all but actuation and bias."""
         graph, f, slopes = Graph(3 * self.nv), {}, kind in WITH_SLOPES
         copied = Copier(graph, self.physics, dict(zip(self.physics.inputs, graph.inputs, strict=False)))
         features = [copied(self.features[part.latents[0]]) for part in self.sums]
@@ -119,6 +120,8 @@ class PredictorCode:
             Q = copied(self.forces)
             slope = [node for row in jacobian(graph, Q, graph.inputs[2 * self.nv :]) for node in row]
             return Program(graph, dict.fromkeys("qvu", self.nv), {"Q": Q, "around": slope + copied(self.around)})
+        if kind == "passive":
+            return Program(graph, dict.fromkeys("qvu", self.nv), {"Q": copied(self.passive)})
         a = copied(self.a)
         match kind:
             case "mean":
@@ -134,8 +137,11 @@ class PredictorCode:
                 outputs = {"a": a, "covariance": given}
         return Program(graph, dict.fromkeys("qvu", self.nv), outputs)
 
-    def c_source(self, kind: str, lanes: int) -> str:
-        """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`."""
+    def c_source(self, kind: str, lanes: int, entry: str = "") -> str:
+        """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`.
+
+        `entry` is another text that calls `program(t, live, x, y)` instead.
+        """
         integrator, loop = kind, kind in STEPS
         if loop:
             kind = "linearize" if integrator == "implicit-midpoint" else "mean"
@@ -147,7 +153,9 @@ class PredictorCode:
             text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self._covariance_source()]
             finish = {"covariance": ("covariance", self.nv**2)}
         text.append(write_function("program", program.graph, program.nodes, lanes, names))
-        text.append(loop_source(integrator, "program", self.nv) if loop else write_entry(program, "program", finish))
+        if loop:
+            entry = loop_source(integrator, "program", self.nv)
+        text.append(entry or write_entry(program, "program", finish))
         return "\n".join(text)
 
     def _covariance_source(self) -> str:
@@ -176,16 +184,20 @@ class PredictorCode:
             found += [part.root_table() for part in self.sums]
         return [aligned(table) for table in found]
 
+    def drawn(self, latent: LatentPosterior, samples: int, seed: int) -> "Sequence[PredictorCode] | None":
+        """The code of each drawn function, whose texts are equal; None where one has no form in pieces."""
+        if not samples or not self.sums:
+            return [self] * max(1, samples)
+        drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)
+        return None if drawn is None else [replace(self, sums=calls, compressed=None) for calls in drawn]
+
     def loops(
         self, integrator: str, latent: LatentPosterior, samples: int = 0, seed: int = 0
     ) -> list[FusedLoop] | None:
         """Over the mean or each drawn function; None where one has no form in pieces. Raises CompilerError."""
-        if not samples or not self.sums:
-            return [FusedLoop(self.library(integrator), self.tables)] * max(1, samples)
-        drawn = drawn_calls(latent, self.sums, samples, seed, self.widening)
-        if drawn is None:
+        codes = self.drawn(latent, samples, seed)
+        if codes is None:
             return None
-        codes = [replace(self, sums=calls, compressed=None) for calls in drawn]
         library = codes[0].library(integrator)
         return [FusedLoop(library, code.tables) for code in codes]
 

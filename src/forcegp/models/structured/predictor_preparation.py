@@ -15,7 +15,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels, Sample, compress
-from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import Actuation, ConstrainedDynamics, MechanicalSystem, RigidBodyBias
 from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode, TermsFunction
@@ -52,11 +52,15 @@ class PredictorPhysics:
         return [affine.offset, affine.matrix @ self.prior.mixing(dynamics), *self._features(dynamics)]
 
     def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
-        """[a, W, Q_K + Q_U, M, A, b, features ...]: what programs are written from, easily differentiated."""
+        """[a, W, Q_K + Q_U, passive forces, M, A, b, features ...]: what programs are written from."""
         dynamics = self.system.dynamics(q, v, u, self.inertials)
         B = self.prior.mixing(dynamics)
-        Q = (B @ f[..., None])[..., 0] + (dynamics.Q_K if self.analytical else 0.0)
-        around = dynamics.M, dynamics.A, dynamics.b
+        passive = Q_U = (B @ f[..., None])[..., 0]
+        for force in self.system.known_forces:
+            if self.analytical and not isinstance(force, Actuation | RigidBodyBias):
+                passive = passive + force.force(dynamics.state)
+        Q = Q_U + (dynamics.Q_K if self.analytical else 0.0)
+        around = passive, dynamics.M, dynamics.A, dynamics.b
         return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
 
     def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:

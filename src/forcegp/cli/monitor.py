@@ -1,0 +1,159 @@
+"""`forcegp monitor`: when a robot was touched, where and how hard, from its log and a fitted model."""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+import forcegp
+import forcegp.data
+import forcegp.evaluation
+import forcegp.recordings
+from forcegp.atomic_files import write_json
+from forcegp.cli.command import LOG, MAPPING, MODEL, Command, Debug, Json, unless_given
+from forcegp.cli.terminal import Terminal, columns
+from forcegp.errors import InvalidInput
+
+PLACE = tuple(f"{name}_{axis}" for name in ("point", "force", "force_std") for axis in "xyz")
+COLUMNS = ("start", "end", "peak", "probability", "link", "also", "newton", *PLACE)
+APART = 0.25
+"""Alarms that are less apart in s belong to one contact."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Monitor(Command):
+    """Find contacts that nobody modelled in a log: when, on which link, and with what force. No sensor is needed.
+
+    What moves the robot beyond the model is a contact where free motion of the same robot hardly ever shows as much.
+    LOG is a dataset, or any log that forcegp import reads, with the signals of the joints of the model.
+
+    For instance:
+      forcegp monitor run log.h5 --free-seconds 120 --out contacts
+      forcegp monitor run shift.csv --free morning.csv --mapping columns.yaml --false-alarms 0.01 --out contacts
+    """
+
+    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
+    """The folder that `forcegp fit --out` wrote, of a robot without contacts."""
+    log: Annotated[Positional[Path], LOG, arg(metavar="LOG")]
+    """The log to look at, at the rate of its sensors."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """The folder to write: contacts.csv, contacts.json and contacts.png."""
+    free: Annotated[Path | None, LOG, unless_given("LOG", "--free-seconds of LOG")] = None
+    """A log in which nothing touches the robot, of 50 s or more, which the model did not learn from."""
+    free_seconds: Annotated[float | None, unless_given("S", "--free")] = None
+    """Nothing touches the robot in the first S seconds of LOG; they serve as --free, and are not looked at."""
+    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside, or by the names")] = None
+    """What the columns of logs mean, as for forcegp import."""
+    false_alarms: Annotated[float, arg(metavar="N")] = 0.1
+    """How many false alarms an hour are accepted."""
+    bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
+    """Of the low-pass filter on the torques: higher is sooner, lower sees smaller forces."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Calibrate, look, draw and show."""
+        if (self.free is None) == (self.free_seconds is None):
+            raise InvalidInput("give either --free LOG or --free-seconds S: free motion shows what the model cannot.")
+        if self.free_seconds is not None and not 0.0 < self.free_seconds < float("inf"):
+            raise InvalidInput(f"--free-seconds is {self.free_seconds:g}; give seconds above 0.")
+        self.require_free(self.out)
+        posterior = forcegp.load_posterior(self.run_folder)
+        log = self._dataset(terminal, self.log, posterior)
+        dt = forcegp.data.filtering.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
+        motions = list(_motions(log, self.log, dt))
+        if self.free is not None:
+            known = [each[1:] for each in _motions(self._dataset(terminal, self.free, posterior), self.free, dt)]
+        else:
+            first, rows = motions[0], round((self.free_seconds or 0.0) / dt)
+            known, motions[0] = [tuple(x[:rows] for x in first[1:])], tuple(x[rows:] for x in first)
+        monitor = forcegp.ContactMonitor(posterior.predictor(), dt=dt, bandwidth=self.bandwidth)
+        with terminal.progress("looking"):
+            monitor.calibrate(known, false_alarms_per_hour=self.false_alarms)
+            parts = [(time, q, monitor.run(q, v, u)) for time, q, v, u in motions if len(time) > 1]
+        if not parts:
+            raise InvalidInput(f"nothing is left of {self.log} after --free-seconds {self.free_seconds:g}.")
+        contacts = [found for time, q, state in parts for found in _contacts(monitor, time, q, state)]
+        content = {
+            "run": str(self.run_folder),
+            "log": str(self.log),
+            "options": self.words("free", "free_seconds", "mapping"),
+            **{name: getattr(self, name) for name in ("false_alarms", "bandwidth")},
+            **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
+        }
+        title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"
+        with self.folder(self.out, content) as folder:
+            write_json(folder / "contacts.json", {**content, "contacts": contacts})
+            with (folder / "contacts.csv").open("w", encoding="utf-8", newline="") as file:
+                table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+                table.writeheader()
+                table.writerows(contacts)
+            time, _, state = max(parts, key=lambda part: len(part[0]))
+            shown = [(each["start"], each["end"]) for each in contacts if time[0] <= each["start"] <= time[-1]]
+            arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
+            figure = forcegp.evaluation.contacts_figure(*arrays, shown, log.joint_names, title)
+            forcegp.evaluation.save_figure(figure, folder / "contacts.png")
+        terminal.note(f"figure: {self.out / 'contacts.png'}")
+        limit = monitor.threshold
+        header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
+        rows = [
+            [each["link"], *(f"{each[name]:.2f}" for name in ("start", "end", "newton")), f"{each['peak'] / limit:.1f}"]
+            for each in contacts
+        ]
+        terminal.show(columns(title, header, rows))
+        return {**content, "contacts": contacts}
+
+    def _dataset(self, terminal: Terminal, path: Path, posterior: Any) -> forcegp.Dataset:
+        """A dataset, or a log imported for this robot. Raises what importing raises."""
+        if path.is_file() and forcegp.data.is_dataset(path):
+            dataset = forcegp.Dataset.load(path)
+        else:
+            beside = self.mapping or forcegp.recordings.beside(path)
+            mapping = forcegp.ColumnMapping() if beside is None else forcegp.recordings.read_mapping(beside)
+            with tempfile.TemporaryDirectory() as folder, terminal.progress(f"reading {path}") as report:
+                out = Path(folder) / "log.h5"
+                try:
+                    forcegp.import_recordings([path], out, mapping, system=posterior.system, report=report)
+                except InvalidInput as error:
+                    raise InvalidInput(f"{error} Or write a dataset of {path} by `forcegp import`.") from None
+                dataset = forcegp.Dataset.load(out)
+        if tuple(posterior.joint_names) != dataset.joint_names:
+            raise InvalidInput(
+                f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
+                f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
+            )
+        return dataset
+
+
+def _motions(dataset: forcegp.Dataset, path: Path, dt: float) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """time, q, v and u of every episode. Raises InvalidInput for other time steps."""
+    for number in dataset.episodes:
+        at = dataset.episode == number
+        step = forcegp.data.filtering.uniform_step(dataset.time[at], f"episode {number} of {path}")
+        if abs(step - dt) > 0.01 * dt:
+            raise InvalidInput(
+                f"{path} has steps of {step:.4g} s and the log of {dt:.4g} s; import both at one --rate."
+            )
+        yield dataset.time[at], dataset.q[at], dataset.v[at], dataset.u[at]
+
+
+def _contacts(monitor: forcegp.ContactMonitor, time: Any, q: Any, state: Any) -> Iterator[dict[str, Any]]:
+    """Alarms that follow each other closely, as one contact with the place and the force of its peak."""
+    import numpy as np  # here, so that --help does not wait for it
+
+    alarms, distance = np.flatnonzero(state.alarm.numpy()), state.distance.numpy()
+    for rows in np.split(alarms, np.flatnonzero(np.diff(alarms) * monitor.dt > APART) + 1) if alarms.size else ():
+        peak = int(rows[distance[rows].argmax()])
+        place = monitor.place(q[peak], state.torque[peak])
+        ends = float(time[rows[0]]), float(time[rows[-1]]), float(distance[peak]), float(state.probability[peak])
+        three = [x for name in ("point", "force", "force_std") for x in getattr(place, name)]
+        found = (*ends, place.link, " ".join(place.also), float(np.linalg.norm(place.force)), *three)
+        yield dict(zip(COLUMNS, found, strict=True))

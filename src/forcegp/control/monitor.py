@@ -1,0 +1,253 @@
+"""Contacts that nobody modelled, from motion and torque alone: `ContactMonitor`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.signal import lfilter
+from scipy.stats import chi2, gumbel_r
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.analytical.least_squares import NoiseLevels
+from forcegp.control.tracking import Model, system_of
+from forcegp.errors import DatasetError, InvalidInput, require_known
+from forcegp.integration.integrators import check_time_step
+from forcegp.models.predictor import Predictor
+from forcegp.robots import Robot
+from forcegp.robots.arguments import finite_vector, real_array
+from forcegp.summary import Summary
+
+Motion = tuple[Any, Any, Any]
+"""q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
+
+BLOCK = 5.0
+"""Seconds of free motion of which the largest distance counts once: what follows upon it resembles it."""
+LEAST_BLOCKS = 10
+PLACES = 5
+"""Points along each link where a contact is tried."""
+EXPLAINED = float(chi2.ppf(0.95, 1))
+"""Links whose misfit is larger by less explain a torque as well as the best."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactState:
+    """What a monitor found at rows (...): `torque` (..., nv) in Nm (N) of what touches the robot, low-pass filtered.
+
+    `distance` (...) is its Mahalanobis distance from free motion, squared; `alarm` where that is over the threshold.
+    `probability` is the share of stretches of 5 s of free motion in which the distance stays below this one.
+    """
+
+    torque: Float[Tensor, "*rows nv"]
+    distance: Float[Tensor, "*rows"]
+    probability: Float[Tensor, "*rows"]
+    alarm: Bool[Tensor, "*rows"]
+
+
+@dataclass(frozen=True)
+class ContactPlace:
+    """A contact that explains a torque: a force (3,) in N in the axes of the world at a point (3,) of the link, in m.
+
+    `force_std` (3,) is what noise leaves open; `also` are links that explain the torque as well.
+    """
+
+    link: str
+    point: tuple[float, float, float]
+    force: tuple[float, float, float]
+    force_std: tuple[float, float, float]
+    also: tuple[str, ...]
+
+
+class ContactMonitor(Summary):
+    """A momentum observer around a model of the forces: what moves the robot beyond it is a contact.
+
+    Over a step of `dt` s, tau = M a - Q_K - Q_U with a the difference of velocities, all in the middle of the step;
+    filtered to first order with `bandwidth` Hz that is the residual of De Luca and Mattone (2005), "Sensorless robot
+    collision detection and hybrid force/motion control". Its covariance is S = M D_a M + D_f with noise of the
+    accelerations and of the forces as in free motion (`calibrate`), and an alarm is raised where tau^T S^-1 tau exceeds
+    a threshold that free motion reaches as often as stated.
+
+    * model: `posterior.predictor()`, or a `MechanicalSystem` without anything learned.
+    * covariance: "noise" is S; "noise and posterior" adds what the predictor does not know of the forces there, which
+      spares false alarms where the model has not been. None is the latter where the model has a covariance.
+
+    Raises InvalidInput for arguments that do not fit and a monitor that was not calibrated, DatasetError for free
+    motion that is too short.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        dt: float,
+        bandwidth: float = 5.0,
+        covariance: Literal["noise", "noise and posterior"] | None = None,
+    ) -> None:
+        self.model, system = model, system_of(model)
+        if system.contacts:
+            raise InvalidInput("ContactMonitor looks for contacts that are not modelled; posterior.with_contacts([]).")
+        known = not (isinstance(model, Predictor) and model.kind != "none")
+        covariance = covariance or ("noise" if known else "noise and posterior")
+        require_known("covariance", covariance, "ContactMonitor", ("noise", "noise and posterior"))
+        self.open = covariance != "noise"
+        if self.open and known:
+            raise InvalidInput(f"covariance={covariance!r} needs posterior.predictor() with a covariance.")
+        check_time_step(dt)
+        if not (isinstance(bandwidth, int | float) and 0.0 < bandwidth < 0.5 / dt):
+            raise InvalidInput(f"bandwidth is {bandwidth!r}; give Hz above 0 and below {0.5 / dt:g}, half the rate.")
+        self.robot: Robot = system.robot
+        self.dt, self.bandwidth = float(dt), float(bandwidth)
+        self._keep = math.exp(-2.0 * math.pi * bandwidth * dt)
+        self.noise: NoiseLevels | None = None
+        self.threshold = math.inf
+        self._maxima = (0.0, 1.0)
+        self.restart()
+
+    @override
+    def facts(self) -> Mapping[str, object]:
+        """Whether and how it is calibrated."""
+        threshold = "not calibrated" if self.noise is None else f"{self.threshold:.3g}"
+        return {"robot": self.robot.name, "bandwidth": f"{self.bandwidth:g} Hz", "threshold": threshold}
+
+    def restart(self) -> None:
+        """Forget earlier calls, as at the beginning of a recording."""
+        self._torque = torch.zeros(self.robot.nv, dtype=torch.float64)
+        self._before: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def calibrate(self, free: Sequence[Motion], *, false_alarms_per_hour: float = 0.1) -> "ContactMonitor":
+        """Learn the noise and the threshold from recordings (T, nv) of free motion; returns the monitor.
+
+        The largest distances of stretches of 5 s follow a Gumbel distribution (Fisher, Tippett 1928), whose quantile is
+        the threshold: so minutes of free motion serve for a rate of one in hours, as far as its tail is the same. Take
+        another motion than the model learned from, as varied as those to come.
+        """
+        rate = false_alarms_per_hour
+        if not (isinstance(rate, int | float) and 0.0 < rate < 3600.0 / BLOCK):
+            raise InvalidInput(f"false_alarms_per_hour is {rate!r}; give a number above 0 and below {3600 / BLOCK:g}.")
+        settle, block = round(1.0 / (self.bandwidth * self.dt)), round(BLOCK / self.dt)
+        found = [self._residuals(*motion, settle) for motion in free]
+        if sum(len(tau) // block for tau, *_ in found) < LEAST_BLOCKS:
+            seconds = sum(len(tau) for tau, *_ in found) * self.dt
+            raise DatasetError(
+                f"free motion of {seconds:.3g} s is too short for a threshold; give at least "
+                f"{LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more."
+            )
+        tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
+        self.noise = NoiseLevels.of(torch.linalg.solve(M, tau[..., None])[..., 0].numpy(), M.numpy())
+        distances = [self._distance(tau, self._covariance(M, extra)) for tau, M, extra in found]
+        largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
+        self._maxima = gumbel_r.fit(largest.numpy())
+        self.threshold = float(gumbel_r.isf(rate * BLOCK / 3600.0, *self._maxima))
+        return self
+
+    def __call__(self, q: Any, v: Any, u: Any) -> ContactState:
+        """What the step to this sample shows, called every `dt` s; q, v and u (nv,), which acts from now on."""
+        sample = self._motion(q, v, u)
+        before, self._before = self._before, sample
+        if before is None:
+            return self._state(self._torque, self._torque.new_zeros(()))
+        middle = 0.5 * (before[0] + sample[0]), 0.5 * (before[1] + sample[1])
+        step = (*middle, before[2], (sample[1] - before[1]) / self.dt)
+        tau, M, extra = self._torques(*(x[None] for x in step))
+        self._torque = self._torque + (1.0 - self._keep) * (tau[0] - self._torque)
+        return self._state(self._torque, self._distance(self._torque[None], self._covariance(M, extra))[0])
+
+    def run(self, q: Any, v: Any, u: Any) -> ContactState:
+        """The same of a whole recording (T, nv); nothing is known at its first row."""
+        tau, M, extra = self._residuals(q, v, u)
+        distance, none = self._distance(tau, self._covariance(M, extra)), tau.new_zeros(1, tau.shape[1])
+        return self._state(torch.cat([none, tau]), torch.cat([none[:, 0], distance]))
+
+    def place(self, q: Any, torque: Any) -> ContactPlace:
+        """The contact at q (nv,) that explains an external torque (nv,) by a force without a moment.
+
+        Least squares in the metric of the noise, at points along every link; of those that explain it alike the one
+        with the least force. Few joints before a contact leave its place and parts of its force open: see `also`.
+        """
+        q, tau = (torch.as_tensor(finite_vector(n, x, self.robot.nv)) for n, x in (("q", q), ("torque", torque)))
+        white = torch.linalg.inv(torch.linalg.cholesky(self._covariance(self.robot.mass_matrix(q), None)))
+        kinematics, found = self.robot.kinematics(q), []
+        for link, point in contact_points(self.robot):
+            J = white @ kinematics.frame_jacobian(link, point)[:3].mT
+            inverse = torch.linalg.pinv(J, rtol=1e-6)
+            force = inverse @ (white @ tau)
+            found.append((float((white @ tau - J @ force).square().sum()), link, point, force, inverse))
+        least = min(each[0] for each in found) + EXPLAINED
+        alike = [each for each in found if each[0] <= least]
+        _, link, point, force, inverse = min(alike, key=lambda each: float(each[3].norm()))
+        also = dict.fromkeys(each[1] for each in alike if each[1] != link)
+        stds = inverse.square().sum(-1).sqrt()
+        x, y, z = (tuple(each.tolist()) for each in (point, force, stds))
+        return ContactPlace(link, x, y, z, tuple(also))
+
+    def _covariance(self, M: Tensor, extra: Tensor | None) -> Tensor:
+        """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open."""
+        if self.noise is None:
+            raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
+        acceleration, force = (torch.as_tensor(x).square() for x in (self.noise.acceleration, self.noise.force))
+        S = (M * acceleration) @ M + force.diag()
+        return S if extra is None else S + extra
+
+    def _motion(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Checked samples, (nv,) each or (T, nv)."""
+        named = zip("qvu", (q, v, u), strict=True)
+        found = [torch.as_tensor(real_array(name, x), dtype=torch.float64) for name, x in named]
+        shapes = [tuple(x.shape) for x in found]
+        if len({*shapes}) > 1 or shapes[0][-1:] != (self.robot.nv,) or not all(bool(x.isfinite().all()) for x in found):
+            raise InvalidInput(
+                f"q, v and u have shapes {', '.join(map(str, shapes))}; give finite numbers, all ({self.robot.nv},) "
+                f"for one sample or (T, {self.robot.nv}) for a recording."
+            )
+        return found[0], found[1], found[2]
+
+    def _residuals(self, q: Any, v: Any, u: Any, settle: int = 0) -> tuple[Tensor, Tensor, Tensor | None]:
+        """As `_torques`, filtered (T - 1 - settle, nv)."""
+        q, v, u = self._motion(q, v, u)
+        if q.dim() != 2 or len(q) < 2:
+            raise InvalidInput(
+                f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}) of two rows or more."
+            )
+        middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
+        tau, M, extra = self._torques(*middle, u[:-1], (v[1:] - v[:-1]) / self.dt)
+        filtered = lfilter([1.0 - self._keep], [1.0, -self._keep], tau.numpy(), axis=0)
+        return torch.from_numpy(filtered)[settle:], M[settle:], None if extra is None else extra[settle:]
+
+    def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """M a - Q_K - Q_U at rows, M, and M Cov(a) M of what the posterior leaves open."""
+        if isinstance(self.model, Predictor):
+            at = self.model.joint_forces(q, v, u)
+            Q, M = at.Q, at.M
+        else:
+            dynamics = self.model.dynamics(q, v, u)
+            Q, M = dynamics.Q_K, dynamics.M
+        extra = M @ self.model(q, v, u)[1] @ M if self.open and isinstance(self.model, Predictor) else None
+        return (M @ a[..., None])[..., 0] - Q, M, extra
+
+    @staticmethod
+    def _distance(tau: Tensor, S: Tensor) -> Float[Tensor, " rows"]:
+        return (tau * torch.linalg.solve(S, tau[..., None])[..., 0]).sum(-1)
+
+    def _state(self, tau: Tensor, distance: Tensor) -> ContactState:
+        probability = torch.from_numpy(np.asarray(gumbel_r.cdf(distance.numpy(), *self._maxima)))
+        return ContactState(tau.clone(), distance, probability, distance > self.threshold)
+
+
+def contact_points(robot: Robot) -> list[tuple[str, Float[Tensor, "3"]]]:
+    """Points of every moving link, from its joint to the next joint, what is fastened to it or its centre of mass.
+
+    Of these ends the farthest, in m in the frame of the link.
+    """
+    layout, points = robot.layout, []
+    for body, joint in enumerate(layout.joints):
+        ends = [origin[:3, 3] for origin, parent in zip(layout.origins, layout.parents, strict=True) if parent == body]
+        ends += [placed.offset[:3, 3] for placed in layout.links.values() if placed.body == body]
+        turn = layout.links[joint.child].offset[:3, :3]
+        inertial = robot.description.links[joint.child]
+        centre = [] if inertial is None else [np.asarray(inertial.center_of_mass)]
+        end = torch.from_numpy(max([turn.T @ end for end in ends] + centre, key=np.linalg.norm))
+        points += [(joint.child, end * k / (PLACES - 1)) for k in range(PLACES if bool(end.any()) else 1)]
+    return points

@@ -1,0 +1,173 @@
+"""Learned forces as passive forces of MuJoCo, as one C function: no Python in its loop, any number of threads."""
+
+import ctypes
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import mujoco as untyped
+import numpy as np
+import torch
+from typing_extensions import override
+
+from forcegp.codegen.library import Purpose, aligned, default_folder, load_library
+from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.models.predictor import Predictor
+from forcegp.models.structured.components import require_actuated
+from forcegp.robots.arguments import whole_number
+from forcegp.summary import Summary
+
+mujoco: Any = untyped
+CALLBACK = """
+#include <mujoco/mujoco.h>
+static const double *const *tables;
+static int failed;
+void passive(const mjModel *m, mjData *d) {
+  enum {N = JOINTS};
+  static const int position[N] = {POSITIONS}, velocity[N] = {VELOCITIES};
+  double x[3 * N], y[N];
+  (void)m;
+  for (int j = 0; j < N; j++) {
+    x[j] = d->qpos[position[j]]; x[N + j] = d->qvel[velocity[j]]; x[2 * N + j] = 0.0;
+  }
+  program(tables, 1, x, y);
+  for (int j = 0; j < N; j++) {
+    if (!(y[j] - y[j] == 0.0)) failed = 1;
+    d->qfrc_passive[velocity[j]] += y[j];
+  }
+}
+int evaluate(const double *const *t) { /* take these tables, and report whether a force was not finite until now */
+  const int before = failed;
+  tables = t; failed = 0;
+  return before;
+}
+"""
+PURPOSE = Purpose("a passive force for MuJoCo", "the environment variable XDG_CACHE_HOME", "use predictor.rollouts")
+STATES = 5
+"""Random ones at which the robots are compared."""
+ALIKE = 1e-6
+"""Largest relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF."""
+
+
+class MujocoForces(Summary):
+    """What was learned of a robot's forces, as MuJoCo's passive force: `with MujocoForces(predictor, model): ...`.
+
+    Within the context every `mj_step`, `mj_forward` and `mujoco.rollout` of this process adds them, on any number of
+    threads; there is one such force at a time. With it `qacc` is what `posterior.predict` says.
+
+    * predictor: `posterior.predictor()` without contacts, since those are MuJoCo's; its forces may depend on q and v.
+    * model: an `MjModel` with the joints of the robot, by their names, and its inertias and gravity. Damping and
+      friction that the URDF states are in it, too, and would act twice: InvalidInput names the joint.
+    * draw: 0 is the mean of the forces; k draws k functions with `seed`, the same as `predictor.rollouts(functions=k)`,
+      and `use(number)` chooses one, for example at the beginning of an episode.
+
+    Raises InvalidInput for models that do not fit, CompilerError without a C compiler; leaving the context raises
+    NumericalError where a force was not finite meanwhile.
+    """
+
+    def __init__(self, predictor: Predictor, model: Any, *, draw: int = 0, seed: int = 0) -> None:
+        require_type("predictor", predictor, Predictor, " : posterior.predictor()")
+        require_type("model", model, mujoco.MjModel)
+        require_actuated(predictor.posterior)
+        self.predictor, self.draw = predictor, whole_number("draw", draw, 0)
+        system = predictor.posterior.system
+        if system.contacts:
+            raise InvalidInput("MuJoCo has contacts of its own, and this model has one; posterior.with_contacts([]).")
+        if draw and not len(predictor.latent.features):
+            raise InvalidInput(f"draw={draw} functions are asked for, and this model has none; give draw=0.")
+        if predictor.code is None:
+            raise InvalidInput("the predictor was made with compile=False; MuJoCo needs the C program.")
+        places = _joints(model, system.robot.joint_names)
+        _require_alike(predictor, model, places)
+        code = predictor.code.traced
+        program = code.program("passive")
+        if set(program.graph.inputs[2 * code.nv :]) & set(program.graph.needed(program.nodes)):
+            raise InvalidInput(
+                "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
+            )
+        codes = code.drawn(predictor.latent, draw, whole_number("seed", seed, 0))
+        if codes is None:
+            raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
+        text = CALLBACK.replace("JOINTS", str(code.nv))
+        for name, numbers in zip(("POSITIONS", "VELOCITIES"), zip(*places, strict=True), strict=True):
+            text = text.replace(name, ", ".join(map(str, numbers)))
+        source = codes[0].c_source("passive", 1, text)
+        include = f"-I{Path(mujoco.__file__).parent / 'include'}"
+        key = json.dumps([source, mujoco.mj_versionString()])
+        self._library = load_library("mujoco", key, lambda _: source, default_folder(), PURPOSE, (include,))[0]
+        self._held = [[aligned(part.table()) for part in each.sums] for each in codes]
+        self._tables = [(ctypes.c_void_p * max(1, len(held)))(*(x.data_ptr() for x in held)) for held in self._held]
+        self.use(0)
+
+    @override
+    def facts(self) -> Mapping[str, object]:
+        """The robot, and how many functions there are."""
+        return {"robot": self.predictor.posterior.system.robot.name, "functions": self.draw or "the mean"}
+
+    def use(self, number: int) -> None:
+        """Take this of the drawn functions from now on; call it between two steps."""
+        if not whole_number("number", number, 0) < len(self._tables):
+            raise InvalidInput(f"function {number} is asked for, of {len(self._tables)}; make more by draw.")
+        self._chosen = self._tables[number]
+        self._library.evaluate(self._chosen)
+
+    def __enter__(self) -> Self:
+        if mujoco.get_mjcb_passive() is not None:
+            raise InvalidInput("MuJoCo has a passive callback already; leave its context, or set_mjcb_passive(None).")
+        self._library.evaluate(self._chosen)
+        mujoco.set_mjcb_passive(
+            ctypes.cast(self._library.passive, ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p))
+        )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        mujoco.set_mjcb_passive(None)
+        if self._library.evaluate(self._chosen) and kind is None:
+            raise NumericalError("a learned force was not finite: a state left what its tables hold, or diverged.")
+
+
+def _joints(model: Any, names: tuple[str, ...]) -> list[tuple[int, int]]:
+    """The places in qpos and qvel of every joint."""
+    places = []
+    for name in names:
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+        scalar = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
+        if number < 0 or int(model.jnt_type[number]) not in scalar:
+            found = [model.joint(k).name for k in range(model.njnt)]
+            raise InvalidInput(f"the MjModel has no hinge or slide {name!r}; its joints are {', '.join(found)}.")
+        at = int(model.jnt_dofadr[number])
+        stated = {"damping": model.dof_damping[at], "frictionloss": model.dof_frictionloss[at]}
+        for what, value in (stated | {"stiffness": model.jnt_stiffness[number]}).items():
+            if np.any(value):
+                raise InvalidInput(
+                    f"joint {name} has {what} in the MjModel, which would act beside the learned forces; set it to 0 "
+                    f"(model.dof_damping, dof_frictionloss, jnt_stiffness), or learn with it as a known force."
+                )
+        places.append((int(model.jnt_qposadr[number]), at))
+    return places
+
+
+def _require_alike(predictor: Predictor, model: Any, places: list[tuple[int, int]]) -> None:
+    """Raise InvalidInput where masses, inertias or gravity are not those of the robot."""
+    data, system, generator = mujoco.MjData(model), predictor.posterior.system, np.random.default_rng(0)
+    at_q, at_v = (list(each) for each in zip(*places, strict=True))
+    for _ in range(STATES):
+        data.qpos[at_q], data.qvel[at_v] = generator.uniform(-1.0, 1.0, (2, len(places)))
+        mujoco.mj_forward(model, data)
+        whole = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, whole)
+        q, v = (torch.from_numpy(np.array(x)) for x in (data.qpos[at_q], data.qvel[at_v]))
+        kinematics = system.robot.kinematics(q, v)
+        M, h = system.mass_matrix(kinematics).numpy(), kinematics.bias_forces().numpy()
+        pairs = ("mass matrix", M, whole[np.ix_(at_v, at_v)]), ("gravity or bias force", h, data.qfrc_bias[at_v])
+        for what, own, other in pairs:
+            apart = float(np.abs(own - other).max() / np.abs(own).max())
+            if not apart <= ALIKE:
+                raise InvalidInput(
+                    f"the {what} of the MjModel differs by {apart:.2g} (relative) from that of "
+                    f"{system.robot.name}; load the same URDF, with the same gravity and armature (dof_armature)."
+                )

@@ -1,0 +1,231 @@
+"""The monitor of contacts: against the momentum observer, a dense formula, and forces that are known."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pinocchio
+import pytest
+import torch
+from tests.control.test_tracking import ROBOT, TRUE, URDF, URDF_ALONE, VISCOUS
+from tests.models.arm import arm_system
+
+from forcegp import ContactMonitor, Dataset, JointFriction, StructuredGP, save_posterior
+from forcegp.cli.main import main
+from forcegp.control.monitor import contact_points
+from forcegp.errors import DatasetError, InvalidInput
+
+DT = 0.01
+
+
+def motion(seconds, seed, push=None, noise=0.003, dt=DT):
+    """q, v, u (T, 2) of sines, exact but for noise; `push` (T, 2) are joint torques that u lacks."""
+    time, rng = np.arange(round(seconds / dt)) * dt, np.random.default_rng(seed)
+    rate, size, phase = rng.uniform(0.7, 3.0, (3, 2)), rng.uniform(0.2, 0.5, (3, 2)), rng.uniform(0, 6, (3, 2))
+    angle = rate[:, None] * time[None, :, None] + phase[:, None]
+    size = size[:, None]
+    q, v = (size * np.sin(angle)).sum(0), (size * rate[:, None] * np.cos(angle)).sum(0)
+    a = -(size * rate[:, None] ** 2 * np.sin(angle)).sum(0)
+    at = [torch.from_numpy(0.5 * (x + np.roll(x, -1, 0))) for x in (q, v)]  # in the middle of the steps
+    step = torch.from_numpy((np.roll(v, -1, 0) - v) / dt)
+    u = ROBOT.inverse_dynamics(*at, step).numpy() + at[1].numpy() * VISCOUS - (0.0 if push is None else push)
+    assert a.shape == u.shape
+    return q, v + noise * rng.standard_normal(v.shape), u
+
+
+@pytest.fixture(scope="module")
+def monitor():
+    return ContactMonitor(TRUE, dt=DT).calibrate([motion(120.0, 1)])
+
+
+def test_it_is_the_momentum_observer():
+    """r = K (p - int (u - friction + C^T v - g + r) dt) of De Luca and Mattone, integrated in small steps."""
+    dt, bandwidth = 1e-3, 3.0
+    push = np.zeros((1000, 2))
+    push[300:] = 2.0, -1.0
+    q, v, u = motion(1.0, 2, push, noise=0.0, dt=dt)
+    observer = ContactMonitor(TRUE, dt=dt, bandwidth=bandwidth).calibrate([motion(55.0, 1, dt=dt)])
+    found = observer.run(q, v, u).torque.numpy()
+    model = pinocchio.buildModelFromXML(URDF)
+    data, K = model.createData(), 2.0 * math.pi * bandwidth
+    r, total, first = np.zeros(2), np.zeros(2), None
+    for k in range(len(q) - 1):
+        momentum = pinocchio.crba(model, data, q[k]) @ v[k]
+        first = momentum if first is None else first
+        r = K * (momentum - first - total)
+        if k > 5:
+            np.testing.assert_allclose(found[k], r, atol=0.05)
+        C = pinocchio.computeCoriolisMatrix(model, data, q[k], v[k])
+        gravity = pinocchio.computeGeneralizedGravity(model, data, q[k])
+        total = total + dt * (u[k] - VISCOUS * v[k] + C.T @ v[k] - gravity + r)
+    np.testing.assert_allclose(found[-1], push[-1], atol=0.02)
+
+
+def test_calls_are_the_run(monitor):
+    q, v, u = motion(1.0, 3)
+    whole = monitor.run(q, v, u)
+    monitor.restart()
+    calls = [monitor(*sample) for sample in zip(q, v, u, strict=True)]
+    for name in ("torque", "distance", "probability", "alarm"):
+        torch.testing.assert_close(torch.stack([getattr(call, name) for call in calls]), getattr(whole, name))
+
+
+def test_distances_are_mahalanobis_of_a_covariance_that_moves_with_the_inertia(monitor):
+    q, v, u = motion(1.0, 4)
+    state, row = monitor.run(q, v, u), 50
+    M = ROBOT.mass_matrix(torch.from_numpy(0.5 * (q[row] + q[row - 1]))).numpy()
+    S = M @ np.diag(monitor.noise.acceleration**2) @ M + np.diag(monitor.noise.force**2)
+    tau = state.torque[row].numpy()
+    assert float(state.distance[row]) == pytest.approx(tau @ np.linalg.solve(S, tau), rel=1e-9)
+
+
+def test_free_motion_raises_as_many_alarms_as_asked_for():
+    often = ContactMonitor(TRUE, dt=DT).calibrate([motion(300.0, 5)], false_alarms_per_hour=60.0)
+    alarms = often.run(*motion(1200.0, 6)).alarm.numpy()
+    blocks = alarms[: len(alarms) // 500 * 500].reshape(-1, 500).any(axis=1)  # expected: 20 of 240
+    assert 5 <= blocks.sum() <= 45
+
+
+def test_pushes_are_found_and_placed(monitor):
+    q, v, u = motion(4.0, 7)
+    where, point, force = "fore", torch.tensor([0.0, 0.0, 0.0], dtype=torch.float64), np.array([4.0, 3.0, 2.0])
+    J = ROBOT.kinematics(torch.from_numpy(q)).frame_jacobian(where, point)[:, :3].numpy()
+    push = np.zeros_like(u)
+    push[200:] = np.einsum("tij,i->tj", J, force)[200:]
+    state = monitor.run(q, v, u - push)
+    assert not state.alarm[:200].any()
+    assert state.alarm[206:].all()
+    assert float(state.probability[-1]) > 0.999
+    torch.testing.assert_close(state.torque[-1], torch.from_numpy(push[-1]), atol=0.1, rtol=0.1)
+    place = monitor.place(q[-1], push[-1])
+    explained = ROBOT.kinematics(torch.from_numpy(q[-1])).frame_jacobian(place.link, torch.tensor(place.point))[:3]
+    np.testing.assert_allclose(explained.mT.numpy() @ place.force, push[-1], atol=0.05)
+    assert where in {place.link, *place.also}
+    assert np.linalg.norm(place.force) <= np.linalg.norm(force) + 0.1
+
+
+def test_points_lie_along_the_links():
+    points = contact_points(ROBOT)
+    assert {link for link, _ in points} == {"upper", "fore"}
+    assert any(np.allclose(point, [0.0, 0.0, -0.4]) for link, point in points if link == "upper")  # the elbow
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    q, v, u = motion(6.0, 8, noise=0.0)
+    middle = [0.5 * (x[1:] + x[:-1]) for x in (q, v)]
+    a = np.diff(v, axis=0) / DT + 0.02 * np.random.default_rng(9).standard_normal((len(q) - 1, 2))
+    rows = Dataset(
+        q=middle[0],
+        v=middle[1],
+        u=u[:-1],
+        a=a,
+        time=DT * np.arange(len(a)),
+        system=URDF_ALONE,
+        noise_std=np.full(2, 0.02),
+    )
+    return StructuredGP(URDF_ALONE, JointFriction()).fit(rows, points=40, restarts=1)
+
+
+def test_learned_friction_sees_what_the_urdf_does_not(posterior):
+    free, limits = motion(120.0, 1), {}
+    push = np.zeros((400, 2))
+    push[200:] = 0.25, 0.1
+    models = {
+        "learned": (posterior.predictor(), "noise"),
+        "urdf": (URDF_ALONE, None),
+        "both": (posterior.predictor(), None),
+    }
+    for name, (model, covariance) in models.items():
+        found = ContactMonitor(model, dt=DT, covariance=covariance).calibrate([free])
+        limits[name] = found.run(*motion(4.0, 7, push)).alarm[250:].double().mean()
+    assert limits["learned"] > 0.95
+    assert limits["both"] > 0.95
+    assert limits["urdf"] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ContactMonitor(TRUE, dt=DT)([0.0, 0.0], [0.0, 0.0], [0.0, 0.0]), None),
+        (lambda: ContactMonitor(TRUE, dt=DT).run(*motion(1.0, 1)), "not calibrated: call calibrate"),
+        (lambda: ContactMonitor(TRUE, dt=DT).place([0.0, 0.0], [0.0, 0.0]), "not calibrated"),
+        (lambda: ContactMonitor(TRUE, dt=0.0), "time step"),
+        (lambda: ContactMonitor(TRUE, dt=DT, bandwidth=60.0), "bandwidth is 60.0; give Hz above 0 and below 50"),
+        (lambda: ContactMonitor(arm_system(), dt=DT), r"posterior\.with_contacts\(\[\]\)"),
+        (lambda: ContactMonitor(TRUE, dt=DT, covariance="noise and posterior"), "with a covariance"),
+        (lambda: ContactMonitor(TRUE, dt=DT, covariance="none"), "choose noise, noise and posterior"),
+        (lambda: ContactMonitor(TRUE, dt=DT).calibrate([motion(20.0, 1)]), "too short for a threshold"),
+        (lambda: ContactMonitor(TRUE, dt=DT).calibrate([]), "too short"),
+        (lambda: ContactMonitor(TRUE, dt=DT).calibrate([motion(60.0, 1)], false_alarms_per_hour=0.0), "above 0"),
+        (lambda: ContactMonitor(TRUE, dt=DT).calibrate([(*motion(60.0, 1)[:2], np.zeros((3, 2)))]), "have shapes"),
+        (lambda: ContactMonitor(TRUE, dt=DT).calibrate([tuple(np.nan * x for x in motion(60.0, 1))]), "finite"),
+    ],
+)
+def test_what_makes_no_monitor(make, message):
+    if message is None:  # nothing to judge at the first sample
+        assert not make().alarm
+        return
+    with pytest.raises((InvalidInput, DatasetError), match=message):
+        make()
+
+
+def saved(path, given):
+    q, v, u = given
+    a = np.gradient(v, DT, axis=0)
+    Dataset(q=q, v=v, u=u, a=a, time=DT * np.arange(len(q)), system=URDF_ALONE).save(path)
+
+
+@pytest.fixture(scope="module")
+def workshop(posterior, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("monitor")
+    save_posterior(posterior, folder / "run")
+    push = np.zeros((800, 2))
+    push[300:400], push[600:700] = (1.0, 0.5), (-1.0, 0.5)
+    saved(folder / "free.h5", motion(120.0, 1))
+    q, v, u = motion(8.0, 7, push)
+    saved(folder / "log.h5", (q, v, u))
+    header = "time," + ",".join(f"{x}{j}" for x in "qvu" for j in (1, 2))
+    table = np.c_[DT * np.arange(len(q)), q, v, u]
+    np.savetxt(folder / "log.csv", table, delimiter=",", header=header, comments="")
+    (folder / "map.yaml").write_text("time: time\nq: q{1..2}\nv: v{1..2}\nu: u{1..2}\n")
+    return folder
+
+
+@pytest.mark.parametrize("log", [("log.h5",), ("log.csv", "--mapping", "map.yaml")])
+def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, capsys, log):
+    monkeypatch.chdir(workshop)
+    out = tmp_path / "contacts"
+    assert main(["monitor", "run", *log, "--free", "free.h5", "--out", str(out)]) == 0
+    assert "2 contacts in 8 s" in capsys.readouterr().out
+    found = json.loads((out / "contacts.json").read_text())
+    with (out / "contacts.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(found["contacts"]) == 2
+    assert [float(row["start"]) for row in rows] == pytest.approx([3.0, 6.0], abs=0.1)
+    assert [float(row["end"]) for row in rows] == pytest.approx([4.0, 7.0], abs=0.3)  # it fades
+    assert {"contacts.csv", "contacts.json", "contacts.png", "config.json", "SHA256SUMS"} == {
+        f.name for f in out.iterdir()
+    }
+    assert json.loads((out / "config.json").read_text())["bandwidth"] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "give either --free LOG or --free-seconds S"),
+        (("--free", "free.h5", "--free-seconds", "5"), "give either"),
+        (("--free-seconds", "5"), "too short for a threshold"),
+        (("--free-seconds", "-1"), "give seconds above 0"),
+        (("--free", "log.csv"), "no columns for q"),
+        (("--free", "free.h5", "--bandwidth", "500"), "below 50"),
+    ],
+)
+def test_refusals_are_one_line(workshop, monkeypatch, tmp_path, capsys, words, message):
+    monkeypatch.chdir(workshop)
+    assert main(["monitor", "run", "log.h5", *words, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert len(told.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
