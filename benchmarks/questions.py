@@ -13,6 +13,7 @@ TITLES = {
     "tracking": "Tracking with learned friction",
     "normal_force": "A normal force without a sensor",
     "contact_monitor": "Contacts seen without a sensor",
+    "mujoco_forces": "Learned forces in MuJoCo",
     "swing_up": "A swing-up by path integral control",
     "planned_swing_up": "A swing-up planned by IPOPT",
     "searches": "Searches for hyper-parameters",
@@ -169,6 +170,12 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "normal_force_path_learned": ("<= 1", "the same: RMSE of the tool's place [mm]"),
         "normal_force_force_urdf": ("", "the same force on the URDF alone [N]"),
         "normal_force_path_urdf": ("", "the same place on the URDF alone [mm]"),
+    },
+    "mujoco_forces": {
+        "mujoco_difference": ("<= 1e-8", "largest difference of MuJoCo's accelerations from predict [rad/s^2]"),
+        "mujoco_step_ratio": ("<= 1.3", "CPU time of mj_step with learned friction in seven joints / without"),
+        "mujoco_step_us": ("", "the same with it [us]"),
+        "mujoco_threads_identical": (">= 1", "1 if motions on 8 threads are those on one to the last bit"),
     },
     "contact_monitor": {
         "monitor_5n": (">= 0.99", "pushes of 5 N at the elbow that are found, one false alarm in 10 hours asked for"),
