@@ -226,7 +226,6 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "scaling": {
         "slope_exact": ("", "exact engine: CPU time grows as N to this power (last three points)"),
-        "slope_iterative": ("", "conjugate gradients: the same"),
         "slope_inducing": ("", "inducing points of the prior tool-friction: the same"),
     },
     "backends": {

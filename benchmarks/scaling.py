@@ -1,7 +1,7 @@
 """What does conditioning cost against the number of rows, engine by engine?
 
 Viscous friction at the tool of `kuka-surface`, hyper-parameters from 250 rows: a joint prior (7 processes on 21
-features) for the exact engine, conjugate gradients and mini-batches, the prior tool-friction (2 processes on 2) for
+features) for the exact engine, the prior tool-friction (2 processes on 2) for
 inducing points. Rows are spread evenly over one recording. Every case runs in a process of its own on one thread:
 conditioning and the mean at 100 states; CPU seconds and the rise of peak memory. The slope is that of the last three
 points of log time over log N. Writes docs/performance/scaling.png and scaling.json.
@@ -33,12 +33,10 @@ FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
 SEED, SECONDS = 903, 420.0
 CASES: dict[str, tuple[int, ...]] = {
     "exact": (100, 200, 400, 800, 1500, 2500),
-    "iterative": (300, 1000, 3000, 10_000),
     "inducing": (100, 1000, 10_000, 100_000),
 }
 LABELS = {
     "exact": "exact, joint prior",
-    "iterative": "conjugate gradients, joint prior",
     "inducing": "inducing points, tool-friction prior",
 }
 PRIORS = {"inducing": ToolForces()}

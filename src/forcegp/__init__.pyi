@@ -68,7 +68,6 @@ from .analytical import AnalyticalIdentification as AnalyticalIdentification
 
 # how and where it is computed
 from .inference import Exact as Exact
-from .inference import Iterative as Iterative
 from .inference import Inducing as Inducing
 from .parallel import Serial as Serial
 from .parallel import Joblib as Joblib

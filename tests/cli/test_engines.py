@@ -21,12 +21,12 @@ def folder(tmp_path):
 
 
 def test_the_engine_is_said_and_stored(forcegp, folder):
-    done = forcegp(*FIT, "--engine", "iterative", "--learning-points", 20, "--out", "run", folder=folder)
+    done = forcegp(*FIT, "--engine", "inducing", "--learning-points", 20, "--out", "run", folder=folder)
     assert done.returncode == 0, done.stderr
-    assert "iterative: as asked for" in done.stdout
-    assert "learned from 40 points (parameters: from 20 of them)" in " ".join(done.stdout.split())
+    assert "inducing: as asked for" in done.stdout
+    assert "learned from 40 points (parameters: from 20 of them" in " ".join(done.stdout.split())
     posterior = load_posterior(folder / "run")
-    assert posterior.engine.name == "iterative"
+    assert posterior.engine.name == "inducing"
     assert (len(posterior.training.q), len(posterior.training.reference.q)) == (40, 20)
     config = json.loads((folder / "run" / "config.json").read_text())
     assert config["resolved"]["learning_points"] == 20
@@ -48,7 +48,7 @@ def test_more_rows_than_memory_holds_is_one_line(forcegp, folder):
     assert refused.returncode == 2
     (line,) = refused.stderr.strip().splitlines()
     assert "N=100000 rows needs" in line
-    assert "use engine='iterative'" in line
+    assert "use engine='inducing'" in line
     assert not (folder / "run").exists()
 
 
@@ -57,7 +57,7 @@ def test_more_rows_than_memory_holds_is_one_line(forcegp, folder):
     [
         (("--engine", "fast"), "engine"),
         (("--learning-points", "1"), "learning_points is 1"),
-        (("--model", "independent-gp", "--engine", "iterative"), "--engine means nothing to --model independent-gp"),
+        (("--model", "independent-gp", "--engine", "inducing"), "--engine means nothing to --model independent-gp"),
         (("--model", "ensemble", "--learning-points", "9"), "--learning-points means nothing to --model ensemble"),
     ],
 )

@@ -8,7 +8,7 @@ import shutil
 import pytest
 from tests.cli.reproductions import Reproduced
 
-FIGURES = ("fig2b", "fig2c", "fig3", "fig4", "extrapolation", "ablation")
+FIGURES = ("fig2b", "fig2c", "fig3", "fig4")
 
 # minutes of fits; tests/experiments covers the cells, test_executable.py the command
 pytestmark = pytest.mark.nightly

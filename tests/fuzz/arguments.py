@@ -323,10 +323,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "Payload": (functools.partial(_prior, forcegp.Payload), lambda: {"frame": "hand", "moments": True}),
     "Inducing": (functools.partial(_engine, forcegp.Inducing), lambda: {"points": 5, "tolerance": 0.02, "refine": 0}),
-    "Iterative": (
-        functools.partial(_engine, forcegp.Iterative),
-        lambda: {"points": None, "tolerance": 1e-4, "iterations": 20, "memory": None},
-    ),
     "Preparation": (
         lambda **k: forcegp.Preparation(**k).apply(INPUTS.free),
         lambda: {"cutoff": 20.0, "order": 2, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},

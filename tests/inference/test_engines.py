@@ -11,7 +11,6 @@ from forcegp.inference import engines, memory
 from forcegp.inference.engines import (
     Exact,
     Inducing,
-    Iterative,
     ProblemSize,
     choose_engine,
     engine_from_dict,
@@ -38,7 +37,6 @@ def free(monkeypatch):
     ("engine", "matrices"),
     [
         (Exact(), [(2000, 2000), (3000, 1000)]),
-        (Iterative(points=100), [(300, 1000), *[(300, 300)] * 3, (12 * 1000, 3 * 2)]),
         (Inducing(100), [*[(300, 300)] * 3, (20_000, 100), (12 * 1000, 3 * 2)]),
         # its batch: ten matrices of the points and the rows of all latents
     ],
@@ -52,24 +50,18 @@ def test_learning_needs_two_more_matrices_for_each_latent():
     assert Exact().bytes_to_learn(SIZE) - Exact().required_bytes(SIZE) == 2 * 8 * 3 * 1000**2
 
 
-@pytest.mark.parametrize(("rows", "points"), [(150, 150), (999, 200), (2000, 400), (5000, 1000), (60_000, 1000)])
-def test_the_preconditioner_has_a_fifth_of_the_rows_within_bounds(rows, points):
-    assert Iterative().points_for(rows) == points
-    assert Iterative(points=300).points_for(rows) == min(rows, 300)
-
-
 def test_the_engine_follows_rows_features_and_memory(free):
     assert choose_engine(replace(SIZE, rows=1500), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000
-    assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Iterative()
-    assert choose_engine(replace(SIZE, rows=20_000), CPU).engine == Iterative()
-    assert choose_engine(replace(SIZE, rows=20_001), CPU).engine == Inducing()
+    assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Inducing(points=1000)
+    assert choose_engine(replace(SIZE, rows=60_000), CPU).engine == Inducing(points=1000)
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU).engine == Inducing()
     assert choose_engine(replace(SIZE, rows=1501, features=4), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU, inducing=False).engine == Exact()
     assert choose_engine(replace(SIZE, rows=10**6, latents=0), CPU).engine == Exact()
-    free(Exact().required_bytes(SIZE))  # 90 % of it may be planned with
-    assert choose_engine(SIZE, CPU).engine == Iterative()
+    few = replace(SIZE, features=2)
+    free(Exact().required_bytes(few))  # 90 % of it may be planned with
+    assert choose_engine(few, CPU).engine == Inducing()
     free(math.ceil(Exact().required_bytes(SIZE) / 0.9))
     assert choose_engine(SIZE, CPU).engine == Exact()
     free(1000)
@@ -80,13 +72,6 @@ def test_the_engine_follows_rows_features_and_memory(free):
 @pytest.mark.parametrize(
     ("kind", "fine", "wrong"),
     [
-        (Iterative, {"points": 1}, {"points": 0}),
-        (Iterative, {"points": None}, {"points": 2.0}),
-        (Iterative, {"iterations": 1}, {"iterations": True}),
-        (Iterative, {"tolerance": 0.5}, {"tolerance": 1.0}),
-        (Iterative, {"tolerance": 1e-12}, {"tolerance": 0.0}),
-        (Iterative, {"memory": 0.0}, {"memory": -0.1}),
-        (Iterative, {"memory": 3}, {"memory": math.inf}),
         (Inducing, {"points": 1}, {"points": 0}),
         (Inducing, {"tolerance": 0.0}, {"tolerance": -1e-9}),
         (Inducing, {"refine": 0}, {"refine": -1}),
@@ -103,9 +88,13 @@ def test_settings_up_to_their_bounds(kind, fine, wrong):
 
 @pytest.mark.parametrize("stored", [["exact"], {"name": "gone"}, {"name": "exact", "points": 3}, {"points": 3}])
 def test_what_is_no_stored_engine_is_refused(stored):
-    with pytest.raises(InvalidInput, match="exact, iterative, inducing"):
+    with pytest.raises(InvalidInput, match="exact, inducing"):
         engine_from_dict(stored)
     assert engine_from_dict(None) == Exact()
+
+
+def test_conjugate_gradients_of_earlier_versions_had_the_exact_mean():
+    assert engine_from_dict({"name": "iterative", "points": 20, "tolerance": 1e-4}) == Exact()
 
 
 def test_an_engine_that_is_gone_loads_as_the_one_that_computed_its_posterior():

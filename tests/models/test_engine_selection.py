@@ -9,8 +9,8 @@ import torch
 from tests.models.arm import arm_data
 
 from forcegp import JointAccelerations, JointFriction, NoForces, StructuredGP, load_posterior, save_posterior
-from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalError, NumericalWarning
-from forcegp.inference import Exact, Inducing, Iterative, OptimizerOptions, ProblemSize, choose_engine
+from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalWarning
+from forcegp.inference import Exact, Inducing, OptimizerOptions, ProblemSize, choose_engine
 from forcegp.inference import memory as memory_module
 from forcegp.models.structured.refinement import _moved_to
 
@@ -34,12 +34,8 @@ def fit(data, engine="auto", prior=None, **how):
     return learn(data, engine=engine, restarts=1, **{"options": QUICK, **how})
 
 
-@pytest.mark.parametrize(
-    "engine",
-    [Iterative(tolerance=1e-11, points=20, solve_covariance=True), Inducing(points=60, tolerance=0.0, refine=0)],
-    ids=["iterative", "inducing"],
-)
-def test_every_engine_predicts_what_the_exact_one_does(data, states, engine):
+def test_enough_inducing_points_predict_what_the_exact_engine_does(data, states):
+    engine = Inducing(points=60, tolerance=0.0, refine=0)
     expected, given = fit(data, "exact").predict(*states), fit(data, engine).predict(*states)
     torch.testing.assert_close(given.mean, expected.mean, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(given.covariance, expected.covariance, rtol=1e-5, atol=1e-6)
@@ -82,7 +78,7 @@ def rows_of(posterior, data) -> set[int]:
 
 def test_the_engine_is_chosen_and_said(data):
     assert fit(data).settings["engine_reason"].startswith("exact: 60 rows need")
-    assert fit(data, "iterative").engine == Iterative()
+    assert fit(data, "inducing").settings["engine_reason"] == "inducing: as asked for"
 
 
 def test_few_features_take_inducing_points(data, monkeypatch):
@@ -107,15 +103,13 @@ def test_refining_on_all_rows_lowers_the_objective(data):
     assert refined.negative_log_likelihood < rough.negative_log_likelihood
 
 
-@pytest.mark.parametrize("engine", [Iterative(tolerance=1e-8, points=20), Inducing(points=60)], ids=["cg", "inducing"])
-def test_stored_and_loaded_it_predicts_the_same(data, states, engine, tmp_path):
+def test_stored_and_loaded_it_predicts_the_same(data, states, tmp_path):
+    engine = Inducing(points=60)
     posterior = fit(data, engine, learning_points=30)
     save_posterior(posterior, tmp_path / "model")
     loaded = load_posterior(tmp_path / "model")
     assert loaded.engine == engine
     torch.testing.assert_close(loaded.predict(*states).mean, posterior.predict(*states).mean, rtol=1e-6, atol=1e-6)
-    if isinstance(engine, Iterative):
-        assert loaded.latent.solved.iterations == 0
 
 
 def test_too_little_memory_is_said_before_anything_is_allocated(data, monkeypatch):
@@ -127,13 +121,8 @@ def test_too_little_memory_is_said_before_anything_is_allocated(data, monkeypatc
 def test_an_engine_that_does_not_fit_names_the_others(data, monkeypatch):
     posterior = fit(data, points=30)
     monkeypatch.setattr(memory_module, "free_memory", lambda device: 10_000)
-    with pytest.raises(NotEnoughMemory, match="use engine='iterative'"):
+    with pytest.raises(NotEnoughMemory, match="use engine='inducing'"):
         Exact().condition(posterior.kernels, posterior.likelihood.terms(posterior.parameters))
-
-
-def test_a_missed_tolerance_is_an_error(data):
-    with pytest.raises(NumericalError, match="conjugate gradients reached"):
-        fit(data, Iterative(tolerance=1e-12, iterations=2, points=2))
 
 
 @pytest.mark.parametrize(
@@ -148,8 +137,6 @@ def test_unknown_engines(data, given, message):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Iterative(points=0),
-        lambda: Iterative(tolerance=2.0),
         lambda: Inducing(points=0),
         lambda: Inducing(refine=-1),
     ],
@@ -166,21 +153,20 @@ def test_learning_points_are_checked(data):
 
 def test_leaving_rows_out_needs_the_exact_engine(data):
     with pytest.raises(InvalidInput, match="engine='exact'"):
-        fit(data, "iterative").leave_out()
+        fit(data, "inducing").leave_out()
 
 
-def test_functions_are_drawn_and_curves_read_from_every_engine(data, states):
+def test_functions_are_drawn_and_curves_read_from_inducing_points(data, states):
     q, v, u = (torch.tensor(x) for x in states)
-    for engine in (Inducing(), Iterative()):
-        posterior = fit(data, engine, prior=JointFriction())
-        sampled = posterior.accelerations(None).sampled(3, 0)(*(x[None].expand(3, -1, -1) for x in (q, v, u)))
-        assert sampled.shape == (3, 8, 3)
-        assert bool(torch.isfinite(sampled).all())
-        curve = posterior.curve(posterior.latent_names[0], points=5)
-        assert bool((curve.std > 0).all())
+    posterior = fit(data, Inducing(), prior=JointFriction())
+    sampled = posterior.accelerations(None).sampled(3, 0)(*(x[None].expand(3, -1, -1) for x in (q, v, u)))
+    assert sampled.shape == (3, 8, 3)
+    assert bool(torch.isfinite(sampled).all())
+    curve = posterior.curve(posterior.latent_names[0], points=5)
+    assert bool((curve.std > 0).all())
 
 
-@pytest.mark.parametrize("engine", ["auto", "exact", "iterative", "inducing"])
+@pytest.mark.parametrize("engine", ["auto", "exact", "inducing"])
 def test_without_unknown_forces_every_engine_is_the_exact_one(data, states, engine, monkeypatch):
     monkeypatch.setattr("forcegp.inference.engines.MOST_EXACT_ROWS", 10)
     posterior = fit(data, engine, prior=NoForces())
@@ -206,7 +192,7 @@ def test_far_rows_beyond_the_learning_rows_are_said(data):
     lifted = replace(data, q=np.where(np.arange(60)[:, None] < 50, data.q + 0.3, data.q))
     near = lifted.rows(np.arange(59, -1, -1))  # the ten near ones first
     with pytest.warns(DataWarning, match="half of the training points lie more than"):
-        fit(near, Iterative(points=20), learning_points=30)
+        fit(near, "exact", learning_points=30)
 
 
 @pytest.mark.parametrize("stored", [["inducing"], "inducing", {"name": "inducing", "points": "5"}, {"name": "gone"}])
@@ -222,8 +208,8 @@ def test_a_damaged_engine_is_refused(data, stored, tmp_path):
 
 def test_many_rows_of_many_features_take_inducing_points():
     chosen = choose_engine(ProblemSize(60_000, 7, 6, 7, 21), torch.device("cpu"))
-    assert chosen.engine == Inducing()
-    assert "hours" in chosen.reason
+    assert chosen.engine == Inducing(points=1000)
+    assert chosen.reason.startswith("inducing: the exact covariance of 60000 rows needs")
 
 
 def test_a_description_names_what_is_learned(data):

@@ -57,9 +57,9 @@ class ModelOptions(FitOptions):
     points: Annotated[int | None, unless_given("N", POINTS_HINT, int)] = None
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N as far as
     --engine is exact."""
-    engine: Annotated[Literal["auto", "exact", "iterative", "inducing"], arg(metavar="NAME")] = "auto"
-    """How the posterior is computed. exact: from the covariance of all points. iterative: by conjugate gradients.
-    inducing: through fewer points, for friction curves and the like. auto: by the number of points, the
+    engine: Annotated[Literal["auto", "exact", "inducing"], arg(metavar="NAME")] = "auto"
+    """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points.
+    auto: by the number of points, the
     features and the free memory, and reports why. See docs/large-data.md."""
     learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
     """Find the hyper-parameters on N of the points; the posterior is that of all points."""

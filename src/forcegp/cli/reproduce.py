@@ -18,7 +18,7 @@ from forcegp.errors import InvalidInput
 class Reproduce(BackendOptions):
     """Compute figures of Rath, Geist, Trimpe (2021) beside the published values, and what goes beyond the paper.
 
-    FIGURE is fig2b, fig2c, fig3, fig4, extrapolation, ablation or all; with the presets of force priors it is
+    FIGURE is fig2b, fig2c, fig3, fig4 or all; with the presets of force priors it is
     data-efficiency, friction, other-laws, transfer, unilateral-contact, deep-kernel or all. Every finished piece of
     work is kept in the folder; after an interruption the same command goes on from there.
 

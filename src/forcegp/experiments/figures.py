@@ -20,10 +20,9 @@ from forcegp.evaluation.plots.style import (
     quiet,
 )
 from forcegp.experiments import published
-from forcegp.experiments.extrapolation_jobs import REGIONS
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS
 from forcegp.experiments.fig2c_jobs import MODELS as ESTIMATING_MODELS
-from forcegp.experiments.fits import MODELS, NETWORKS
+from forcegp.experiments.fits import MODELS
 
 COLORS = dict(
     zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET, SERIES[3], SERIES[5]), strict=True)
@@ -105,34 +104,6 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
     panels[0].plot([], [], "x", color=QUIET, label="published (2021)")
     legend_below(figure, panels[0], columns=5)
     return figure
-
-
-def extrapolation_figure(summary: Mapping[str, Any]) -> Figure:
-    """One panel per region: for each model the MAE inside (hollow) and outside (filled), with the range over seeds."""
-    figure = new_figure(10.0, 3.8)
-    panels = figure.subplots(1, len(REGIONS), sharey=True, sharex=True)
-    for axes, (region, label) in zip(panels, REGIONS.items(), strict=True):
-        labels = {}
-        for place, (model, scores) in enumerate(summary["regions"][region].items()):
-            _draw_model(axes, -place, scores, COLORS[model])
-            points = "all rows" if model in NETWORKS else f"{scores['points']['median']:.0f} points"
-            labels[-place] = f"{MODELS[model].label} ({points})"
-        axes.set_yticks(list(labels), list(labels.values()))
-        axes.set_xscale("log")
-        quiet(axes, title=f"tested in the {label}", x="MAE against noise-free accelerations [rad/s²]")
-        axes.tick_params(axis="y", length=0)
-    panels[0].plot([], [], "o", color=QUIET, markerfacecolor="white", label="inside: where it was trained")
-    panels[0].plot([], [], "o", color=QUIET, label="outside")
-    legend_below(figure, panels[0])
-    return figure
-
-
-def _draw_model(axes: Axes, place: int, scores: Mapping[str, Any], color: str) -> None:
-    inside, outside = (scores[side]["mae_noise_free"] for side in ("inside", "outside"))
-    axes.plot([inside["median"], outside["median"]], [place, place], color=color, linewidth=1.0, alpha=0.5)
-    for value, face in ((inside, "white"), (outside, color)):
-        axes.plot([value["min"], value["max"]], [place, place], color=color, linewidth=3.0, alpha=0.35)
-        axes.plot(value["median"], place, "o", color=color, markerfacecolor=face, markersize=6)
 
 
 SHOWN_JOINTS = (0, 3, 6)

@@ -11,8 +11,8 @@ import torch
 from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
+from forcegp.evaluation.plots.tool_path import tool_motion
 from forcegp.experiments.data import farthest, simulated
-from forcegp.experiments.extrapolation_jobs import TEST_X, TRAIN_X, tool_motion
 from forcegp.experiments.fits import MODEL, START_FRICTION, search_report
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
@@ -26,6 +26,12 @@ from forcegp.simulation.joint_friction import OF_VELOCITY, JointFrictionLaw
 from forcegp.simulation.kuka_motion import tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]
+TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first, test rows above the second [m]
+
+
+def _tool_x(dataset: Dataset) -> np.ndarray:
+    assert dataset.system is not None
+    return tool_motion(dataset.system, dataset.q, dataset.v)[0][:, 0]
 
 
 def true_curves(posterior: Any) -> dict[str, Law]:
@@ -110,7 +116,7 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
     """Fit to the first `points` training rows and score on every test trajectory, under the contacts of its own."""
     train = load(results, spec["train"])
     if spec["region"]:
-        train = train.rows(tool_motion(train)[0] < TRAIN_X)
+        train = train.rows(_tool_x(train) < TRAIN_X)
     if spec["points"] > len(train):
         raise InvalidInput(f"{spec['points']} training points are asked for, but there are {len(train)}.")
     posterior = fitted(spec, train.rows(slice(spec["points"])))
@@ -119,7 +125,7 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
     for label, name in spec["tests"].items():
         test = load(results, name)
         if spec["region"]:
-            test = test.rows(tool_motion(test)[0] > TEST_X)
+            test = test.rows(_tool_x(test) > TEST_X)
         tests[label] = scores(posterior, test)
     left_out = {"leave_one_out": posterior.leave_out().total / spec["points"]}
     return {"tests": tests, "curves": curve_scores(posterior), **left_out, "search": search_report(posterior)}

@@ -13,9 +13,7 @@ from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
-from forcegp.experiments.ablation import Ablation
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.extrapolation import Extrapolation
 from forcegp.experiments.fig2b import Fig2b
 from forcegp.experiments.fig2c import Fig2c
 from forcegp.experiments.fig3 import Fig3
@@ -60,16 +58,12 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
         Fig2c(PAPER_DATA, 300, 101, points_interval=300, seeds=tuple(range(101, 111)), iterations=150, tolerance=1e-7),
         Fig3(points=PAPER_POINTS[:1], seed=101, start=5.0, seconds=3.0, **PAPER),
         Fig4(points=PAPER_POINTS, seeds=PAPER_SEEDS[:2], starts=10, seconds=(1.0, 5.0), **PAPER),
-        Extrapolation(points=200, seeds=PAPER_SEEDS[:2], **PAPER),
-        Ablation(points=PAPER_POINTS[:2], seeds=PAPER_SEEDS[:1], cutoffs=(30.0,), **PAPER),
     ),
     "smoke": (
         Fig2b(points=SMOKE_POINTS, seeds_many_points=(101,), few_points=SMOKE_POINTS[-1], **SMOKE),
         Fig2c(SMOKE_DATA, 40, 101, points_interval=30, seeds=(101,), iterations=8, tolerance=1e-6),
         Fig3(SMOKE_DATA, SMOKE_POINTS, 101, start=1.0, seconds=1.0, settings=SMOKE_SEARCH),
         Fig4(points=SMOKE_POINTS, starts=2, seconds=(0.1, 0.2), **SMOKE),
-        Extrapolation(points=30, **SMOKE),
-        Ablation(points=SMOKE_POINTS, cutoffs=(30.0,), steps=20, **SMOKE),
     ),
     "forces": (
         DataEfficiency(points=(10, 20, 50, 100), **FORCES),

@@ -1,4 +1,4 @@
-"""Gaussian-process inference, exact by deflation, and for many rows by conjugate gradients or inducing points.
+"""Gaussian-process inference, exact by deflation, and for many rows by inducing points.
 
 Knows mixing vectors, kernels, noise and targets; nothing of robots.
 """

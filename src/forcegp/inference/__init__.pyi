@@ -1,12 +1,11 @@
 from .block_cross_validation import LeaveOut as LeaveOut, leave_blocks_out as leave_blocks_out
 from .dense_kernels import LatentKernels as LatentKernels
 from .engines import (
-    ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing, Iterative as
-    Iterative, ProblemSize as ProblemSize, choose_engine as choose_engine, engine_from_dict as
-    engine_from_dict, engine_of as engine_of,
+    ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing,
+    ProblemSize as ProblemSize, choose_engine as choose_engine, engine_from_dict as engine_from_dict,
+    engine_of as engine_of,
 )
 from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound
-from .iterative import IterativePosterior as IterativePosterior
 from .likelihood import Terms as Terms, negative_log_likelihood as negative_log_likelihood
 from .linear_functionals import FunctionalPosterior as FunctionalPosterior
 from .memory import require_memory as require_memory

@@ -3,13 +3,11 @@
 | engine | posterior | time | memory |
 |---|---|---|---|
 | `Exact` | exact, from the factorised covariance | (rN)^3 | (rN)^2 |
-| `Iterative` | exact mean by conjugate gradients, covariance of a low-rank model | iterations C N^2 | N P |
 | `Inducing` | variational, through inducing points, with a bound on what that costs | N P^2 | P^2 |
 
 with N rows, r the rank of the mixing vectors, C latents and P points of all latents together.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -23,7 +21,6 @@ from forcegp.errors import InvalidInput, require_known, usable_arguments
 from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior, WeightSpace
-from forcegp.inference.iterative import Iteration, IterativePosterior
 from forcegp.inference.likelihood import Terms
 from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
@@ -32,13 +29,13 @@ MOST_EXACT_ROWS = 1500
 """Rows up to which the exact engine is taken without a question, and all hyper-parameters are found on all of them."""
 
 MOST_EXACT_ENTRIES = 16_000
-"""Size rN of the covariance up to which factorising it takes about as long as conjugate gradients on it."""
-
-MOST_ITERATIVE_ROWS = 20_000
-"""Rows beyond which conjugate gradients take hours rather than minutes."""
+"""Size rN of the covariance beyond which factorising it takes minutes, and many inducing points are taken."""
 
 FEW_FEATURES = 3
 """Features of a latent up to which inducing points can be expected to leave nothing out."""
+
+MANY_POINTS = 1000
+"""Inducing points of a latent with more features: measured, docs/large-data.md."""
 
 ENOUGH = 0.02
 """Prior variance of a row in units of its noise that inducing points may leave out: measured, docs/large-data.md."""
@@ -79,12 +76,10 @@ class Engine(ABC):
         """Memory that conditioning on so many rows takes at least."""
 
     @abstractmethod
-    def condition(
-        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
-    ) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
         """The posterior given the data.
 
-        `start` is an earlier `solution` of the same engine, `report(iteration, residual)` follows an iterative one.
+        `start` is an earlier `solution` of the same engine.
         Raises NotEnoughMemory before anything large is allocated, NumericalError where the engine fails.
         """
 
@@ -106,7 +101,7 @@ class Exact(Engine):
     """The factorised covariance of all rows (the default up to 1500 rows): the only engine that can leave rows out."""
 
     name: ClassVar[str] = "exact"
-    remedy: ClassVar[str] = "use engine='iterative' or engine='inducing', or fewer points"
+    remedy: ClassVar[str] = "use engine='inducing', or fewer points"
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:
@@ -117,72 +112,9 @@ class Exact(Engine):
         return self.required_bytes(size) + 16 * size.latents * size.rows**2
 
     @override
-    def condition(
-        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
-    ) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
         return ExactPosterior.condition(kernels, *terms)
-
-
-@dataclass(frozen=True)
-class Iterative(Engine):
-    """Preconditioned conjugate gradients on all rows.
-
-    `points` of each latent for the preconditioner (None: as many as are worth their time), `tolerance` of the relative
-    residual, most `iterations`, `memory` in GiB for kernel matrices that are kept between iterations (None: half of
-    what is free). `solve_covariance`: see `IterativePosterior`.
-    """
-
-    name: ClassVar[str] = "iterative"
-    remedy: ClassVar[str] = "give Iterative fewer points, use engine='inducing', or fewer rows"
-    points: int | None = None
-    tolerance: float = 1e-4
-    iterations: int = 1000
-    memory: float | None = None
-    solve_covariance: bool = False
-
-    def __post_init__(self) -> None:
-        if self.points is not None:
-            _require_whole(self, 1, "points")
-        _require_whole(self, 1, "iterations")
-        _require_number(self, "tolerance", "between 0 and 1", lambda x: 0.0 < x < 1.0)
-        if self.memory is not None:
-            _require_number(self, "memory", "at least 0 (GiB)", lambda x: 0.0 <= x < math.inf)
-
-    def points_for(self, rows: int) -> int:
-        """A fifth of the rows, at least 200 and at most 1000."""
-        # at N = 3000 (Coulomb friction in the joints) 200, 400, 700 and 1000 points per joint needed more than 749,
-        # 291, 65 and 20 iterations to 1e-4: points matter more than iterations (docs/solvers.md)
-        return min(rows, self.points if self.points is not None else min(1000, max(200, rows // 5)))
-
-    @override
-    def required_bytes(self, size: ProblemSize) -> int:
-        points = self.points_for(size.rows)
-        weights = size.latents * points
-        return 8 * (weights * size.rows + 3 * weights**2 + 12 * size.rows * size.latents * size.outputs)
-
-    @override
-    def condition(
-        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
-    ) -> LatentPosterior:
-        size, device = ProblemSize.of(terms), terms.W.device
-        self.require_memory(size, device)
-        spare = max(0, free_memory(device) - self.required_bytes(size))
-        return IterativePosterior.condition(
-            kernels,
-            terms,
-            points=self.points_for(size.rows),
-            tolerance=self.tolerance,
-            iterations=self.iterations,
-            memory=spare // 2 if self.memory is None else int(self.memory * 2**30),
-            solve_covariance=self.solve_covariance,
-            start=start,
-            report=report,
-        )
-
-    @override
-    def solution(self, posterior: LatentPosterior) -> Tensor | None:
-        return posterior.solved.solution if isinstance(posterior, IterativePosterior) else None
 
 
 @dataclass(frozen=True)
@@ -212,9 +144,7 @@ class Inducing(Engine):
         return 8 * (3 * weights**2 + 20_000 * self.points + 12 * size.rows * size.latents * size.outputs)
 
     @override
-    def condition(
-        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
-    ) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
         return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=self.tolerance)
 
@@ -235,9 +165,7 @@ class InducingWeights(Engine):
         return 16 * sum(self.points) ** 2
 
     @override
-    def condition(
-        self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None, report: Iteration | None = None
-    ) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
         sizes = [count * z.shape[-1] for count, z in zip(self.points, terms.features, strict=True)]
         count = sum(self.points)
         if start is None or start.numel() != sum(sizes) + count + count**2:
@@ -255,7 +183,7 @@ class InducingWeights(Engine):
         return torch.cat([*(z.flatten() for z in space.points), space.mean, space.precision.lower.tril().flatten()])
 
 
-ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Iterative, Inducing, InducingWeights)}
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing, InducingWeights)}
 
 
 @dataclass(frozen=True)
@@ -283,6 +211,8 @@ def engine_from_dict(stored: object) -> Engine:
         return Exact()
     if not isinstance(stored, Mapping):
         raise InvalidInput(f"stored engine {stored!r} is not a name with settings; there are {', '.join(ENGINES)}")
+    if stored.get("name") == "iterative":  # of version 0.2: the mean was the exact one
+        return Exact()
     if stored.get("name") == "stochastic":  # of version 0.2: the posterior was that of its inducing points
         stored = {"name": "inducing", "points": stored.get("points", 200), "tolerance": 0.0}
     kind = ENGINES.get(str(stored.get("name")))
@@ -294,7 +224,7 @@ def engine_from_dict(stored: object) -> Engine:
 
 
 def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = True) -> Choice:
-    """By rows, features and memory; without `inducing`, no inducing points. Raises NotEnoughMemory where none fits."""
+    """By rows, features and memory; without `inducing`, no few points. Raises NotEnoughMemory where none fits."""
     exact, rows = Exact(), f"{size.rows} rows"
     needed, free = exact.required_bytes(size), free_memory(device)
     fits = needed <= USABLE * free
@@ -306,12 +236,9 @@ def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = T
         return Choice(Inducing(), f"inducing: {rows}, and the processes have {size.features} features at most")
     if fits and size.rows * size.rank <= MOST_EXACT_ENTRIES:
         return Choice(exact, f"exact: {rows} need {gib(needed)}, {gib(free)} are free")
-    if size.rows > MOST_ITERATIVE_ROWS:
-        reason = f"inducing: {rows} of {size.features} features, on which conjugate gradients would take hours"
-        return Choice(Inducing(), reason)
-    iterative = Iterative()
-    iterative.require_memory(size, device)
-    return Choice(iterative, f"iterative: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")
+    many = Inducing(points=MANY_POINTS)
+    many.require_memory(size, device)
+    return Choice(many, f"inducing: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")
 
 
 def _require_whole(engine: Engine, least: int, *names: str) -> None:

@@ -167,7 +167,7 @@ FitProgress = Callable[[int, int, float], None]
 """Called as progress(restart, iteration, objective), and with restart `ALL_ROWS` while an engine takes in all rows."""
 
 ALL_ROWS = -1
-"""Instead of a restart: the value is then the relative residual of conjugate gradients, or the bound on all rows."""
+"""Instead of a restart: the value is then the bound on all rows."""
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
 

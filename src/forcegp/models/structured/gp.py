@@ -99,7 +99,7 @@ class StructuredGP(StructuredModel):
         options: the search itself; None is `models.search.default_options`, which is content sooner beyond 400 points.
         start: unconstrained parameters at which the first search begins instead of moments, for example
             `posterior.parameters` of a fit to fewer points; those that are missing start from moments.
-        engine: how the posterior is computed from all points: "exact", "iterative", "inducing", or one of
+        engine: how the posterior is computed from all points: "exact", "inducing", or one of
             `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
             memory, with the reason in `settings["engine_reason"]`.
         learning_points: find the parameters on this many of the points, those that lie farthest apart; None means all

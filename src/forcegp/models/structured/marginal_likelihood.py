@@ -24,7 +24,6 @@ from forcegp.inference import (
     collapsed_bound,
     negative_log_likelihood,
 )
-from forcegp.inference.iterative import Iteration
 from forcegp.inference.linear_functionals import functional_negative_log_likelihood, weighted
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.models.identification.physical_parameters import COEFFICIENTS, INERTIALS, coefficients_of, inertials_of
@@ -245,10 +244,9 @@ class MarginalLikelihood:
         engine: Engine | None = None,
         *,
         start: Tensor | None = None,
-        report: Iteration | None = None,
         at_parameters: bool = False,
     ) -> LatentPosterior:
-        """The posterior of the latent functions at fixed parameters; `start` and `report` as for `Engine.condition`.
+        """The posterior of the latent functions at fixed parameters; `start` as for `Engine.condition`.
 
         Kernels that are `at_parameters` hold them already, and are not copied.
         """
@@ -257,7 +255,7 @@ class MarginalLikelihood:
             terms = self.terms(parameters)
             if self.training.weights is not None:
                 return FunctionalPosterior.condition(kernels, self.training.weights, terms)
-            return (engine or Exact()).condition(kernels, terms, start=start, report=report)
+            return (engine or Exact()).condition(kernels, terms, start=start)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ from forcegp.errors import InvalidInput, require_known, require_type, usable_arg
 from forcegp.inference import (
     Engine,
     InducingPosterior,
-    IterativePosterior,
     LatentKernels,
     LatentPosterior,
     LeaveOut,
@@ -397,16 +396,12 @@ class StructuredPosterior(Posterior):
     def negative_log_likelihood(self) -> float:
         """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior.
 
-        With inducing points its upper bound; with conjugate gradients, which do not compute it, that of the rows which
-        the hyper-parameters were found on (`training.reference`).
+        With inducing points its upper bound.
         """
         with torch.no_grad():
             if isinstance(self.latent, InducingPosterior):
                 return float(self.likelihood.bound(self.kernels, self.parameters, self.latent.features))
-            likelihood = self.likelihood
-            if isinstance(self.latent, IterativePosterior) and self.training.reference is not None:
-                likelihood = replace(likelihood, training=self.training.reference)
-            return float(likelihood(self.kernels, self.parameters))
+            return float(self.likelihood(self.kernels, self.parameters))
 
     @property
     @override

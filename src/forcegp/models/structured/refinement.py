@@ -25,8 +25,7 @@ from forcegp.inference import (
     choose_engine,
     minimize_objective,
 )
-from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS, MOST_ITERATIVE_ROWS
-from forcegp.inference.iterative import Iteration
+from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
 from forcegp.inference.linear_functionals import require_memory_for_functionals
 from forcegp.inference.memory import require_memory
 from forcegp.models.search import blas_threads
@@ -41,6 +40,9 @@ from forcegp.robots.arguments import whole_number
 
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
+
+Iteration = Callable[[int, float], None]
+"""Called as report(iteration, objective)."""
 
 
 def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
@@ -104,15 +106,13 @@ def on_all_rows(
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         return replace(fitted, settings=settings)
     with blas_threads(training.q.numel()):
-        latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine, report=report)
+        latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
         left_out = latent.left_out if isinstance(latent, InducingPosterior) else 0.0
         if engine is None and isinstance(choice.engine, Inducing) and left_out > choice.engine.tolerance:
-            few = size.rows <= MOST_ITERATIVE_ROWS  # for an engine without inducing points
-            choice = choose_engine(size, training.q.device, inducing=False) if few else choice
-            short = f"inducing points leave out {left_out:.2g} of the noise variance of a row"
+            choice = choose_engine(size, training.q.device, inducing=False)
+            short = f"fewer inducing points leave out {left_out:.2g} of the noise variance of a row"
             choice = Choice(choice.engine, f"{choice.reason}; {short}")
-            if few:
-                latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine, report=report)
+            latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
         return refined(posterior, hyperprior, report)
@@ -122,7 +122,9 @@ TOLERANCE = 1e-6
 """Fraction of the bound by which an iteration must lower it for the search to go on."""
 
 
-def refined(posterior: StructuredPosterior, hyperprior: bool, report: Iteration | None = None) -> StructuredPosterior:
+def refined(
+    posterior: StructuredPosterior, hyperprior: bool, report: Callable[[int, float], None] | None = None
+) -> StructuredPosterior:
     """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
 
     Where physical parameters were learned they and all others stay, for their standard errors belong together.
@@ -151,7 +153,7 @@ def _checked(posterior: StructuredPosterior) -> StructuredPosterior:
         warnings.warn(
             f"{latent.space.count} inducing points leave out {latent.left_out:.2g} of the noise variance of a row, so "
             "that the posterior is an approximation with wider intervals than the exact one; give more points, or take "
-            "`engine='exact'` or `engine='iterative'`",
+            "`engine='exact'`",
             NumericalWarning,
             stacklevel=4,
         )
