@@ -1,4 +1,4 @@
-"""The pictures of docs/control.md: `tracking` of one seed as errors over time, and as a film of the arm.
+"""The pictures of docs/control.md, of one seed each: `tracking` as errors over time and as a film of the arm, contacts.
 
 python -m benchmarks.control_pictures
 """
@@ -12,8 +12,10 @@ import torch
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
+from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
 from benchmarks.tracking import GAINS, RATE, controllers, excitation, followed, robot_of, rows_of, task_of
 from forcegp import MechanicalSystem, PDGravity, Robot
+from forcegp.evaluation import contacts_figure
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SERIES, SMALL, TRUTH, new_figure, quiet, save_figure
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "control"
@@ -89,9 +91,45 @@ def film(robot: Robot, done: dict[str, dict[str, np.ndarray]]) -> FuncAnimation:
     return FuncAnimation(figure, draw, frames=len(next(iter(drawn.values()))))
 
 
+def contacts() -> tuple[Figure, Figure]:
+    """Pushes of 5 N over 8 s, and what every monitor finds of 3 N at any rate of false alarms."""
+    found = recordings(SEED)
+    made = monitors(SEED, found["calibration"])
+    rows, monitor = slice(0, round(8.0 * RATE)), made["learned"]
+    some = {name: x[rows] for name, x in found["5 N"].items()}
+    state, time = monitor.run(*qvu(some)), np.arange(len(some["q"])) / RATE
+    pushes = [(start, start + LASTING) for start in np.arange(0.0, 8.0, EVERY)]
+    arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
+    one = contacts_figure(*arrays, pushes, monitor.robot.joint_names, "KUKA iiwa, pushed with 5 N at the elbow")
+    curves = new_figure(6.4, 3.6)
+    axes = curves.subplots()
+    period, window = round(EVERY * RATE), round(LASTING * RATE)
+    for color, (name, each) in zip((MEASUREMENT, SERIES[1], PREDICTION, TRUTH), made.items(), strict=False):
+        free = each.run(*qvu(found["free"])).distance.numpy()
+        pushed = each.run(*qvu(found["3 N"])).distance.numpy()
+        largest = pushed[: len(pushed) // period * period].reshape(-1, period)[:, : window + 1].max(axis=1)
+        blocks = free[: len(free) // RATE * RATE].reshape(-1, RATE).max(axis=1)  # of one second
+        limits = np.sort(np.concatenate([blocks, largest]))
+        rate = [3600.0 * (blocks > limit).mean() for limit in limits]
+        share = [(largest > limit).mean() for limit in limits]
+        style = "--" if name == "true model" else "-"
+        axes.plot(np.maximum(rate, 6.0), share, style, color=color, linewidth=1.6, label=name)
+    axes.set(xscale="log", xlim=(6.0, 3600.0), ylim=(0.0, 1.02))
+    quiet(
+        axes,
+        title="Pushes of 3 N at the elbow, half a second each",
+        x="false alarms per hour (6: none in 10 min)",
+        y="found",
+    )
+    curves.legend(fontsize=SMALL, frameon=False, loc="outside lower center", ncols=4)
+    return one, curves
+
+
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
+    for name, figure in zip(("monitor", "monitor-rates"), contacts(), strict=True):
+        save_figure(figure, FOLDER / f"{name}.png")
     arm, found = motions()
     save_figure(errors(found), FOLDER / "tracking.png")
     film(arm, found).save(FOLDER / "tracking.gif", PillowWriter(fps=FRAMES_PER_SECOND), dpi=80)
