@@ -46,7 +46,18 @@ PACKAGES = {
         "inference",
         "integration",
     },
-    "control": {"errors", "summary", "robots", "mechanics", "integration", "models"},
+    "control": {
+        "errors",
+        "summary",
+        "atomic_files",
+        "robots",
+        "mechanics",
+        "data",
+        "analytical",
+        "inference",
+        "integration",
+        "models",
+    },
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
 PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}

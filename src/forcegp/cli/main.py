@@ -20,6 +20,7 @@ from forcegp.cli.command import Command
 from forcegp.cli.compare import Compare
 from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
+from forcegp.cli.excite import Excite
 from forcegp.cli.export import Export
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
@@ -57,6 +58,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
+    "excite": (Excite, "the next motion to record: the one that teaches most"),
     "export": (Export, "write a fitted model as a C program"),
     "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
 }
