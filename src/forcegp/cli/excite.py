@@ -69,7 +69,7 @@ class Excite(RobotOptions):
         )
         with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
             chosen = forcegp.excitation(
-                forcegp.load_posterior(self.run_folder) if robot is None else robot,
+                robot or forcegp.load_posterior(str(self.run_folder)),
                 **{name: getattr(self, name) for name in ("seconds", "margin", "clearance", "seed")},
                 **{
                     "limits": limits,
@@ -87,7 +87,7 @@ class Excite(RobotOptions):
             table |= dict(zip(("spread of a,\nbefore", "\nafter"), chosen.spread, strict=True))
         rows = [
             [name, *(f"{x:.3g}" for x in each)]
-            for name, *each in zip(chosen.motions.robot.joint_names, *table.values(), strict=True)
+            for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
         ]
         terminal.show(columns(str(self.out), ["joint", *table], rows))
         spread = None if chosen.spread is None else chosen.spread.tolist()

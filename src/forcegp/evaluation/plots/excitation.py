@@ -10,7 +10,7 @@ from forcegp.evaluation.plots.friction_curves import curve_panels
 
 def excitation_figure(chosen: Excitation) -> Figure:
     """Velocity over position of every joint; below, where each has one friction curve, this before and after."""
-    robot, model, fastest = chosen.motions.robot, chosen.model, chosen.motions.limits["velocity"][1]
+    robot, model, fastest = chosen.robot, chosen.model, chosen.limits["velocity"][1]
     panels = [] if model is None else curve_panels(model)
     rows = 2 if len(panels) == robot.nv else 1
     figure = style.new_figure(max(2.2 * robot.nv, 6.0), 1.2 + 2.2 * rows)
@@ -37,5 +37,5 @@ def excitation_figure(chosen: Excitation) -> Figure:
         axes.set_ylim(-reach, reach)
         style.quiet(axes, x="velocity in rad/s (m/s)", y="" if j else "resisting torque in Nm (N)")
     style.legend_below(figure, *grid[:, 0])
-    style.heading(figure, f"The next {chosen.motions.seconds:g} s")
+    style.heading(figure, f"The next {chosen.seconds:g} s")
     return figure
