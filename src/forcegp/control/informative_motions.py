@@ -24,8 +24,9 @@ from forcegp.analytical.identifiability import base_parameters, torque_regressor
 from forcegp.atomic_files import atomic_file
 from forcegp.control.controller import per_joint
 from forcegp.data import Dataset
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
-from forcegp.errors import InvalidInput, require_known
+from forcegp.errors import InvalidInput, require_known, require_type
 from forcegp.inference.cholesky_update import with_only
 from forcegp.inference.posterior import exact
 from forcegp.integration.integrators import check_time_step
@@ -39,8 +40,8 @@ from forcegp.summary import Summary, rounded
 
 QUANTITIES = ("position", "velocity", "acceleration", "torque")
 SPANS, SAMPLES = 2.5, 20  # pieces of a spline per second, samples in each
-SHRINK, ROUNDS = 0.85, 40  # of a motion beyond its limits
-CANDIDATES, CHANGES = 100, 200  # random motions, and random changes to the best of them
+SHRINK, ROUNDS, EXACT = 0.85, 40, 1e-12  # of a motion beyond its limits; rounding
+LONGEST = 120.0  # s, for the memory of all samples
 STATES, MOST_ROWS = 150, 150  # where the spread is computed; those learned so far that take part in the search
 DRY = 0.05  # velocity in rad/s (m/s) within which the dry friction of a robot without learned forces turns
 Values = Float[np.ndarray, "n nv"]
@@ -200,16 +201,18 @@ class Excitation(Summary):
         torque, distances = np.zeros(self.robot.nv), np.zeros(0)
         for _ in range(ROUNDS):
             q, v, a = (sample @ points for sample in self._samples)
-            fast = np.maximum(self.used("velocity", v), self.used("acceleration", a)).clip(1.0)
+            fast = np.maximum(self.used("velocity", v), self.used("acceleration", a)).clip(1.0) * (1.0 + EXACT)
             points, q, v, a = points / fast, self.start + q / fast, v / fast, a / fast
-            motion = Motion(points, q, v, a, self.torques(q, v, a))
-            torque, distances = self.used("torque", motion.u), self.distances(q)
-            if (torque <= 1.0).all() and (distances >= self.clearance).all():
-                return motion
+            distances = self.distances(q)
+            if (distances >= self.clearance).all():
+                motion = Motion(points, q, v, a, self.torques(q, v, a))
+                torque = self.used("torque", motion.u)
+                if (torque <= 1.0).all():
+                    return motion
             points = SHRINK * points
         j = int(torque.argmax())
         what = f"joint {self.robot.joint_names[j]} needs {torque[j]:.3g} times its torque limit"
-        if torque[j] <= 1.0:
+        if (distances < self.clearance).any():
             j = int(distances.argmin())
             what = f"frame {self.surfaces[j].frame!r} is {distances[j]:.3g} m from its surface, not {self.clearance:g},"
         raise InvalidInput(f"{what} at the start, so no motion keeps its limits; start elsewhere, or change limits.")
@@ -238,11 +241,11 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], mar
     """
     for name in given:
         require_known("limit", name, "excitation", QUANTITIES)
-    stated = np.array([(x.lower, x.upper, x.velocity_limit, x.effort_limit) for x in robot.joints]).T
-    half = np.stack([(stated[1] - stated[0]) / 2.0, stated[2], np.full(robot.nv, np.inf), stated[3]])
-    middle, limits = np.where(np.isinf(half[0]), 0.0, stated[0] + half[0] - start), {}
-    for name, most in zip(QUANTITIES, margin * half, strict=True):
-        ends = np.outer((-1.0, 1.0), most) + (middle if name == "position" else 0.0)
+    joints = [(x.lower, x.upper, margin * x.velocity_limit, np.inf, margin * x.effort_limit) for x in robot.joints]
+    lower, upper, *most = np.array(joints).T
+    inset = 0.5 * (1.0 - margin) * np.nan_to_num(upper - lower, posinf=0.0)
+    stated, limits = [np.stack([lower + inset - start, upper - inset - start])], {}
+    for name, ends in zip(QUANTITIES, stated + [np.outer((-1.0, 1.0), x) for x in most], strict=True):
         asked = per_joint(f"limits[{name!r}]", given.get(name, np.inf), robot.nv).numpy()
         limits[name] = low, high = ends.clip(-asked, asked)
         wrong = (low > 0.0) | (high < 0.0) | (low == high) | (np.isinf(high) & (name == "velocity"))
@@ -269,6 +272,7 @@ def excitation(
     clearance: float = 0.05,
     task: Dataset | None = None,
     rows: int = 100,
+    motions: int = 300,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Excitation:
@@ -281,6 +285,7 @@ def excitation(
       s and Nm (m, N); those of the URDF count, too, `margin` times.
     * start: posture (nv,); None takes the mean of the training rows, or the middle of the joints' ranges.
     * surfaces: contacts whose points keep `clearance` m away; None takes the model's. No other collision is looked at.
+    * motions: how many to look at; the first third at random, the others as changes to the best so far.
 
     Raises InvalidInput for arguments that do not fit and, naming the joint, for limits that cannot be kept.
     """
@@ -289,34 +294,42 @@ def excitation(
     system = MechanicalSystem(model) if isinstance(model, Robot) else model
     system = system.system if isinstance(system, Posterior) else system
     robot, rng = system.robot, np.random.default_rng(whole_number("seed", seed, 0))
-    check_time_step(seconds)
+    for name, value, most in (("seconds", seconds, LONGEST), ("margin", margin, 1.0), ("clearance", clearance, 1e9)):
+        if not isinstance(value, int | float) or not 0.0 < value <= most:
+            raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
     if start is None:
         middles = [x.lower + (x.upper - x.lower) / 2.0 if x.upper - x.lower < np.inf else 0.0 for x in robot.joints]
         start = model.training.q.mean(0) if isinstance(model, Posterior) else middles
     start = finite_vector("start", start, robot.nv)
-    bounds, rows = motion_limits(robot, start, limits or {}, margin), whole_number("rows", rows, 1)
+    bounds = motion_limits(robot, start, require_type("limits", limits or {}, Mapping), margin)
+    rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1)
     learned = model if isinstance(model, StructuredPosterior) and model.latent_names else None
     teaches = BaseParameters(system, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
-    surfaces = system.contacts if surfaces is None else tuple(surfaces)
+    surfaces = (system if surfaces is None else system.with_contacts(surfaces)).contacts
     draft = Excitation(robot, start, bounds, seconds, teaches.torques, surfaces, clearance, Motion(*[start] * 5))
     best, least, size = draft.kept(0.0 * draft.random(rng)), np.inf, 0.3  # refuses the start
     if isinstance(teaches, LearnedForces) and task is not None:
+        require_rows("task", task, robot.joint_names, "the model", "")
         some = np.linspace(0, len(task) - 1, min(STATES, len(task))).astype(int)
         teaches.judged_at = task.q[some], task.v[some], task.u[some]
     elif isinstance(teaches, LearnedForces):
         q, v = (rng.uniform(low, high, (STATES, robot.nv)) for low, high in (bounds[x] for x in QUANTITIES[:2]))
         teaches.judged_at = start + q, v, teaches.torques(start + q, v, 0.0 * v)
-    for k in range(CANDIDATES + CHANGES):
-        points = draft.random(rng)
-        if k >= CANDIDATES:  # change some joints for some time
+    for k in range(motions):
+        points, changed = draft.random(rng), k >= max(1, motions // 3)
+        if changed:  # change some joints for some time
             middle, width = rng.uniform(0.0, len(points)), rng.uniform(1.0, len(points))
             near = np.exp(-((np.arange(len(points)) - middle) ** 2) / (2.0 * width**2))[:, None]
             points = best.points + size * near * (rng.random(robot.nv) < 0.5) * points
         motion = draft.kept(points)
         score = teaches.score(motion)
-        size *= 1.0 if k < CANDIDATES else 1.3 if score < least else 0.96
+        size *= (1.3 if score < least else 0.96) if changed else 1.0
         best, least = (motion, score) if score < least else (best, least)
-        progress(k + 1, CANDIDATES + CHANGES)
+        progress(k + 1, motions)
+    if not np.isfinite(least):
+        raise InvalidInput(
+            f"none of {motions} motions shows all base parameters; give more seconds, limits or motions."
+        )
     if isinstance(teaches, BaseParameters):
         Y = teaches.regressor(best)
         return replace(draft, motion=best, condition=float(np.linalg.cond(Y / np.linalg.norm(Y, axis=0))))

@@ -26,16 +26,13 @@ def excitation_figure(chosen: Excitation) -> Figure:
             continue
         axes, v = grid[1, j], np.linspace(-fastest[j], fastest[j], 301)
         for posterior, color, when in (
-            (model, style.MEASUREMENT, "before"),
+            (model, style.KNOWN_PHYSICS, "so far"),
             (chosen.expected, style.PREDICTION, "after"),
         ):
-            curve = posterior.curve(panels[j].latent, v)
-            half = style.QUANTILE * curve.std.numpy()
-            style.draw_band(axes, v, curve.mean.numpy(), half, color=color, alpha=0.4, label=f"95 % {when}")
-        style.draw_line(axes, v, curve.mean, style.TRUTH, 1.0, "mean so far")
-        reach = 2.0 * np.abs(curve.mean.numpy()).max()
-        axes.set_ylim(-reach, reach)
-        style.quiet(axes, x="velocity in rad/s (m/s)", y="" if j else "resisting torque in Nm (N)")
+            std = posterior.curve(panels[j].latent, v).std
+            style.draw_line(axes, v, std, color, 1.2, f"standard deviation {when}")
+        axes.set_yscale("log")
+        style.quiet(axes, x="velocity in rad/s (m/s)", y="" if j else "of friction in Nm (N)")
     style.legend_below(figure, *grid[:, 0])
     style.heading(figure, f"The next {chosen.seconds:g} s")
     return figure
