@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ import forcegp.evaluation
 from forcegp.cli.command import DATASET, MODEL, Debug, Json, numbers_of, require_free_file, unless_given
 from forcegp.cli.input_options import RobotOptions
 from forcegp.cli.learning_options import parse_contacts
-from forcegp.cli.terminal import Terminal, columns
+from forcegp.cli.terminal import Terminal, columns, number
 from forcegp.errors import InvalidInput
 
 
@@ -45,8 +46,10 @@ class Excite(RobotOptions):
     """How far these points stay away."""
     task: Annotated[Path | None, DATASET, unless_given("DATA", "all within the limits", Path)] = None
     """A log with the states at which forces shall be sure (HDF5)."""
+    motions: Annotated[int, arg(metavar="N")] = 300
+    """How many motions to look at."""
     seed: Annotated[int, arg(metavar="K")] = 0
-    """Draws the motions to choose from."""
+    """Draws them."""
     overwrite: bool = False
     """Replace the files if forcegp wrote them."""
     json: Json = False
@@ -56,40 +59,42 @@ class Excite(RobotOptions):
         """Choose, write, draw and show."""
         picture = self.out.with_suffix(".png")
         for path, begin in ((self.out, b"t,q_"), (picture, b"\x89PNG")):
-            own = lambda x, begin=begin: x.read_bytes().startswith(begin)  # noqa: E731
+            own = partial(_begins, begin)
             require_free_file(path, overwrite=self.overwrite, own=own, what="what forcegp writes there")
         robot, limits = self.chosen_robot(), {}
         if (robot is None) == (self.run_folder is None):
-            raise InvalidInput("give either the folder of a fitted model, or --robot ARM.urdf.")
-        for name, _, values in (word.partition("=") for word in self.limits):
-            numbers = numbers_of(values, f"--limits {name}={values}: give numbers, for example --limits velocity=1.5.")
+            raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
+        for word in self.limits:
+            name, _, values = word.partition("=")
+            numbers = numbers_of(values, f"--limits {word}: give numbers, for example --limits velocity=1.5.")
             limits[name] = numbers[0] if len(numbers) == 1 else numbers
-        start = (
-            None if self.start is None else numbers_of(self.start, f"--start {self.start}: give one number per joint.")
-        )
+        complaint = f"--start {self.start}: give one number per joint, with commas."
+        given = {name: getattr(self, name) for name in ("seconds", "margin", "clearance", "motions", "seed")}
         with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
             chosen = forcegp.excitation(
                 robot or forcegp.load_posterior(str(self.run_folder)),
-                **{name: getattr(self, name) for name in ("seconds", "margin", "clearance", "seed")},
-                **{
-                    "limits": limits,
-                    "start": start,
-                    "surfaces": parse_contacts(self.surface) if self.surface else None,
-                },
+                **given,
+                limits=limits,
+                start=None if self.start is None else numbers_of(self.start, complaint),
+                surfaces=parse_contacts(self.surface) if self.surface else None,
                 task=None if self.task is None else forcegp.Dataset.load(self.task),
                 progress=report,
             )
         chosen.save_csv(self.out)
         forcegp.evaluation.save_figure(forcegp.evaluation.excitation_figure(chosen), picture)
         terminal.note(f"figure: {picture}")
-        table = {f"{name}\nover limit": values for name, values in chosen.usage.items()}
-        if chosen.spread is not None:
-            table |= dict(zip(("spread of a,\nbefore", "\nafter"), chosen.spread, strict=True))
+        table = {f"{name}\nover limit": values.tolist() for name, values in chosen.usage.items()}
+        spread = None if chosen.spread is None else chosen.spread.tolist()
+        if spread is not None:
+            table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
         rows = [
-            [name, *(f"{x:.3g}" for x in each)]
-            for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
+            [name, *map(number, each)] for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
         ]
         terminal.show(columns(str(self.out), ["joint", *table], rows))
-        spread = None if chosen.spread is None else chosen.spread.tolist()
-        used = {name: values.tolist() for name, values in chosen.usage.items()}
-        return {"out": str(self.out), "used": used, "spread": spread, "condition": chosen.condition}
+        usage = {name: values.tolist() for name, values in chosen.usage.items()}
+        return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}
+
+
+def _begins(text: bytes, path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(text)) == text
