@@ -16,6 +16,7 @@ TITLES = {
     "mujoco_forces": "Learned forces in MuJoCo",
     "swing_up": "A swing-up by path integral control",
     "planned_swing_up": "A swing-up planned by IPOPT",
+    "excitation": "A motion chosen to learn from",
     "searches": "Searches for hyper-parameters",
     "large_data": "Many rows",
     "scaling": "Cost against the number of rows",
@@ -212,6 +213,20 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "planned_swing_up_laws_rad": ("", "the same: Coulomb's and viscous friction of the same rows [rad]"),
         "planned_swing_up_urdf_rad": ("", "the same: URDF [rad]"),
         "planned_swing_up_true_rad": ("", "the same: true model [rad]"),
+    },
+    "excitation": {
+        "excitation_over_random_series": (
+            "<= 0.5",
+            "error along a task after 10 s of the chosen motion / of random Fourier series (median)",
+        ),
+        "excitation_over_random_splines": ("", "the same: / of random splines, each joint scaled to its own limits"),
+        "excitation_without_task_over_random_series": (
+            "",
+            "the same, chosen without a log of the task / random series",
+        ),
+        "excitation_rank_correlation": ("", "predicted spread and error afterwards over 30 motions: rank correlation"),
+        "excitation_limits_used": ("<= 1", "largest position, velocity, acceleration or torque over its limit"),
+        "excitation_cpu_seconds": ("<= 60", "CPU time of choosing, 7 joints and 10 s, slowest seed [s]"),
     },
     "searches": {
         "search_evaluations_n100": (

@@ -46,7 +46,19 @@ PACKAGES = {
         "inference",
         "integration",
     },
-    "control": {"errors", "summary", "robots", "mechanics", "analytical", "integration", "models"},
+    "control": {
+        "errors",
+        "summary",
+        "atomic_files",
+        "codegen",
+        "robots",
+        "mechanics",
+        "data",
+        "analytical",
+        "inference",
+        "integration",
+        "models",
+    },
     "simulation": {"errors", "robots", "mechanics", "data"},
 }
 PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}

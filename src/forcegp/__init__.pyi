@@ -61,6 +61,8 @@ from .control import PDGravity as PDGravity
 from .control import ContactMonitor as ContactMonitor
 from .control import HybridForce as HybridForce
 from .control import MPPI as MPPI
+from .control import excitation as excitation
+from .control import Excitation as Excitation
 
 # the same without Gaussian processes
 from .analytical import identify_analytical as identify_analytical

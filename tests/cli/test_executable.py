@@ -47,6 +47,10 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
         "results/report.md",
     ),
     "rollout": (("run", "test.h5", "--starts", 1, "--seconds", 0.05, "--out", "motion"), "motion/rollout.h5"),
+    "excite": (
+        ("run", "--seconds", 1, "--motions", 2, "--clearance", 0.001, "--surface", "none", "--out", "next.csv"),
+        "next.png",
+    ),
     "export": (("run", "--to", "c", "--out", "deployed"), "deployed/self_test.c"),
     "reproduce": (("fig3", "--preset", "smoke", "--points", 10, "--jobs", 1, "--out", "paper"), "paper/fig3.md"),
 }

@@ -22,6 +22,7 @@ FILES = {
     "simulate": "simulate kuka-surface --overwrite --out OUT",
     "import": f"{IMPORT} --overwrite --out OUT",
     "mapping": f"{IMPORT} --overwrite --out x.h5 --write-mapping OUT",
+    "excite": "excite run --overwrite --out OUT",
     "prepare": "prepare arm.h5 --every 2 --overwrite --out OUT",
 }
 FOLDERS = {

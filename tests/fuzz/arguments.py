@@ -352,6 +352,22 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "on_failure": "raise",
         },
     ),
+    "excitation": (
+        forcegp.excitation,
+        lambda: {
+            "model": INPUTS.posterior.with_contacts(()),
+            "seconds": 1.0,
+            "limits": {"velocity": 1.0},
+            "margin": 0.9,
+            "start": None,
+            "surfaces": None,
+            "clearance": 0.05,
+            "task": None,
+            "rows": 5,
+            "motions": 2,
+            "seed": 0,
+        },
+    ),
     "evaluate": (forcegp.evaluate, lambda: {"posterior": INPUTS.posterior, "dataset": INPUTS.data}),
     "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "system": None, "preparation": None}),
     "identify_analytical": (

@@ -40,6 +40,7 @@ VALID = {
     "rollout": ("rollout", "carried", "train.h5", "--starts", "1", "--seconds", "0.02", "--out", "out"),
     "monitor": ("monitor", "carried", "train.h5", "--free-seconds", "0.1", "--out", "out"),
     "export": ("export", "carried", "--to", "c", "--unchecked", "--out", "out"),
+    "excite": ("excite", "carried", "--motions", "2", "--seconds", "1", "--out", "out.csv"),
     "validate": ("validate", "test.h5", "--models", "none-such", "--out", "out"),
     "simulate": ("simulate", "none-such", "--out", "out.h5"),
     "demo": ("demo", "--seconds", "0"),

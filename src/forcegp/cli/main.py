@@ -20,6 +20,7 @@ from forcegp.cli.command import Command
 from forcegp.cli.compare import Compare
 from forcegp.cli.demo import Demo
 from forcegp.cli.evaluate import Evaluate
+from forcegp.cli.excite import Excite
 from forcegp.cli.export import Export
 from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
@@ -59,6 +60,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
     "monitor": (Monitor, "when a robot was touched, where and how hard, from a log without force sensor"),
+    "excite": (Excite, "the next motion to record: the one that teaches most"),
     "export": (Export, "write a fitted model as a C program"),
     "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
 }

@@ -7,6 +7,7 @@ from .force_errors import (
     ForceScore as ForceScore, ForceScores as ForceScores, curve_coverage as curve_coverage, force_scores as
     force_scores,
 )
+from .plots.excitation import excitation_figure as excitation_figure
 from .plots.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
 from .plots.log import check_figure as check_figure, preparation_figure as preparation_figure
 from .plots.prediction import (

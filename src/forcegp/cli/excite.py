@@ -1,0 +1,100 @@
+"""`forcegp excite`: choose the next motion of a robot, the one that teaches most."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+import forcegp
+import forcegp.evaluation
+from forcegp.cli.command import DATASET, MODEL, Debug, Json, numbers_of, require_free_file, unless_given
+from forcegp.cli.input_options import RobotOptions
+from forcegp.cli.learning_options import parse_contacts
+from forcegp.cli.terminal import Terminal, columns, number
+from forcegp.errors import InvalidInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excite(RobotOptions):
+    """Choose a motion within limits, from rest to rest, after which learned forces are surest.
+
+    With --robot instead of a model, one that identifies base parameters and friction. For instance:
+      forcegp excite run --limits velocity=1.5 --limits acceleration=6 --out next.csv
+      forcegp excite --robot arm.urdf --limits velocity=1,1,2 --seconds 20 --out next.csv
+    """
+
+    run_folder: Annotated[Positional[Path | None], MODEL, arg(metavar="[RUN]")] = None
+    """The folder that `forcegp fit --out` wrote."""
+    out: Annotated[Path, arg(metavar="FILE.csv")]
+    """t, q, v, a and u to write, 100 rows per second, as `forcegp import` reads them; and a picture, FILE.png."""
+    seconds: Annotated[float, arg(metavar="S")] = 10.0
+    """How long the motion lasts."""
+    limits: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="WHAT=X[,X...]", help_behavior_hint="")] = ()
+    """Largest position (from the start), velocity, acceleration or torque, for all joints or for each (repeatable)."""
+    margin: Annotated[float, arg(metavar="PART")] = 0.9
+    """The part of the URDF's own limits that may be used."""
+    start: Annotated[str | None, unless_given("Q,Q...", "mean of the log, or middle of the ranges", str)] = None
+    """Posture at both ends."""
+    surface: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="FRAME:SURFACE", help_behavior_hint="")] = ()
+    """What points of the robot shall not touch, as in `forcegp fit --contact` (repeatable; default: its contacts)."""
+    clearance: Annotated[float, arg(metavar="M")] = 0.05
+    """How far these points stay away."""
+    task: Annotated[Path | None, DATASET, unless_given("DATA", "all within the limits", Path)] = None
+    """A log with the states at which forces shall be sure (HDF5)."""
+    motions: Annotated[int, arg(metavar="N")] = 300
+    """How many motions to look at."""
+    seed: Annotated[int, arg(metavar="K")] = 0
+    """Draws them."""
+    overwrite: bool = False
+    """Replace the files if forcegp wrote them."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Choose, write, draw and show."""
+        picture = self.out.with_suffix(".png")
+        for path, begin in ((self.out, b"t,q_"), (picture, b"\x89PNG")):
+            own = partial(_begins, begin)
+            require_free_file(path, overwrite=self.overwrite, own=own, what="what forcegp writes there")
+        robot, limits = self.chosen_robot(), {}
+        if (robot is None) == (self.run_folder is None):
+            raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
+        for word in self.limits:
+            name, _, values = word.partition("=")
+            numbers = numbers_of(values, f"--limits {word}: give numbers, for example --limits velocity=1.5.")
+            limits[name] = numbers[0] if len(numbers) == 1 else numbers
+        complaint = f"--start {self.start}: give one number per joint, with commas."
+        given = {name: getattr(self, name) for name in ("seconds", "margin", "clearance", "motions", "seed")}
+        with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
+            chosen = forcegp.excitation(
+                robot or forcegp.load_posterior(str(self.run_folder)),
+                **given,
+                limits=limits,
+                start=None if self.start is None else numbers_of(self.start, complaint),
+                surfaces=parse_contacts(self.surface) if self.surface else None,
+                task=None if self.task is None else forcegp.Dataset.load(self.task),
+                progress=report,
+            )
+        chosen.save_csv(self.out)
+        forcegp.evaluation.save_figure(forcegp.evaluation.excitation_figure(chosen), picture)
+        terminal.note(f"figure: {picture}")
+        table = {f"{name}\nover limit": values.tolist() for name, values in chosen.usage.items()}
+        spread = None if chosen.spread is None else chosen.spread.tolist()
+        if spread is not None:
+            table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
+        rows = [
+            [name, *map(number, each)] for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
+        ]
+        terminal.show(columns(str(self.out), ["joint", *table], rows))
+        usage = {name: values.tolist() for name, values in chosen.usage.items()}
+        return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}
+
+
+def _begins(text: bytes, path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(text)) == text

@@ -1,0 +1,88 @@
+"""`forcegp excite` from end to end, and whatever can be asked wrongly."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.models.arm import URDF, arm_data, arm_system
+
+from forcegp import Dataset
+
+QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1, "--no-checks")
+FEW = ("--seconds", 2, "--motions", 3, "--limits", "velocity=1.5", "--limits", "acceleration=9,9,8")
+
+
+@pytest.fixture(scope="module")
+def folder(forcegp, tmp_path_factory):
+    """A robot, a log, and a model of friction."""
+    place = tmp_path_factory.mktemp("excite")
+    (place / "arm.urdf").write_text(URDF)
+    arm_data(40, 0, arm_system(0)).save(place / "arm.h5")
+    done = forcegp("fit", "arm.h5", "--prior", "joint-friction", *QUICK, "--out", "run", folder=place)
+    assert done.returncode == 0, done.stderr
+    return place
+
+
+def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
+    words = ("excite", "run", *FEW, "--task", "arm.h5", "--out", "next.csv")
+    done = forcegp(*words, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert max(max(each) for each in found["usage"].values()) <= 1.0
+    assert (np.array(found["spread"][1]) < found["spread"][0]).all()
+    assert (folder / "next.png").read_bytes().startswith(b"\x89PNG")
+    names = ("--time", "t", *(x for what in "qvu" for x in (f"--{what}", f"{what}_{{joints}}")))
+    done = forcegp(
+        "import",
+        "next.csv",
+        *names,
+        "--joints",
+        "pan,lift,bend",
+        "--robot",
+        "arm.urdf",
+        "--out",
+        "next.h5",
+        folder=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    data = Dataset.load(folder / "next.h5")
+    assert len(data) >= 199
+    assert np.abs(data.v).max() <= 1.5
+
+    again = forcegp(*words, folder=folder)
+    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
+    assert "add --overwrite" in again.stderr
+    shown = forcegp(*words, "--overwrite", folder=folder)
+    assert shown.returncode == 0, shown.stderr
+    assert "spread of a" in shown.stdout
+
+
+def test_a_robot_without_a_model(forcegp, folder):
+    words = ("excite", "--robot", "arm.urdf", *FEW, "--start", "0,0.5,0.5", "--surface", "hand:plane:0,0,1,-9")
+    done = forcegp(*words, "--out", "bare.csv", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["spread"] is None
+    assert found["condition"] > 1.0
+    first, last = np.genfromtxt(folder / "bare.csv", delimiter=",", skip_header=1)[[0, -1]]
+    np.testing.assert_allclose([first[1:7], last[1:7]], [[0.0, 0.5, 0.5, 0.0, 0.0, 0.0]] * 2, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "either the folder of a fitted model or --robot"),
+        (("run", "--robot", "arm.urdf"), "either the folder of a fitted model or --robot"),
+        (("run", "--limits", "velocity=fast"), "--limits velocity=fast: give numbers"),
+        (("run", "--limits", "jerk=1"), "jerk"),
+        (("run", "--limits", "velocity=0"), "joint pan: no motion"),
+        (("run", "--start", "a,b"), "--start a,b: give one number per joint"),
+        (("run", "--surface", "hand@0,0,0.2:plane:0,0,1,0", "--clearance", "5"), "not 5, at the start"),
+    ],
+)
+def test_what_is_refused(forcegp, folder, words, message):
+    done = forcegp("excite", *words, "--seconds", 1, "--motions", 1, "--out", "never.csv", folder=folder)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(folder.glob("never*"))

@@ -1,0 +1,211 @@
+"""Chosen motions: limits at every time, against Pinocchio; what they teach, against real updates; what is refused."""
+
+import warnings
+
+import numpy as np
+import pinocchio
+import pytest
+import scipy.linalg
+from tests.models.arm import URDF, arm_data, arm_system
+
+from forcegp import Contact, Dataset, MechanicalSystem, NoForces, Plane, Robot, StructuredGP, excitation
+from forcegp.control.informative_motions import far_apart
+from forcegp.errors import InvalidInput
+from forcegp.evaluation import excitation_figure
+from forcegp.inference import OptimizerOptions
+from forcegp.priors import JointFriction
+
+FREE = arm_system(0)
+START = [0.3, 0.8, -0.6]
+FEW = {"motions": 9, "start": START, "seconds": 4.0}
+LIMITS = {"position": [0.5, 1.0, 0.7], "velocity": [1.0, 2.0, 1.5], "acceleration": 8.0, "torque": [50.0, 11.0, 3.0]}
+
+
+def fitted(prior, system=FREE, rows=12):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return StructuredGP(system, prior).fit(
+            arm_data(rows, 1, system), restarts=1, options=OptimizerOptions(iterations=8)
+        )
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    """Friction of three joints from 12 rows."""
+    return fitted(JointFriction())
+
+
+@pytest.fixture(scope="module")
+def chosen(posterior):
+    return excitation(posterior, **FEW, limits={"velocity": 2.0, "acceleration": 10.0}, rows=20)
+
+
+def rnea(q, v, a):
+    model = pinocchio.buildModelFromXML(URDF)
+    data = model.createData()
+    return np.array([pinocchio.rnea(model, data, *x) for x in zip(q, v, a, strict=True)])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_limits_hold_at_every_time(seed):
+    found = excitation(FREE.robot, **FEW, limits=LIMITS, seed=seed)
+    q, v, a = found.trajectory(np.linspace(-0.1, 4.1, 4201))
+    for values, name in ((q - START, "position"), (v, "velocity"), (a, "acceleration"), (rnea(q, v, a), "torque")):
+        assert (np.abs(values) <= np.array(LIMITS[name])).all(), name
+    assert found.usage["velocity"].max() > 0.5
+    assert max(x.max() for x in found.usage.values()) <= 1.0
+    for at in (0.0, 4.0):  # rest
+        np.testing.assert_allclose(np.stack(found.trajectory(at)), [START, [0.0] * 3, [0.0] * 3], atol=1e-12)
+    np.testing.assert_allclose(np.gradient(q, 0.001, axis=0), v, atol=5e-3)
+    np.testing.assert_allclose(np.gradient(v, 0.001, axis=0)[105:-105], a[105:-105], atol=5e-2)
+
+
+def test_a_bare_robot_moves_so_that_its_parameters_show():
+    """The determinant of independent columns of Pinocchio's regressor and friction grows with the motions looked at."""
+    model = pinocchio.buildModelFromXML(URDF)
+    data, rng = model.createData(), np.random.default_rng(0)
+
+    def regressor(q, v, a):
+        Y = [pinocchio.computeJointTorqueRegressor(model, data, *x).copy() for x in zip(q, v, a, strict=True)]
+        return np.concatenate(Y)
+
+    _, R, order = scipy.linalg.qr(regressor(*rng.normal(0.0, 2.0, (3, 100, 3))), mode="economic", pivoting=True)
+    columns = order[: int((np.abs(R.diagonal()) > 1e-9 * abs(R[0, 0])).sum())]
+
+    def determinant(motions):
+        found = excitation(FREE.robot, **FEW | {"motions": motions}, limits={"velocity": 2.0, "acceleration": 10.0})
+        q, v, a = found.trajectory(np.linspace(0.0, 4.0, 201))
+        friction = [np.concatenate([np.diag(f(x)) for x in v]) for f in (np.array, lambda x: np.tanh(x / 0.05))]
+        Y = np.hstack([regressor(q, v, a)[:, columns], *friction])
+        return np.linalg.slogdet(Y.T @ Y)[1], found.condition
+
+    (least, _), (more, condition) = determinant(1), determinant(30)
+    assert more > least + 3.0
+    assert 1.0 < condition < 1e3
+
+
+def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior, chosen):
+    motion = chosen.motion
+    some = far_apart(motion.q, motion.v, motion.u, 20)
+    a = np.random.default_rng(0).normal(0.0, 5.0, (20, 3))
+    rows = Dataset(q=motion.q[some], v=motion.v[some], u=motion.u[some], a=a, time=np.arange(20) * 0.1, system=FREE)
+    measured = posterior.update(rows)
+    at = arm_data(30, 5, FREE)
+    after, before = (x.predict(at.q, at.v, at.u) for x in (chosen.expected, posterior))
+    expected = measured.predict(at.q, at.v, at.u)
+    np.testing.assert_allclose(after.covariance, expected.covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(after.mean, before.mean, rtol=1e-6, atol=1e-7)
+    assert (chosen.spread[1] < chosen.spread[0]).all()
+
+
+def test_more_motions_looked_at_leave_less_open_and_a_task_decides_where(posterior):
+    how = {**FEW, "limits": {"velocity": 2.0, "acceleration": 10.0}, "rows": 20}
+    task = arm_data(40, 3, FREE)
+    open_after = [np.linalg.norm(excitation(posterior, **how | {"motions": k}, task=task).spread[1]) for k in (1, 40)]
+    assert open_after[1] < 0.95 * open_after[0]
+    said = []
+    again = [excitation(posterior, **how, seed=3, progress=lambda *x: said.append(x)).motion.points for _ in range(2)]
+    assert np.array_equal(*again)
+    assert said[:9] == [(k + 1, 9) for k in range(9)]
+
+
+def test_torques_are_those_of_the_learned_friction(posterior, chosen):
+    motion = chosen.motion
+    v = motion.v[::20]
+    friction = posterior.components(motion.q[::20], v, motion.u[::20]).total.mean.numpy()
+    np.testing.assert_allclose(motion.u[::20], rnea(motion.q[::20], v, motion.a[::20]) - friction, atol=1e-6)
+
+
+def height(found):
+    """Of the point of the tool above z = 0, at many times."""
+    q = found.trajectory(np.linspace(0.0, found.seconds, 2001))[0]
+    model = pinocchio.buildModelFromXML(URDF)
+    data, frame, heights = model.createData(), model.getFrameId("hand"), []
+    for x in q:
+        pinocchio.framesForwardKinematics(model, data, x)
+        heights.append(data.oMf[frame].act(np.array([0.0, 0.0, 0.2]))[2])
+    return np.array(heights)
+
+
+def test_a_point_stays_away_from_surfaces():
+    low = height(excitation(FREE, **FEW)).min()
+    floor = Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), low + 0.1))
+    for model, surfaces in ((FREE, [floor]), (FREE.with_contacts([floor]), None)):
+        found = excitation(model, **FEW, surfaces=surfaces, clearance=0.05)
+        assert height(found).min() >= low + 0.15
+    with pytest.raises(InvalidInput, match=r"frame 'hand' is .* m from its surface, not 2, at the start"):
+        excitation(FREE, **FEW, surfaces=[floor], clearance=2.0)
+
+
+def test_a_model_in_contact_learns_what_moves_freely():
+    found = excitation(fitted(JointFriction(), arm_system()), **FEW | {"motions": 3}, surfaces=[], rows=10)
+    assert (found.spread[1] < found.spread[0]).all()
+
+
+def test_models_without_learned_forces_move_for_parameters():
+    found = excitation(fitted(NoForces()), **FEW | {"motions": 3})
+    assert found.spread is None
+    assert found.expected is None
+    assert found.condition > 1.0
+
+
+def test_the_file_has_the_motion(chosen, tmp_path):
+    chosen.save_csv(tmp_path / "next.csv", rate=50.0)
+    header, *rows = (tmp_path / "next.csv").read_text().splitlines()
+    names = header.split(",")
+    assert names == ["t", *(f"{x}_{joint}" for x in "qvau" for joint in ("pan", "lift", "bend"))]
+    table = np.array([row.split(",") for row in rows], float)
+    assert table.shape == (201, 13)
+    np.testing.assert_allclose(table[:, 1:10], np.hstack(chosen.trajectory(table[:, 0])), atol=1e-7)
+    assert "condition" in repr(chosen)
+
+
+def test_the_picture_has_a_panel_per_joint_and_per_curve(chosen):
+    panels = excitation_figure(chosen).axes
+    assert len(panels) == 6
+    before, after = (line.get_ydata() for line in panels[3].lines)
+    assert (after <= before * (1.0 + 1e-9)).all()
+    assert len(excitation_figure(excitation(FREE, **FEW)).axes) == 3
+
+
+ENDLESS = Robot.from_urdf_text(URDF.replace('type="revolute"', 'type="continuous"').replace('lower="-3" upper="3"', ""))
+
+
+def test_joints_without_ends_move_within_their_velocities():
+    found = excitation(ENDLESS, **FEW)
+    assert 0.1 < np.abs(found.motion.q - START).max() <= 4.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start": [0.0, 3.5, 0.0]}, r"joint lift: no motion from 3.5 .* position limits of -6.2 and -0.8 from there"),
+        ({"limits": {"velocity": [1.0, 0.0, 1.0]}}, "joint lift: no motion from 0.8 .* velocity limits of 0 and 0"),
+        ({"limits": {"acceleration": 0.0}}, "joint pan: no motion .* acceleration"),
+        ({"limits": {"torque": [50.0, 1.0, 50.0]}}, r"joint lift needs .* times its torque limit at the start"),
+        ({"limits": {"jerk": 1.0}}, "jerk"),
+        ({"limits": {"velocity": [1.0, 2.0]}}, "velocity"),
+        ({"limits": 3.0}, "limits"),
+        ({"seconds": 0.0}, "seconds"),
+        ({"seconds": 1e9}, "at most 120"),
+        ({"margin": 1.5}, "margin"),
+        ({"clearance": np.nan}, "clearance"),
+        ({"rows": 0}, "rows"),
+        ({"motions": 0}, "motions"),
+        ({"seed": -1}, "seed"),
+        ({"start": [0.0]}, "start"),
+        ({"surfaces": [3]}, "contacts"),
+        ({"task": 3}, "task"),
+    ],
+)
+def test_what_cannot_be_is_refused(posterior, changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        excitation(posterior, **FEW | changes)
+
+
+def test_only_robots_and_models_move():
+    with pytest.raises(InvalidInput, match=r"model is a int"):
+        excitation(3)
+    endless = MechanicalSystem(Robot.from_urdf_text(URDF.replace('velocity="5"', "")))
+    with pytest.raises(InvalidInput, match=r"joint pan: no motion .* velocity limits of -inf and inf"):
+        excitation(endless)
