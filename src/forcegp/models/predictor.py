@@ -7,14 +7,15 @@ uses few combinations of the data (`inference.prepared_kernels`). `structured.pr
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
+from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, hold_tables, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
@@ -111,6 +112,27 @@ class Predictor(Summary):
         """What it predicts, and how long preparing took."""
         covariance = {"joints": self.nv, "covariance": self.kind, "device": self.device}
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
+
+    def refreshed(self, posterior: Any) -> "Predictor":
+        """The predictor of `posterior.update(...)` in milliseconds: other tables, the same programs; this one stays.
+
+        Neither traced nor compiled, but for the first time after its programs were found on disk. Raises InvalidInput
+        for posteriors that were not updated from this one, compressed covariances, and kernels whose numbers stand in
+        the programs: then make another by `posterior.predictor()`.
+        """
+        latent, own = getattr(posterior, "latent", None), self.posterior
+        if latent is None or latent.kernels is not self.latent.kernels or posterior.system is not own.system:
+            raise InvalidInput("refreshed needs what posterior.update(...) gave of the predictor's own posterior.")
+        if self.compressed is not None:
+            raise InvalidInput("a compressed covariance is not refreshed; give covariance='none' or 'exact'.")
+        code = self.code and self.code.refreshed(latent)
+        given = {"latent": latent, "prepared": PreparedKernels.of(latent), "code": code, "posterior": posterior}
+        functions, loops = dict(self._functions), {how: x for how, x in self._loops.items() if not how[1]}
+        if code:
+            tables = code.traced.tables
+            functions = {kind: x and hold_tables(copy(x), tables) for kind, x in functions.items()}
+            loops = {how: x and [hold_tables(copy(loop), tables) for loop in x] for how, x in loops.items()}
+        return replace(self, **given, _functions=functions, _failed=list(self._failed), _loops=loops)
 
     @property
     def rank(self) -> int | None:

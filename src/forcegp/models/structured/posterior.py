@@ -24,6 +24,7 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
+from forcegp.inference.engines import InducingWeights
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
@@ -42,7 +43,7 @@ from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, St
 from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
-from forcegp.models.structured.update import Keep, learn_more_rows
+from forcegp.models.structured.update import Keep, horizons_of, learn_and_forget, learn_more_rows, require_fitting
 from forcegp.models.training_data import ACCELERATION, FORCE, Noise, TrainingData, second_moments, shrunk
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots.arguments import real_tensor
@@ -261,19 +262,47 @@ class StructuredPosterior(Posterior):
         return replace(super().to(device), identification=self.identification)
 
     @override
-    def update(self, rows: Dataset, budget: int | None = None, *, keep: Keep = rows_to_keep) -> "StructuredPosterior":
-        """As `Posterior.update`; `keep` chooses the rows that stay."""
+    def update(
+        self,
+        rows: Dataset,
+        budget: int | None = None,
+        *,
+        keep: Keep = rows_to_keep,
+        horizon: float | Mapping[str, float] | None = None,
+    ) -> "StructuredPosterior":
+        """As `Posterior.update`; `keep` chooses the rows that stay.
+
+        With a `horizon` in s, forces change with time: their kernels become k(z, z') exp(-|t - t'| / horizon), one
+        horizon for all or {term: its own}, and the posterior is that at the time of the last row. It has inducing
+        points, so that a call takes as long however many rows came before; its rows count as simultaneous, those of the
+        fit as measured when the first of them was (docs/incremental.md). Raises InvalidInput where time goes back.
+        """
         if self.target is not None:
             raise InvalidInput(
                 "the posterior was carried to another system than the one that its rows were measured on; update it "
                 "before it is carried there: posterior.update(rows).with_system(system)."
             )
+        require_fitting(rows, self.likelihood)
+        added = self.settings.get("rows_added", 0) + len(rows)
+        if horizon is not None:
+            horizons = horizons_of(horizon, self.model.prior, self.model.system.robot)
+            until = float(rows.time.max())
+            seconds = until - self.settings.get("learned_until", float(rows.time.min()))
+            if budget is not None or seconds < 0.0:
+                raise InvalidInput(
+                    f"budget is {budget} and the last of these rows comes {seconds:.4g} s after those learned before; "
+                    "with a horizon give no budget, and rows in the order of time."
+                )
+            known = self.likelihood, self.parameters, self.latent, self.model.noise
+            latent = learn_and_forget(*known, rows, horizons, seconds)
+            engine = InducingWeights(tuple(len(z) for z in latent.features))
+            told = {"engine": engine.to_dict(), "rows_added": added, "learned_until": until}
+            return replace(self, latent=latent, engine=engine).with_settings(**told)
         before = exact(self.latent, "learning from more rows")
         likelihood, latent = learn_more_rows(
             self.likelihood, self.parameters, before, self.model.noise, rows, budget, keep
         )
-        settings = {"points": len(latent.system.deflation.C), "budget": budget}
-        settings["rows_added"] = self.settings.get("rows_added", 0) + len(rows)
+        settings = {"points": len(latent.system.deflation.C), "budget": budget, "rows_added": added}
         return replace(self, likelihood=likelihood, latent=latent).with_settings(**settings)
 
     @override

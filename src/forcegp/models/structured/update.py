@@ -1,7 +1,8 @@
 """A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
 
+import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +11,18 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
-from forcegp.errors import DataWarning
-from forcegp.inference import ExactPosterior
+from forcegp.errors import DataWarning, InvalidInput, require_known
+from forcegp.inference import ExactPosterior, InducingPosterior, LatentPosterior, exact
 from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
+from forcegp.inference.engines import ENOUGH
 from forcegp.inference.memory import require_memory
 from forcegp.models.search import blas_threads
+from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.prior_checks import check_distance
 from forcegp.models.training_data import ACCELERATION, Noise, TrainingData
+from forcegp.priors import ForcePrior
+from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
 Keep = Callable[[ExactPosterior, int], Tensor]
@@ -25,6 +30,9 @@ Keep = Callable[[ExactPosterior, int], Tensor]
 
 SHARE_AT_ONCE = 4
 """With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
+
+POINTS = 100
+"""Inducing points of each latent, at most, of a posterior that forgets: all of 100 rows."""
 
 OTHER_NOISE = 0.1
 """Part of the fit's level of noise by which rows may state another one without a warning."""
@@ -43,23 +51,14 @@ def learn_more_rows(
 
     `latent` is the posterior on the rows of `likelihood` at `parameters`, `noise` that of the model.
     """
-    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
-    require_rows("rows", rows, likelihood.system.robot.joint_names, "the model", example)
     budget = None if budget is None else whole_number("budget", budget, 2)
     training = likelihood.training
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
     _require_memory(latent, len(rows), height, budget)
-    reference = training if training.reference is None else training.reference
-    level = parameters[ACCELERATION].exp().cpu().numpy()
-    if noise is not None and noise.from_data and reference.noise_std is None:
-        _warn_of_another_noise(level, rows)
-    added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
-    likelihood.system.check_states(added.q, added.v, added.u)
-    check_distance(likelihood.system, added)
-    # the standardization at hand, instead of one that is computed again from the reference
-    standardized = replace(likelihood, fixed_standardization=likelihood.standardization)
+    more = _on_rows(likelihood, parameters, noise, rows)
+    added, reference = more.training, more.training.reference
     with torch.no_grad(), blas_threads(training.q.numel()):
-        features, W, residual, variance = replace(standardized, training=added).terms(parameters)
+        features, W, residual, variance = more.terms(parameters)
         variance = variance.expand(len(W), *variance.shape[1:])
         for start in range(0, len(W), height):
             part = slice(start, start + height)
@@ -68,7 +67,63 @@ def learn_more_rows(
             if budget is not None and len(training.q) > budget:
                 kept = keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
-    return replace(standardized, training=replace(training, reference=reference)), latent
+    return replace(more, training=replace(training, reference=reference)), latent
+
+
+def learn_and_forget(
+    likelihood: MarginalLikelihood,
+    parameters: Mapping[str, Tensor],
+    latent: LatentPosterior,
+    noise: Noise | None,
+    rows: Dataset,
+    horizons: Sequence[float],
+    seconds: float,
+) -> InducingPosterior:
+    """The posterior `seconds` later and with these rows, where latent c is forgotten within horizons[c] seconds.
+
+    See `WeightSpace.learned`. An exact posterior goes over to `POINTS` inducing points per latent of its rows.
+    """
+    more = _on_rows(likelihood, parameters, noise, rows)
+    with torch.no_grad(), blas_threads(len(rows)):
+        if not isinstance(latent, InducingPosterior):
+            kernels = exact(latent, "learning from more rows").kernels
+            latent = InducingPosterior.condition(kernels, likelihood.terms(parameters), points=POINTS, tolerance=ENOUGH)
+        terms = more.terms(parameters)
+        deflation, kept = terms.deflated(), [math.exp(-seconds / horizon) for horizon in horizons]
+        space = latent.space.learned(kept, terms.features, deflation.C, deflation.t)
+    return InducingPosterior(latent.kernels, space)
+
+
+def horizons_of(given: float | Mapping[str, float], prior: ForcePrior, robot: Robot) -> list[float]:
+    """Of every latent in s, from one number or those of terms by name; infinite for others. Raises InvalidInput."""
+    parts = {name: which for name, _, which in term_slices(prior, robot)}
+    horizons = [math.inf] * len(prior.latent_names(robot))
+    for name, seconds in (given if isinstance(given, Mapping) else dict.fromkeys(parts, given)).items():
+        require_known("horizon", name, "this model", tuple(parts))
+        if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds > 0.0:
+            raise InvalidInput(f"horizon is {seconds!r}; give seconds above 0, math.inf where nothing is forgotten.")
+        horizons[parts[name]] = [float(seconds)] * len(horizons[parts[name]])
+    return horizons
+
+
+def require_fitting(rows: Dataset, likelihood: MarginalLikelihood) -> None:
+    """Raise InvalidInput for what is no Dataset of the same joints."""
+    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
+    require_rows("rows", rows, likelihood.system.robot.joint_names, "the model", example)
+
+
+def _on_rows(
+    likelihood: MarginalLikelihood, parameters: Mapping[str, Tensor], noise: Noise | None, rows: Dataset
+) -> MarginalLikelihood:
+    """The likelihood of other rows, checked, with the standardization at hand instead of one that is computed again."""
+    training = likelihood.training
+    reference = training if training.reference is None else training.reference
+    if noise is not None and noise.from_data and reference.noise_std is None:
+        _warn_of_another_noise(parameters[ACCELERATION].exp().cpu().numpy(), rows)
+    added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
+    likelihood.system.check_states(added.q, added.v, added.u)
+    check_distance(likelihood.system, added)
+    return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
 
 
 def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
