@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from functools import cache, reduce
 from operator import or_
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -245,7 +244,8 @@ class RowFunction:
         self, library: ctypes.CDLL, inputs: Sequence[int], outputs: Sequence[int], tables: Sequence[Tensor] = ()
     ) -> None:
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
-        hold_tables(self, tables)
+        self.library, self._held = library, tuple(tables)
+        self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
         vectors = len(inputs) + len(outputs)
         self._evaluate.argtypes = [ctypes.c_long] * 2 + [ctypes.c_void_p, *[ctypes.c_void_p, ctypes.c_long] * vectors]
@@ -278,13 +278,6 @@ class RowFunction:
         for k, values in sums.items():
             outputs[k].copy_(values.sum(0))
         return found
-
-
-def hold_tables(function: Any, tables: Sequence[Tensor]) -> Any:
-    """The same function of a library, which is given these tables from now on."""
-    function._held = tuple(tables)
-    function._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
-    return function
 
 
 def in_threads(part: Callable[[int], int], count: int) -> list[int]:

@@ -158,27 +158,25 @@ class WeightSpace:
         )
         return cls(kernels, points, lowers, precision, mean, 0.0)
 
-    def learned(
-        self,
-        kept: Sequence[float],
-        features: Sequence[Float[Tensor, "N _"]],
-        C: Float[Tensor, "N r C"],
-        t: Float[Tensor, "N r"],
-    ) -> "WeightSpace":
-        """After forgetting all but a part `kept`, from 0 to 1, of each latent, and conditioning on more rows.
+    def learned(self, kept: Sequence[float], terms: Terms) -> "WeightSpace":
+        """After forgetting all but a part `kept` of each latent, and conditioning on more rows; time O(P^3 + N P^2).
 
-        f <- kept f + sqrt(1 - kept^2) g, g a new draw from the prior: the step in time of kernels k_c(z, z')
-        exp(-|t - t'| / horizon_c), kept_c = exp(-step / horizon_c), which is Markov (Van Vaerenbergh, Lazaro-Gredilla &
-        Santamaria 2012, "Kernel recursive least-squares tracker for time-varying regression", section III-B; as a
-        filter: Sarkka & Solin 2019, "Applied stochastic differential equations", section 12.3). Time O(P^3 + N P^2).
+        f <- kept f + sqrt(1 - kept^2) g, g a new draw from the prior: a step in time of the kernels k_c(z, z')
+        exp(-|t - t'| / horizon_c), which are Markov, by kept_c = exp(-step / horizon_c) (Van Vaerenbergh,
+        Lazaro-Gredilla & Santamaria 2012, "Kernel recursive least-squares tracker for time-varying regression"; Sarkka
+        & Solin 2019, "Applied stochastic differential equations", 12.3). What the weights leave out is noise of a row.
         """
+        deflation, phis = terms.deflated(), self.columns(terms.features)
         d = torch.cat([self.mean.new_full((len(z),), part) for z, part in zip(self.points, kept, strict=True)])
         covariance = CholeskyFactor(self.precision.lower.clone()).into_inverse().mul_(d).mul_(d[:, None])
         covariance.diagonal().add_(1.0 - d.square())
         factor = factorize(covariance.clone)
-        right = factor.solve((d * self.mean)[:, None])[:, 0]
-        earlier = factor.into_inverse().tril_(), right.contiguous()
-        return WeightSpace.of(self.kernels, features, self.points, C, t, earlier=earlier)
+        right = factor.solve((d * self.mean)[:, None])[:, 0].contiguous()
+        parts = zip(self.kernels.dense, terms.features, phis, strict=True)
+        left_out = torch.stack([kernel.diagonal(z) - phi.square().sum(0) for kernel, z, phi in parts], dim=-1)
+        precision = with_left_out(deflation.C, left_out.clamp_min(0.0))
+        given = self.kernels, terms.features, self.points, deflation.C, deflation.t, precision
+        return WeightSpace.of(*given, (factor.into_inverse(), right))
 
     @property
     def count(self) -> int:
@@ -233,6 +231,12 @@ class WeightSpace:
         wide[self.slices[index]] = phi
         remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
         return remainder + self.precision.solve_lower(wide).square().sum(0)
+
+
+def with_left_out(C: Float[Tensor, "N r C"], left_out: Float[Tensor, "N C"]) -> Float[Tensor, "N r r"]:
+    """D^-1 where the prior variances that the weights leave out of each latent count as noise of the rows."""
+    D = (C * left_out[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
+    return torch.cholesky_inverse(torch.linalg.cholesky(D))
 
 
 CHUNK_BYTES = 64 * 2**20

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.inducing import Pivots, WeightSpace, pivoted_cholesky
+from forcegp.inference.inducing import Pivots, WeightSpace, pivoted_cholesky, with_left_out
 from forcegp.inference.likelihood import Deflation, Terms
 from forcegp.inference.posterior import LatentPosterior
 
@@ -177,9 +177,7 @@ class LowRankPlusDiagonal:
             for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
         )
         left_out = torch.stack([found.remainder for found in pivots], dim=-1)
-        identity = torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
-        D = (C * left_out[:, None, :]) @ C.mT + identity
-        noise_precision = torch.cholesky_inverse(torch.linalg.cholesky(D))
+        noise_precision = with_left_out(C, left_out)
         places = [z[found.indices] for z, found in zip(features, pivots, strict=True)]
         weights = WeightSpace.of(kernels, features, places, C, t, noise_precision)
         return cls(C, pivots, noise_precision, weights)

@@ -116,18 +116,15 @@ def refreshed_calls(calls: Sequence[LatentCall], latent: LatentPosterior) -> tup
     found: list[LatentCall] = []
     for part in calls:
         index = part.latents[0]
-        if isinstance(part, OneInputCall):
-            form = one_input_form(latent, index)
-            same = form is not None and form.c_source("f") == part.functions.c_source("f")
+        if isinstance(part, OneInputCall) and (form := one_input_form(latent, index)) is not None:
             found.append(replace(part, functions=form))
-        else:
-            same = len(part.latents) == 1 and part.level == (0.0,)  # else constants stand in the program
+        elif isinstance(part, KernelSum) and part.level == (0.0,):  # else its program holds sums of the weights
             found.append(replace(part, centers=latent.features[index], weights=latent.weights[index].detach()[None]))
-        if not same:
-            raise InvalidInput(
-                "the predictor's programs hold numbers of the posterior, as of latents with squared exponential "
-                "kernels; make a new one by posterior.predictor()."
-            )
+    if [part.c_source(1, True) for part in found] != [part.c_source(1, True) for part in calls]:
+        raise InvalidInput(
+            "the predictor's programs hold numbers of the posterior, as of squared exponential kernels of latents with "
+            "the same features; make a new one by posterior.predictor()."
+        )
     return tuple(found)
 
 

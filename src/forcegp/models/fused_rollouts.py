@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.codegen.c_writer import ROWS
-from forcegp.codegen.library import hold_tables, in_threads
+from forcegp.codegen.library import in_threads
 from forcegp.errors import NumericalWarning
 from forcegp.integration.integrators import Integrator
 from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate, warn_of_divergence
@@ -205,7 +205,8 @@ class FusedLoop:
     """`evaluate` of a loaded library; `tables` are those of the functions that it calls."""
 
     def __init__(self, library: ctypes.CDLL, tables: Sequence[Tensor]) -> None:
-        hold_tables(self, tables)
+        self.library, self._held = library, tuple(tables)
+        self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
         self._evaluate.argtypes = (
             [ctypes.c_long] * 2 + [ctypes.c_void_p, ctypes.c_long, ctypes.c_double] + [ctypes.c_void_p] * 7

@@ -123,7 +123,7 @@ class KeptCode:
         return "traced" in vars(self)
 
     def refreshed(self, latent: LatentPosterior) -> "KeptCode":
-        """Of another posterior with the same kernels; traced if it was not. Raises InvalidInput as `refreshed_calls`."""
+        """That of another posterior with the same kernels. Raises InvalidInput as `refreshed_calls`."""
         made = replace(self.traced, sums=refreshed_calls(self.traced.sums, latent))
         return KeptCode(self.nv, self.contacts, partial(replace, made), None)
 

@@ -7,7 +7,6 @@ uses few combinations of the data (`inference.prepared_kernels`). `structured.pr
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, hold_tables, require_plain
+from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
@@ -114,25 +113,25 @@ class Predictor(Summary):
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
 
     def refreshed(self, posterior: Any) -> "Predictor":
-        """The predictor of `posterior.update(...)` in milliseconds: other tables, the same programs; this one stays.
+        """That of `posterior.update(...)` in milliseconds: the same programs with other tables; this one stays.
 
-        Neither traced nor compiled, but for the first time after its programs were found on disk. Raises InvalidInput
-        for posteriors that were not updated from this one, compressed covariances, and kernels whose numbers stand in
-        the programs: then make another by `posterior.predictor()`.
+        Nothing is compiled, and nothing traced but once, if the programs were found on disk. Raises InvalidInput for
+        other posteriors, compressed covariances, and kernels that leave numbers in the programs.
         """
-        latent, own = getattr(posterior, "latent", None), self.posterior
-        if latent is None or latent.kernels is not self.latent.kernels or posterior.system is not own.system:
-            raise InvalidInput("refreshed needs what posterior.update(...) gave of the predictor's own posterior.")
-        if self.compressed is not None:
-            raise InvalidInput("a compressed covariance is not refreshed; give covariance='none' or 'exact'.")
+        latent: Any = getattr(posterior, "latent", None)
+        same = latent and latent.kernels is self.latent.kernels and posterior.system is self.posterior.system
+        if not same or self.compressed is not None:
+            raise InvalidInput(
+                "refreshed takes what posterior.update(...) gave of the predictor's own posterior, and no compressed "
+                "covariance (covariance='none' or 'exact'); make a new one by posterior.predictor()."
+            )
         code = self.code and self.code.refreshed(latent)
-        given = {"latent": latent, "prepared": PreparedKernels.of(latent), "code": code, "posterior": posterior}
-        functions, loops = dict(self._functions), {how: x for how, x in self._loops.items() if not how[1]}
-        if code:
-            tables = code.traced.tables
-            functions = {kind: x and hold_tables(copy(x), tables) for kind, x in functions.items()}
-            loops = {how: x and [hold_tables(copy(loop), tables) for loop in x] for how, x in loops.items()}
-        return replace(self, **given, _functions=functions, _failed=list(self._failed), _loops=loops)
+        tables = code.traced.tables if code else []
+        functions = {k: f and RowFunction(f.library, f.inputs, f.outputs, tables) for k, f in self._functions.items()}
+        of_mean = {how: loops for how, loops in self._loops.items() if not how[1]}
+        loops = {how: x and [FusedLoop(loop.library, tables) for loop in x] for how, x in of_mean.items()}
+        prepared, made = PreparedKernels.of(latent), {"_functions": functions, "_loops": loops}
+        return replace(self, latent=latent, prepared=prepared, code=code, posterior=posterior, **made)
 
     @property
     def rank(self) -> int | None:

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import DataWarning, InvalidInput, require_known
-from forcegp.inference import ExactPosterior, InducingPosterior, LatentPosterior, exact
-from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
-from forcegp.inference.engines import ENOUGH
+from forcegp.inference import ExactPosterior
+from forcegp.inference.cholesky_update import rows_to_keep, with_only, with_rows
 from forcegp.inference.memory import require_memory
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.components import term_slices
@@ -30,9 +28,6 @@ Keep = Callable[[ExactPosterior, int], Tensor]
 
 SHARE_AT_ONCE = 4
 """With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
-
-POINTS = 100
-"""Inducing points of each latent, at most, of a posterior that forgets: all of 100 rows."""
 
 OTHER_NOISE = 0.1
 """Part of the fit's level of noise by which rows may state another one without a warning."""
@@ -55,7 +50,7 @@ def learn_more_rows(
     training = likelihood.training
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
     _require_memory(latent, len(rows), height, budget)
-    more = _on_rows(likelihood, parameters, noise, rows)
+    more = on_rows(likelihood, parameters, noise, rows)
     added, reference = more.training, more.training.reference
     with torch.no_grad(), blas_threads(training.q.numel()):
         features, W, residual, variance = more.terms(parameters)
@@ -70,57 +65,29 @@ def learn_more_rows(
     return replace(more, training=replace(training, reference=reference)), latent
 
 
-def learn_and_forget(
-    likelihood: MarginalLikelihood,
-    parameters: Mapping[str, Tensor],
-    latent: LatentPosterior,
-    noise: Noise | None,
-    rows: Dataset,
-    horizons: Sequence[float],
-    seconds: float,
-) -> InducingPosterior:
-    """The posterior `seconds` later and with these rows, where latent c is forgotten within horizons[c] seconds.
-
-    See `WeightSpace.learned`. An exact posterior goes over to `POINTS` inducing points per latent of its rows.
-    """
-    more = _on_rows(likelihood, parameters, noise, rows)
-    with torch.no_grad(), blas_threads(len(rows)):
-        if not isinstance(latent, InducingPosterior):
-            kernels = exact(latent, "learning from more rows").kernels
-            latent = InducingPosterior.condition(kernels, likelihood.terms(parameters), points=POINTS, tolerance=ENOUGH)
-        terms = more.terms(parameters)
-        deflation, kept = terms.deflated(), [math.exp(-seconds / horizon) for horizon in horizons]
-        space = latent.space.learned(kept, terms.features, deflation.C, deflation.t)
-    return InducingPosterior(latent.kernels, space)
+def parts_kept(horizon: float | Mapping[str, float], seconds: float, prior: ForcePrior, robot: Robot) -> list[float]:
+    """exp(-seconds / horizon) of every latent, from one horizon in s or {term: its own}. Raises InvalidInput."""
+    terms = term_slices(prior, robot)
+    horizons = horizon if isinstance(horizon, Mapping) else {name: horizon for name, *_ in terms}
+    for name, given in horizons.items():
+        require_known("term", name, "this model", [name for name, *_ in terms])
+        if not isinstance(given, int | float) or not given > 0.0:
+            raise InvalidInput(f"horizon is {given!r}; give seconds above 0, math.inf where nothing is forgotten.")
+    found = [[horizons.get(name, math.inf)] * len(term.latent_names(robot)) for name, term, _ in terms]
+    return [math.exp(-seconds / own) for part in found for own in part]
 
 
-def horizons_of(given: float | Mapping[str, float], prior: ForcePrior, robot: Robot) -> list[float]:
-    """Of every latent in s, from one number or those of terms by name; infinite for others. Raises InvalidInput."""
-    parts = {name: which for name, _, which in term_slices(prior, robot)}
-    horizons = [math.inf] * len(prior.latent_names(robot))
-    for name, seconds in (given if isinstance(given, Mapping) else dict.fromkeys(parts, given)).items():
-        require_known("horizon", name, "this model", tuple(parts))
-        if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds > 0.0:
-            raise InvalidInput(f"horizon is {seconds!r}; give seconds above 0, math.inf where nothing is forgotten.")
-        horizons[parts[name]] = [float(seconds)] * len(horizons[parts[name]])
-    return horizons
-
-
-def require_fitting(rows: Dataset, likelihood: MarginalLikelihood) -> None:
-    """Raise InvalidInput for what is no Dataset of the same joints."""
-    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
-    require_rows("rows", rows, likelihood.system.robot.joint_names, "the model", example)
-
-
-def _on_rows(
+def on_rows(
     likelihood: MarginalLikelihood, parameters: Mapping[str, Tensor], noise: Noise | None, rows: Dataset
 ) -> MarginalLikelihood:
     """The likelihood of other rows, checked, with the standardization at hand instead of one that is computed again."""
-    training = likelihood.training
+    training, stated = likelihood.training, rows.noise_std
     reference = training if training.reference is None else training.reference
     if noise is not None and noise.from_data and reference.noise_std is None:
         _warn_of_another_noise(parameters[ACCELERATION].exp().cpu().numpy(), rows)
-    added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
+    if reference.noise_std is not None and stated is not None and stated.ndim == 1:
+        rows = replace(rows, noise_std=np.tile(stated, (len(rows), 1)))  # every row states it then
+    added = replace(TrainingData.of(rows, training.q.device), reference=reference)
     likelihood.system.check_states(added.q, added.v, added.u)
     check_distance(likelihood.system, added)
     return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
@@ -147,21 +114,15 @@ def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int
     count, rank, latents = latent.system.deflation.C.shape
     height = min(height, added)
     before = count if budget is None else min(max(count, budget), count + added - height)  # at the largest step
-    needed = bytes_to_append(before, height, rank, latents)
+    size, new = rank * (before + height), rank * height
+    needed = 8 * (size**2 + 2 * new * size + latents * height**2)  # the new factor, blocks of new rows and their copies
     what, remedy = f"a posterior of {count} + {added} rows", "give a budget of rows to keep (budget=N), or fewer rows"
     if budget is not None:
-        needed = max(needed, bytes_to_choose(before + height, rank))
+        needed = max(needed, 8 * 4 * size**2)  # the factor, its inverse, and two matrices that join halves of it
         what, remedy = f"learning from {added} rows with budget={budget}", "give a smaller budget"
         if count > budget:
             remedy += f", or a posterior of fewer rows (it has {count})"
     require_memory(needed, what, remedy, latent.system.alpha.device)
-
-
-def _with_row_noise(rows: Dataset, reference: TrainingData) -> Dataset:
-    """Rows that state one noise for all of them state it for every row, where the training rows did so."""
-    if reference.noise_std is None or rows.noise_std is None or rows.noise_std.ndim == 2:
-        return rows
-    return replace(rows, noise_std=np.tile(rows.noise_std, (len(rows), 1)))
 
 
 def _selected(training: TrainingData, index: Tensor | slice) -> TrainingData:
