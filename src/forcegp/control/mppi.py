@@ -87,7 +87,7 @@ class MPPI(Controller):
         apart = torch.arange(self.steps, dtype=torch.float64)
         self._colour = torch.linalg.cholesky(correlation ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
-        self._how = {"integrator": integrator, "functions": functions, "seed": seed, "threads": threads}
+        self._how: dict[str, Any] = {"integrator": integrator, "functions": functions, "seed": seed, "threads": threads}
 
     @override
     def facts(self) -> Mapping[str, object]:
