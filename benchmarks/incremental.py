@@ -28,7 +28,7 @@ import torch
 
 from forcegp.data import Dataset, farthest_point_sampling, farthest_rows
 from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptions
-from forcegp.inference.cholesky_update import information, rows_to_keep, with_only
+from forcegp.inference.cholesky_update import rows_to_keep, with_only
 from forcegp.models import Noise, StructuredGP, TrainingData
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
@@ -103,6 +103,11 @@ def deletion_speed(data: Dataset) -> float:
 def newest(latent: ExactPosterior, budget: int) -> torch.Tensor:
     count = len(latent.features[0])
     return torch.arange(count - budget, count)
+
+
+def information(blocks: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+    """Of every row beyond all others, whatever was measured there: -1/2 log|P_ii| in nats."""
+    return -torch.linalg.cholesky(blocks).diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def far_apart(latent: ExactPosterior, budget: int) -> torch.Tensor:

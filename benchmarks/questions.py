@@ -11,6 +11,7 @@ TITLES = {
     "prediction": "Predictions at control rates",
     "programs": "Models as programs",
     "tracking": "Tracking with learned friction",
+    "drift": "Learning while controlling",
     "normal_force": "A normal force without a sensor",
     "contact_monitor": "Contacts seen without a sensor",
     "mujoco_forces": "Learned forces in MuJoCo",
@@ -165,6 +166,14 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "tracking_task_over_laws": ("", "the same: learned / Coulomb's and viscous friction of the same rows"),
         "tracking_payload_over_urdf": ("<= 0.1", "inertias 10 % wrong, 0.5 kg unknown: identified and learned / URDF"),
         "tracking_payload_over_identified": ("", "the same: identified and learned / identified"),
+    },
+    "drift": {
+        "drift_online_over_refit_torque": (
+            "<= 1.2",
+            "friction loses 30 % in 10 min, torque error of `update(horizon=)` every second / refit every minute",
+        ),
+        "drift_online_over_refit_acceleration": ("<= 1.2", "the same, error of the acceleration"),
+        "drift_online_ms_per_row": ("<= 1", "the same, CPU ms per row of update and refreshed predictor"),
     },
     "normal_force": {
         "normal_force_force_learned": ("<= 0.2", "15 N wanted on a plane, 100 rows: RMSE of the normal force [N]"),

@@ -84,9 +84,8 @@ def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
 
 def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "incremental.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    assert printed.splitlines()[-1] == "70 40"
+    printed = [run_example(code, tmp_path) for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
+    assert [text.splitlines()[-1] for text in printed] == ["70 40", "True True"]
 
 
 def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):

@@ -200,6 +200,11 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         },
     ),
     "update": (lambda **k: INPUTS.posterior.update(**k), lambda: {"rows": INPUTS.data.rows([9]), "budget": 8}),
+    "update (horizon)": (
+        lambda **k: INPUTS.posterior.update(**k).predict(*STATE),
+        lambda: {"rows": INPUTS.data.rows([9]), "horizon": 60.0},
+    ),
+    "predictor().refreshed": (lambda **k: INPUTS.predictor.refreshed(**k), lambda: {"posterior": INPUTS.posterior}),
     "curve": (lambda **k: INPUTS.posterior.curve(**k), lambda: {"latent": "pan", "features": None, "points": 5}),
     "with_contacts": (lambda **k: INPUTS.posterior.with_contacts(**k), lambda: {"contacts": ()}),
     "with_robot": (lambda **k: INPUTS.posterior.with_robot(**k), lambda: {"robot": _robot()}),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.inference.problems import Problem, normal, problem
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.inference import ExactPosterior, cholesky_update, likelihood
+from forcegp.inference import ExactPosterior, likelihood
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.cholesky_update import appended, divergences, rows_to_keep, with_only, with_rows
 
@@ -46,7 +46,6 @@ SHAPES = {
 @pytest.mark.parametrize("panel_bytes", [4 * 2**20, 1], ids=["one panel", "one row per panel"])
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_appending_is_conditioning_on_all_rows(shape, panel_bytes, monkeypatch):
-    monkeypatch.setattr(cholesky_update, "PANEL_BYTES", panel_bytes)
     monkeypatch.setattr(likelihood, "PANEL_BYTES", panel_bytes)
     whole = problem(**shape)
     grown = condition(rows_of(whole, slice(0, 7)))

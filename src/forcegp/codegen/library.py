@@ -249,7 +249,7 @@ class RowFunction:
         self, library: ctypes.CDLL, inputs: Sequence[int], outputs: Sequence[int], tables: Sequence[Tensor] = ()
     ) -> None:
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
-        self._held = tuple(tables)
+        self.library, self._held = library, tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
         vectors = len(inputs) + len(outputs)

@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import torch
@@ -88,9 +87,7 @@ class MPPI(Controller):
         apart = torch.arange(self.steps, dtype=torch.float64)
         self._colour = torch.linalg.cholesky(correlation ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
-        self._roll_out = partial(
-            predictor.rollouts, dt=dt, integrator=integrator, functions=functions, seed=seed, threads=threads
-        )
+        self._how: dict[str, Any] = {"integrator": integrator, "functions": functions, "seed": seed, "threads": threads}
 
     @override
     def facts(self) -> Mapping[str, object]:
@@ -125,7 +122,7 @@ class MPPI(Controller):
         torques = torch.minimum(torch.maximum(torques, -self.torque_limits), self.torque_limits)
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NumericalWarning)  # of sequences that diverge: they cost infinitely much
-            motions = self._roll_out(q, v, torques)
+            motions = self.predictor.rollouts(q, v, torques, self.dt, **self._how)
             costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
         if costs.shape != motions.diverged_at.shape:
             raise InvalidInput(

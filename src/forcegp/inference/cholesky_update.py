@@ -20,7 +20,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.likelihood import PANEL_BYTES, DeflatedSystem, Deflation, deflate, deflated_covariance, whiten
+from forcegp.inference.likelihood import DeflatedSystem, Deflation, deflate, deflated_covariance, whiten
 from forcegp.inference.posterior import ExactPosterior
 
 COPIED_ROWS = 256
@@ -53,17 +53,6 @@ def with_rows(
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
 
 
-def bytes_to_append(rows: int, more: int, rank: int, latents: int) -> int:
-    """Memory that `with_rows` takes beside the old factor: the new one, blocks of the new rows and their copies."""
-    old, new = rank * rows, rank * more
-    return 8 * ((old + new) ** 2 + 2 * new * (old + new) + latents * more**2)
-
-
-def bytes_to_choose(rows: int, rank: int) -> int:
-    """Memory of `rows_to_keep`: the factor, its inverse, and two whole matrices while both halves of it are joined."""
-    return 8 * 4 * (rank * rows) ** 2
-
-
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
     """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
     with torch.no_grad():
@@ -80,13 +69,7 @@ def divergences(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> 
     error = torch.linalg.solve_triangular(factor, alpha[..., None], upper=False).square().sum((-2, -1))
     trace = blocks.diagonal(dim1=-2, dim2=-1).sum(-1)
     surprise = 0.5 * (trace - blocks.shape[-1] + error - alpha.square().sum(-1))
-    return information(blocks, alpha) + surprise
-
-
-def information(blocks: Float[Tensor, "N r r"], alpha: Float[Tensor, "N r"]) -> Float[Tensor, " N"]:
-    """The information of every row beyond all others, whatever was measured there: -1/2 log|P_ii| in nats."""
-    factor, _ = torch.linalg.cholesky_ex(blocks)
-    return -factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return surprise - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def rows_to_keep(
@@ -130,9 +113,8 @@ def rows_to_keep(
 def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]) -> CholeskyFactor:
     """The factor of [[T11, cross^T], [cross, own]] from that of T11, which is copied; `own` is overwritten.
 
-    Copied, because torch's triangular solves copy a view of a larger buffer at every call, which costs more.
-
-    Only the lower triangle of `own` is read. Jitter is added to the new rows alone, as `factorize` does.
+    Copied, because torch's triangular solves copy a view of a larger buffer at every call, which costs more. Only the
+    lower triangle of `own` is read. Jitter is added to the new rows alone, as `factorize` does.
     """
     size, more = factor.lower.shape[0], own.shape[0]
     lower = factor.lower.new_empty(size + more, size + more)
@@ -160,8 +142,6 @@ def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:
 def _padded(deflation: Deflation, rank: int) -> Deflation:
     """The same with zeros in place of the directions that rows of higher rank have; nothing depends on them."""
     more = rank - deflation.rank
-    if not more:
-        return deflation
     pad = torch.nn.functional.pad
     U, C, t = pad(deflation.U, (0, more)), pad(deflation.C, (0, 0, 0, more)), pad(deflation.t, (0, more))
     return Deflation(U, C, t, deflation.remainder)
@@ -184,19 +164,9 @@ def _cross_covariance(
     old_features: Sequence[Tensor],
     old_C: Float[Tensor, "N r C"],
 ) -> Float[Tensor, "mr Nr"]:
-    """T21 of size (rm, rN), point-major, in panels of new rows."""
-    more, rank, latents = C.shape
-    count = len(old_C)
-    cross = C.new_zeros(more * rank, count * rank)
-    if not cross.numel():
-        return cross
-    by_latent = old_C.permute(2, 0, 1).contiguous()
-    height = max(1, PANEL_BYTES // max(1, 8 * latents * count * rank))
-    for start in range(0, more, height):
-        part = slice(start, min(more, start + height))
-        kernel = torch.stack(
-            [k.cross(z[part], old) for k, z, old in zip(kernels.dense, features, old_features, strict=True)], dim=1
-        )
-        weighted = (kernel[..., None] * by_latent).reshape(len(kernel), latents, count * rank)
-        cross[part.start * rank : part.stop * rank] = torch.bmm(C[part], weighted).reshape(-1, count * rank)
-    return cross
+    """T21 of size (rm, rN), point-major."""
+    cross = C.new_zeros(*C.shape[:2], *old_C.shape[:2])
+    parts = zip(kernels.dense, features, old_features, C.unbind(-1), old_C.unbind(-1), strict=True)
+    for kernel, z, old, own, other in parts:
+        cross.addcmul_(own[..., None, None], (kernel.cross(z, old)[..., None] * other)[:, None])
+    return cross.flatten(2).flatten(0, 1)

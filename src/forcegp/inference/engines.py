@@ -173,7 +173,7 @@ class InducingWeights(Engine):
                 "a model refined on motions is conditioned on them, not on rows; fit again, and refine again."
             )
         *places, mean, lower = start.split([*sizes, count, count**2])
-        shaped = [z.view(-1, like.shape[-1]) for z, like in zip(places, terms.features, strict=True)]
+        shaped = [z.view(n, like.shape[-1]) for z, n, like in zip(places, self.points, terms.features, strict=True)]
         return InducingPosterior(kernels, WeightSpace.at(kernels, shaped, CholeskyFactor(lower.view(count, -1)), mean))
 
     @override

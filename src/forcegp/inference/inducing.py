@@ -117,19 +117,21 @@ class WeightSpace:
         C: Float[Tensor, "N r C"],
         t: Float[Tensor, "N r"],
         noise_precision: Float[Tensor, "N r r"] | None = None,
+        earlier: tuple[Float[Tensor, "P P"], Float[Tensor, " P"]] | None = None,
     ) -> "WeightSpace":
         """Condition on all rows; None for the noise precision D^-1 is white noise.
 
-        Time O(N P^2), memory O(P^2) and a block of rows. Raises NumericalError where the kernel matrix of the points
-        cannot be factorised.
+        `earlier` are precision (overwritten) and precision times mean of the weights before, None for those of the
+        prior. Time O(N P^2), memory O(P^2) and a block of rows. Raises NumericalError where the kernel matrix of the
+        points cannot be factorised.
         """
         prior = cls.at(kernels, points, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0))
         white, slices = C if noise_precision is None else noise_precision @ C, prior.slices
         pairs = (C[..., :, None] * white[..., None, :]).sum(1)  # C_i^T D_i^-1 C_i
         target = (white * t[..., None]).sum(1)  # C_i^T D_i^-1 t_i
         relevance = C.square().sum(1)
-        B = torch.eye(prior.count, dtype=C.dtype, device=C.device)
-        right, left_out = C.new_zeros(prior.count), C.new_zeros(())
+        B, right = earlier or (torch.eye(prior.count, dtype=C.dtype, device=C.device), C.new_zeros(prior.count))
+        left_out = C.new_zeros(())
         height = max(1, BLOCK_BYTES // (8 * max(1, prior.count)))
         for start in range(0, len(C), height):
             rows = slice(start, start + height)
@@ -155,6 +157,26 @@ class WeightSpace:
             factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
         )
         return cls(kernels, points, lowers, precision, mean, 0.0)
+
+    def learned(self, kept: Sequence[float], terms: Terms) -> "WeightSpace":
+        """After forgetting all but a part `kept` of each latent, and conditioning on more rows; time O(P^3 + N P^2).
+
+        f <- kept f + sqrt(1 - kept^2) g, g a new draw from the prior: a step in time of the kernels k_c(z, z')
+        exp(-|t - t'| / horizon_c), which are Markov, by kept_c = exp(-step / horizon_c) (Van Vaerenbergh,
+        Lazaro-Gredilla & Santamaria 2012, "Kernel recursive least-squares tracker for time-varying regression"; Sarkka
+        & Solin 2019, "Applied stochastic differential equations", 12.3). What the weights leave out is noise of a row.
+        """
+        deflation, phis = terms.deflated(), self.columns(terms.features)
+        d = torch.cat([self.mean.new_full((len(z),), part) for z, part in zip(self.points, kept, strict=True)])
+        covariance = CholeskyFactor(self.precision.lower.clone()).into_inverse().mul_(d).mul_(d[:, None])
+        covariance.diagonal().add_(1.0 - d.square())
+        factor = factorize(covariance.clone)
+        right = factor.solve((d * self.mean)[:, None])[:, 0].contiguous()
+        parts = zip(self.kernels.dense, terms.features, phis, strict=True)
+        left_out = torch.stack([kernel.diagonal(z) - phi.square().sum(0) for kernel, z, phi in parts], dim=-1)
+        precision = with_left_out(deflation.C, left_out.clamp_min(0.0))
+        given = self.kernels, terms.features, self.points, deflation.C, deflation.t, precision
+        return WeightSpace.of(*given, (factor.into_inverse(), right))
 
     @property
     def count(self) -> int:
@@ -209,6 +231,12 @@ class WeightSpace:
         wide[self.slices[index]] = phi
         remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
         return remainder + self.precision.solve_lower(wide).square().sum(0)
+
+
+def with_left_out(C: Float[Tensor, "N r C"], left_out: Float[Tensor, "N C"]) -> Float[Tensor, "N r r"]:
+    """D^-1 where the prior variances that the weights leave out of each latent count as noise of the rows."""
+    D = (C * left_out[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
+    return torch.cholesky_inverse(torch.linalg.cholesky(D))
 
 
 CHUNK_BYTES = 64 * 2**20

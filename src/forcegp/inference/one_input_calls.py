@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from forcegp.codegen.graph import Graph
+from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_sums import PADDING, KernelSum
 from forcegp.inference.one_input_functions import OneInputFunctions, drawn_form, markov_functions, one_input_form
 from forcegp.inference.pathwise import draw_functions
@@ -107,6 +108,23 @@ def latent_calls(
             found.append(replace(part, roots=roots))
             continue
         found.append(OneInputCall(part, functions, of_roots))
+    return tuple(found)
+
+
+def refreshed_calls(calls: Sequence[LatentCall], latent: LatentPosterior) -> tuple[LatentCall, ...]:
+    """The same C functions with the tables of another posterior with the same kernels. Raises InvalidInput if none."""
+    found: list[LatentCall] = []
+    for part in calls:
+        index = part.latents[0]
+        if isinstance(part, OneInputCall) and (form := one_input_form(latent, index)) is not None:
+            found.append(replace(part, functions=form))
+        elif isinstance(part, KernelSum) and part.level == (0.0,):  # else its program holds sums of the weights
+            found.append(replace(part, centers=latent.features[index], weights=latent.weights[index].detach()[None]))
+    if [part.c_source(1, True) for part in found] != [part.c_source(1, True) for part in calls]:
+        raise InvalidInput(
+            "the predictor's programs hold numbers of the posterior, as of squared exponential kernels of latents with "
+            "the same features; make a new one by posterior.predictor()."
+        )
     return tuple(found)
 
 

@@ -205,7 +205,7 @@ class FusedLoop:
     """`evaluate` of a loaded library; `tables` are those of the functions that it calls."""
 
     def __init__(self, library: ctypes.CDLL, tables: Sequence[Tensor]) -> None:
-        self._held = tuple(tables)
+        self.library, self._held = library, tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
         self._evaluate.argtypes = (

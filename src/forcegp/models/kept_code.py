@@ -10,8 +10,8 @@ import ctypes
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from forcegp.codegen.library import (
     own_folder,
 )
 from forcegp.errors import CompilerError, ForceGPError
+from forcegp.inference.one_input_calls import refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.models.fused_rollouts import STEPS, FusedLoop
@@ -120,6 +121,11 @@ class KeptCode:
     def is_traced(self) -> bool:
         """Whether something was made anew."""
         return "traced" in vars(self)
+
+    def refreshed(self, latent: LatentPosterior) -> "KeptCode":
+        """That of another posterior with the same kernels. Raises InvalidInput as `refreshed_calls`."""
+        made = replace(self.traced, sums=refreshed_calls(self.traced.sums, latent))
+        return KeptCode(self.nv, self.contacts, partial(replace, made), None)
 
     def function(self, kind: str) -> RowFunction:
         """As `PredictorCode.function`."""

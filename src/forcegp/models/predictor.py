@@ -7,7 +7,7 @@ uses few combinations of the data (`inference.prepared_kernels`). `structured.pr
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -111,6 +111,27 @@ class Predictor(Summary):
         """What it predicts, and how long preparing took."""
         covariance = {"joints": self.nv, "covariance": self.kind, "device": self.device}
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
+
+    def refreshed(self, posterior: Any) -> "Predictor":
+        """That of `posterior.update(...)` in milliseconds: the same programs with other tables; this one stays.
+
+        Nothing is compiled, and nothing traced but once, if the programs were found on disk. Raises InvalidInput for
+        other posteriors, compressed covariances, and kernels that leave numbers in the programs.
+        """
+        latent: Any = getattr(posterior, "latent", None)
+        same = latent and latent.kernels is self.latent.kernels and posterior.system is self.posterior.system
+        if not same or self.compressed is not None:
+            raise InvalidInput(
+                "refreshed takes what posterior.update(...) gave of the predictor's own posterior, and no compressed "
+                "covariance (covariance='none' or 'exact'); make a new one by posterior.predictor()."
+            )
+        code = self.code and self.code.refreshed(latent)
+        tables = code.traced.tables if code else []
+        functions = {k: f and RowFunction(f.library, f.inputs, f.outputs, tables) for k, f in self._functions.items()}
+        of_mean = {how: loops for how, loops in self._loops.items() if not how[1]}
+        loops = {how: x and [FusedLoop(loop.library, tables) for loop in x] for how, x in of_mean.items()}
+        prepared, made = PreparedKernels.of(latent), {"_functions": functions, "_loops": loops}
+        return replace(self, latent=latent, prepared=prepared, code=code, posterior=posterior, **made)
 
     @property
     def rank(self) -> int | None:

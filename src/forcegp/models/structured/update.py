@@ -1,5 +1,6 @@
 """A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -9,15 +10,17 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
-from forcegp.errors import DataWarning
+from forcegp.errors import DataWarning, InvalidInput, require_known
 from forcegp.inference import ExactPosterior
-from forcegp.inference.cholesky_update import bytes_to_append, bytes_to_choose, rows_to_keep, with_only, with_rows
+from forcegp.inference.cholesky_update import rows_to_keep, with_only, with_rows
 from forcegp.inference.memory import require_memory
 from forcegp.models.search import blas_threads
+from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.structured.prior_checks import check_distance
 from forcegp.models.training_data import ACCELERATION, Noise, TrainingData
+from forcegp.priors import ForcePrior
+from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
 Keep = Callable[[ExactPosterior, int], Tensor]
@@ -43,23 +46,14 @@ def learn_more_rows(
 
     `latent` is the posterior on the rows of `likelihood` at `parameters`, `noise` that of the model.
     """
-    example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
-    require_rows("rows", rows, likelihood.system.robot.joint_names, "the model", example)
     budget = None if budget is None else whole_number("budget", budget, 2)
     training = likelihood.training
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
     _require_memory(latent, len(rows), height, budget)
-    reference = training if training.reference is None else training.reference
-    level = parameters[ACCELERATION].exp().cpu().numpy()
-    if noise is not None and noise.from_data and reference.noise_std is None:
-        _warn_of_another_noise(level, rows)
-    added = replace(TrainingData.of(_with_row_noise(rows, reference), training.q.device), reference=reference)
-    likelihood.system.check_states(added.q, added.v, added.u)
-    check_distance(likelihood.system, added)
-    # the standardization at hand, instead of one that is computed again from the reference
-    standardized = replace(likelihood, fixed_standardization=likelihood.standardization)
+    more = on_rows(likelihood, parameters, noise, rows)
+    added, reference = more.training, more.training.reference
     with torch.no_grad(), blas_threads(training.q.numel()):
-        features, W, residual, variance = replace(standardized, training=added).terms(parameters)
+        features, W, residual, variance = more.terms(parameters)
         variance = variance.expand(len(W), *variance.shape[1:])
         for start in range(0, len(W), height):
             part = slice(start, start + height)
@@ -68,7 +62,35 @@ def learn_more_rows(
             if budget is not None and len(training.q) > budget:
                 kept = keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
-    return replace(standardized, training=replace(training, reference=reference)), latent
+    return replace(more, training=replace(training, reference=reference)), latent
+
+
+def parts_kept(horizon: float | Mapping[str, float], seconds: float, prior: ForcePrior, robot: Robot) -> list[float]:
+    """exp(-seconds / horizon) of every latent, from one horizon in s or {term: its own}. Raises InvalidInput."""
+    terms = term_slices(prior, robot)
+    horizons = horizon if isinstance(horizon, Mapping) else {name: horizon for name, *_ in terms}
+    for name, given in horizons.items():
+        require_known("term", name, "this model", [name for name, *_ in terms])
+        if not isinstance(given, int | float) or not given > 0.0:
+            raise InvalidInput(f"horizon is {given!r}; give seconds above 0, math.inf where nothing is forgotten.")
+    found = [[horizons.get(name, math.inf)] * len(term.latent_names(robot)) for name, term, _ in terms]
+    return [math.exp(-seconds / own) for part in found for own in part]
+
+
+def on_rows(
+    likelihood: MarginalLikelihood, parameters: Mapping[str, Tensor], noise: Noise | None, rows: Dataset
+) -> MarginalLikelihood:
+    """The likelihood of other rows, checked, with the standardization at hand instead of one that is computed again."""
+    training, stated = likelihood.training, rows.noise_std
+    reference = training if training.reference is None else training.reference
+    if noise is not None and noise.from_data and reference.noise_std is None:
+        _warn_of_another_noise(parameters[ACCELERATION].exp().cpu().numpy(), rows)
+    if reference.noise_std is not None and stated is not None and stated.ndim == 1:
+        rows = replace(rows, noise_std=np.tile(stated, (len(rows), 1)))  # every row states it then
+    added = replace(TrainingData.of(rows, training.q.device), reference=reference)
+    likelihood.system.check_states(added.q, added.v, added.u)
+    check_distance(likelihood.system, added)
+    return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
 
 
 def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
@@ -92,21 +114,15 @@ def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int
     count, rank, latents = latent.system.deflation.C.shape
     height = min(height, added)
     before = count if budget is None else min(max(count, budget), count + added - height)  # at the largest step
-    needed = bytes_to_append(before, height, rank, latents)
+    size, new = rank * (before + height), rank * height
+    needed = 8 * (size**2 + 2 * new * size + latents * height**2)  # the new factor, blocks of new rows and their copies
     what, remedy = f"a posterior of {count} + {added} rows", "give a budget of rows to keep (budget=N), or fewer rows"
     if budget is not None:
-        needed = max(needed, bytes_to_choose(before + height, rank))
+        needed = max(needed, 8 * 4 * size**2)  # the factor, its inverse, and two matrices that join halves of it
         what, remedy = f"learning from {added} rows with budget={budget}", "give a smaller budget"
         if count > budget:
             remedy += f", or a posterior of fewer rows (it has {count})"
     require_memory(needed, what, remedy, latent.system.alpha.device)
-
-
-def _with_row_noise(rows: Dataset, reference: TrainingData) -> Dataset:
-    """Rows that state one noise for all of them state it for every row, where the training rows did so."""
-    if reference.noise_std is None or rows.noise_std is None or rows.noise_std.ndim == 2:
-        return rows
-    return replace(rows, noise_std=np.tile(rows.noise_std, (len(rows), 1)))
 
 
 def _selected(training: TrainingData, index: Tensor | slice) -> TrainingData:
