@@ -5,7 +5,7 @@
 
 Both sides learn the same forces from the same number of points of the same training runs, windows or rows, with one
 search from moments. Filtered rows: zero-phase Butterworth of order 4 on q and u, v and a by central differences, 0.12 s
-off both ends. Windows: `WeakForm` and `VelocityIncrements` on the raw log. Seeds choose the points: where
+off both ends. Windows: `WeakForm` on the raw log. Seeds choose the points: where
 farthest-point sampling of rows begins, where the first window of a run begins. Two scores on the test runs:
 
 * nRMSE of the acceleration against the reference filter of the rig, which favours the side that learned from it;
@@ -32,9 +32,7 @@ from threadpoolctl import threadpool_limits
 from forcegp.data import (
     Dataset,
     Preparation,
-    VelocityIncrements,
     WeakForm,
-    WindowObservation,
     farthest_rows,
     resample,
     units_for,
@@ -144,7 +142,7 @@ MORE, MORE_WINDOWS = 6, 3
 class Source:
     """What is learned from: rows after a low-pass [Hz], windows, or nothing; `times` as many as there are points."""
 
-    how: float | Literal["auto"] | WindowObservation | None
+    how: float | Literal["auto"] | WeakForm | None
     times: int = 1
 
 
@@ -159,8 +157,6 @@ def sources(rig: Rig) -> Iterator[tuple[str, Source]]:
         yield f"weak form, q, {seconds:g} s", Source(WeakForm(seconds))
     short = WeakForm(min(rig.seconds), nodes=2)
     yield f"weak form, {short.seconds:g} s, {MORE_WINDOWS} x the points", Source(short, MORE_WINDOWS)
-    for seconds in rig.seconds:
-        yield f"velocity increments, {seconds:g} s", Source(VelocityIncrements(seconds))
 
 
 def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPosterior:
@@ -168,7 +164,7 @@ def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPoster
     if how is None:
         return StructuredGP(rig.train.system, NoForces(), noise=Noise(1.0)).fit(rig.train, points=2)
     model = StructuredGP(rig.train.system, rig.prior, rig.mean)
-    if isinstance(how, WindowObservation):
+    if isinstance(how, WeakForm):
         noise = None if rig.force_noise is None else Noise(None, rig.force_noise, learn=True)
         return replace(model, noise=noise).fit_windows(_later(rig.train, 5 * seed), how, points=points, restarts=1)
     rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train).dataset

@@ -1,6 +1,5 @@
 """The dataset comes first, and what is given in another place or of another kind ends in one sentence."""
 
-import numpy as np
 import pytest
 from tests.models.arm import arm_data, arm_system
 
@@ -33,25 +32,13 @@ def posterior(data):
     return StructuredGP(data.system).fit(data, restarts=1)
 
 
-def test_the_old_order_of_version_0_2_works_and_warns(data):
-    new = motion_residuals(data, data.system)
-    with pytest.warns(FutureWarning, match=r"motion_residuals\(dataset, ...\)"):
-        old = motion_residuals(data.system, data)
-    np.testing.assert_array_equal(old, new)
-    with pytest.warns(FutureWarning, match="split_named takes the dataset first"):
-        assert split_named("blocks:3:1", data, 0.0) == split_named(data, "blocks:3:1", 0.0)
-    with pytest.warns(FutureWarning, match="identify_analytical takes the dataset first"):
-        found = identify_analytical(data.system, data, friction=())
-    assert found.values == identify_analytical(data, friction=()).values  # with the system of the dataset
-    with pytest.warns(FutureWarning, match="held_out_noise"):
-        held_out_noise(data.system, data, friction=())
-
-
 CALLS = [
     (lambda d, p: evaluate(d, p), "posterior is a Dataset; give a Posterior"),
     (lambda d, p: evaluate(p, p), "dataset is a StructuredPosterior; give a Dataset"),
     (lambda d, p: check(d.system, d), "dataset is a MechanicalSystem; give a Dataset"),
     (lambda d, p: check(d, d.system.robot), "system is a Robot; give a MechanicalSystem"),
+    (lambda d, p: motion_residuals(d.system, d), "dataset is a MechanicalSystem; give a Dataset"),
+    (lambda d, p: held_out_noise(d.system, d), "dataset is a MechanicalSystem; give a Dataset"),
     (lambda d, p: identify_analytical(d.system), "dataset is a MechanicalSystem; give a Dataset"),
     (lambda d, p: identify_analytical(d, d.system.robot), "system is a Robot; give a MechanicalSystem"),
     (lambda d, p: compare_priors({"a": JointFriction()}, d), "dataset is a dict; give a Dataset"),

@@ -31,7 +31,6 @@ from .recordings import import_recordings as import_recordings
 from .recordings import ColumnMapping as ColumnMapping
 from .recordings import ImportOptions as ImportOptions
 from .data import WeakForm as WeakForm
-from .data import VelocityIncrements as VelocityIncrements
 from .simulation import KukaSurfaceConfig as KukaSurfaceConfig
 from .simulation import simulate_kuka_surface as simulate_kuka_surface
 

@@ -18,7 +18,7 @@ def folder(tmp_path_factory):
     return where
 
 
-@pytest.mark.parametrize(("name", "window"), [("weak-form", 0.1), ("increments", 0.06)])
+@pytest.mark.parametrize(("name", "window"), [("weak-form", 0.1), ("weak-form", 0.06)])
 def test_a_raw_log_teaches_without_accelerations(forcegp, folder, name, window):
     done = forcegp(*FIT, "--learn-from", name, "--window", window, "--out", name, folder=folder)
     assert done.returncode == 0, done.stderr

@@ -19,7 +19,7 @@ from forcegp.errors import InvalidInput
 
 ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
 
-LearnFrom = Literal["accelerations", "increments", "weak-form"]
+LearnFrom = Literal["accelerations", "weak-form"]
 
 POINTS, NETWORK_POINTS = 200, 10_000
 POINTS_HINT = f"{POINTS}; all for functions of one or two inputs, as friction of the joints; networks {NETWORK_POINTS}"
@@ -74,8 +74,8 @@ class ModelOptions(FitOptions):
     the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md.
     By default joint-friction, in contact tool-friction, unless stretches of time left out show joint, or the sum of
     both, to be better."""
-    learn_from: Annotated[LearnFrom, arg(metavar="accelerations|increments|weak-form")] = "accelerations"
-    """accelerations: of the dataset. increments, weak-form: from raw velocities or positions over short windows, of
+    learn_from: Annotated[LearnFrom, arg(metavar="accelerations|weak-form")] = "accelerations"
+    """accelerations: of the dataset. weak-form: from raw positions over short windows, of
     which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
     window: Annotated[float | None, unless_given("SECONDS", f"{WINDOW}", float)] = None
     """Length of the windows."""
@@ -195,12 +195,11 @@ def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
     }
 
 
-def window_observation(learn_from: LearnFrom, seconds: float | None) -> forcegp.data.WindowObservation | None:
+def window_observation(learn_from: LearnFrom, seconds: float | None) -> forcegp.data.WeakForm | None:
     """What to observe of windows of that length; None for accelerations. Raises InvalidInput for no length."""
     if learn_from == "accelerations":
         return None
-    kind = forcegp.WeakForm if learn_from == "weak-form" else forcegp.VelocityIncrements
-    return kind(WINDOW if seconds is None else seconds)
+    return forcegp.WeakForm(WINDOW if seconds is None else seconds)
 
 
 def noise_of_windows(given: str, dataset: forcegp.Dataset, force: float | None = None) -> forcegp.Noise | None:

@@ -21,6 +21,5 @@ from .spectrum import (
     MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,
 )
 from .windows import (
-    OBSERVATIONS as OBSERVATIONS, VelocityIncrements as VelocityIncrements, WeakForm as WeakForm, WindowObservation as
-    WindowObservation, Windows as Windows, observation_of as observation_of,
+    WeakForm as WeakForm, Windows as Windows,
 )

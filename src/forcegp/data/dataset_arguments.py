@@ -1,6 +1,5 @@
 """Datasets as arguments: they come first, but for models and posteriors, and have the joints that are asked for."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
@@ -13,18 +12,10 @@ Result = TypeVar("Result")
 
 
 def dataset_first(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function whose dataset came second in version 0.2: that order still works, with a FutureWarning."""
+    """A function that refuses anything else as its first argument, which came second in version 0.2."""
 
     @wraps(function)
     def ordered(*given: Any, **named: Any) -> Result:
-        if len(given) > 1 and isinstance(given[1], Dataset) and not isinstance(given[0], Dataset):
-            name = function.__name__
-            warnings.warn(
-                f"{name} takes the dataset first: {name}(dataset, ...); the other order will be removed",
-                FutureWarning,
-                stacklevel=2,
-            )
-            given = (given[1], given[0], *given[2:])
         require_type("dataset", given[0] if given else named.get("dataset"), Dataset)
         return cast(Any, function)(*given, **named)
 

@@ -1,26 +1,23 @@
 """Windows: what a log shows of accelerations over short stretches of time, without differentiating it.
 
 With a test function phi of integral 1, y = int phi a dt comes from q or v alone (docs/without-accelerations.md): the
-weak form (Messenger & Bortz 2021, "Weak SINDy"), or with phi = 1/T the increment (v(t1) - v(t0)) / T. Both are linear
-in the unknown forces, and exactly so; no filter comes before. White noise of the signal makes independent noise of y.
+weak form (Messenger & Bortz 2021, "Weak SINDy"). It is linear in the unknown forces, and exactly so; no filter comes
+before. White noise of the signal makes independent noise of y.
 """
 
 import warnings
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import beta
-from typing_extensions import override
 
 from forcegp.data.dataset import Dataset
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
 from forcegp.data.row_selection import farthest_point_sampling
-from forcegp.errors import DatasetError, DataWarning, InvalidInput, require_known, usable_arguments
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
 
 EXACT_DEGREE = 5
@@ -60,39 +57,68 @@ class Windows:
         return self.nodes.a[:: self.weights.shape[1]]
 
 
-class WindowObservation(ABC):
-    """What is observed of every window; a frozen value whose fields are its settings.
+@dataclass(frozen=True)
+class WeakForm:
+    """phi = (1 - s^2)^order on s from -1 to 1, scaled to integral 1; `signal` is "q" (with phi'') or "v" (with phi').
 
     `seconds` is the length of a window, `nodes` the states that stand for its rows (n): each is the weighted mean of
     the rows around it, so that what is linear along a window enters without error, and noise of the states is averaged.
-    `signal` is what y is computed from.
+
+    Order 2 on q is the second derivative of the parabola that fits a window best, and order 1 on v the slope of the
+    straight line: among all unbiased ones these have the least noise (Savitzky & Golay 1964). Higher orders look at the
+    middle of a window only, and need longer ones.
     """
 
-    # Constructors are the check, with messages for people; run-time checks of annotations must not come before.
+    # The constructor is the check, with messages for people; run-time checks of annotations must not come before.
     __no_type_check__: ClassVar[bool] = True
+    name: ClassVar[str] = "weak-form"
+    seconds: float = 0.1
+    nodes: int = 6
+    signal: Literal["q", "v"] = "q"
+    order: int = 2
 
-    name: ClassVar[str]
-    seconds: float
-    nodes: int
-    signal: Literal["q", "v"]
-
+    @usable_arguments("WeakForm")
     def __post_init__(self) -> None:
         if not (isinstance(self.seconds, int | float) and 0.0 < self.seconds < float("inf")):
-            raise InvalidInput(f"{type(self).__name__} seconds is {self.seconds!r}; it must be positive and finite.")
+            raise InvalidInput(f"WeakForm seconds is {self.seconds!r}; it must be positive and finite.")
         if isinstance(self.nodes, bool) or not isinstance(self.nodes, int) or self.nodes < 1:
-            raise InvalidInput(f"{type(self).__name__} nodes is {self.nodes!r}; it must be a whole number from 1.")
+            raise InvalidInput(f"WeakForm nodes is {self.nodes!r}; it must be a whole number from 1.")
+        if self.signal not in ("q", "v"):
+            raise InvalidInput(f"WeakForm signal is {self.signal!r}; allowed: 'q' (positions) or 'v' (velocities).")
+        least = 2 if self.signal == "q" else 1
+        if isinstance(self.order, bool) or not isinstance(self.order, int) or not least <= self.order <= 16:
+            raise InvalidInput(
+                f"WeakForm order is {self.order!r}; on {self.signal} it must be a whole number from {least} to 16."
+            )
 
-    @abstractmethod
     def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
         """w with y = sum_i w_i signal(t_i)."""
+        s, half, step = _scaled(time)
+        p, rest = self.order, 1.0 - s**2
+        size = 1.0 / beta(0.5, p + 1)
+        powers, moments = np.arange(EXACT_DEGREE + 1), np.zeros(EXACT_DEGREE + 1)
+        if self.signal == "v":
+            slope = -2.0 * p * s * rest ** (p - 1)
+            moments[1:] = powers[1:] * self._moments(EXACT_DEGREE)
+            return _exact(-size * slope * step, s, moments) / half
+        bend = -2.0 * p * rest ** (p - 1) + 4.0 * p * (p - 1) * s**2 * np.maximum(rest, 0.0) ** max(p - 2, 0)
+        moments[2:] = powers[2:] * powers[1:-1] * self._moments(EXACT_DEGREE - 1)
+        return _exact(size * bend * step, s, moments) / half**2
 
-    @abstractmethod
     def acceleration_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
         """c with y = sum_i c_i a(t_i), of sum 1."""
+        s, _, step = _scaled(time)
+        phi = (1.0 - s**2) ** self.order / beta(0.5, self.order + 1)
+        return _exact(phi * step, s, self._moments(EXACT_DEGREE + 1))
+
+    def _moments(self, count: int) -> Float[np.ndarray, " count"]:
+        """int phi s^k ds, k = 0, 1, ...."""
+        k = np.arange(count)
+        return np.where(k % 2 == 0, beta(0.5 * (k + 1), self.order + 1) / beta(0.5, self.order + 1), 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Name and settings as plain JSON values."""
-        return {"name": self.name, **asdict(self)}  # type: ignore[call-overload]  # every observation is a dataclass
+        return {"name": self.name, **asdict(self)}
 
     def count(self, dataset: Dataset) -> int:
         """How many windows the dataset has; raises as `windows`."""
@@ -150,92 +176,6 @@ class WindowObservation(ABC):
         return np.concatenate(means)
 
 
-@dataclass(frozen=True)
-class WeakForm(WindowObservation):
-    """phi = (1 - s^2)^order on s from -1 to 1, scaled to integral 1; `signal` is "q" (with phi'') or "v" (with phi').
-
-    Order 2 on q is the second derivative of the parabola that fits a window best, and order 1 on v the slope of the
-    straight line: among all unbiased ones these have the least noise (Savitzky & Golay 1964). Higher orders look at the
-    middle of a window only, and need longer ones.
-    """
-
-    name: ClassVar[str] = "weak-form"
-    seconds: float = 0.1
-    nodes: int = 6
-    signal: Literal["q", "v"] = "q"
-    order: int = 2
-
-    @usable_arguments("WeakForm")
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.signal not in ("q", "v"):
-            raise InvalidInput(f"WeakForm signal is {self.signal!r}; allowed: 'q' (positions) or 'v' (velocities).")
-        least = 2 if self.signal == "q" else 1
-        if isinstance(self.order, bool) or not isinstance(self.order, int) or not least <= self.order <= 16:
-            raise InvalidInput(
-                f"WeakForm order is {self.order!r}; on {self.signal} it must be a whole number from {least} to 16."
-            )
-
-    @override
-    def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        s, half, step = _scaled(time)
-        p, rest = self.order, 1.0 - s**2
-        size = 1.0 / beta(0.5, p + 1)
-        powers, moments = np.arange(EXACT_DEGREE + 1), np.zeros(EXACT_DEGREE + 1)
-        if self.signal == "v":
-            slope = -2.0 * p * s * rest ** (p - 1)
-            moments[1:] = powers[1:] * self._moments(EXACT_DEGREE)
-            return _exact(-size * slope * step, s, moments) / half
-        bend = -2.0 * p * rest ** (p - 1) + 4.0 * p * (p - 1) * s**2 * np.maximum(rest, 0.0) ** max(p - 2, 0)
-        moments[2:] = powers[2:] * powers[1:-1] * self._moments(EXACT_DEGREE - 1)
-        return _exact(size * bend * step, s, moments) / half**2
-
-    @override
-    def acceleration_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        s, _, step = _scaled(time)
-        phi = (1.0 - s**2) ** self.order / beta(0.5, self.order + 1)
-        return _exact(phi * step, s, self._moments(EXACT_DEGREE + 1))
-
-    def _moments(self, count: int) -> Float[np.ndarray, " count"]:
-        """int phi s^k ds, k = 0, 1, ...."""
-        k = np.arange(count)
-        return np.where(k % 2 == 0, beta(0.5 * (k + 1), self.order + 1) / beta(0.5, self.order + 1), 0.0)
-
-
-@dataclass(frozen=True)
-class VelocityIncrements(WindowObservation):
-    """phi = 1/T: the change of the velocity over a window, by its length."""
-
-    name: ClassVar[str] = "increments"
-    seconds: float = 0.1
-    nodes: int = 6
-    signal: Literal["q", "v"] = field(default="v", init=False)
-
-    @override
-    def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        weights = np.zeros_like(time)
-        weights[:, -1] = 1.0 / (time[:, -1] - time[:, 0])
-        weights[:, 0] = -weights[:, -1]
-        return weights
-
-    @override
-    def acceleration_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        s, _, step = _scaled(time)
-        k = np.arange(EXACT_DEGREE + 1)
-        return _exact(0.5 * step, s, np.where(k % 2 == 0, 1.0 / (k + 1), 0.0))
-
-
-OBSERVATIONS: Mapping[str, type[WindowObservation]] = {kind.name: kind for kind in (WeakForm, VelocityIncrements)}
-
-
-def observation_of(given: WindowObservation | str) -> WindowObservation:
-    """The observation of that name with its defaults, or itself. Raises InvalidInput for other names."""
-    if isinstance(given, WindowObservation):
-        return given
-    require_known("observation", given, "forcegp", OBSERVATIONS)
-    return OBSERVATIONS[given]()
-
-
 def white_noise(dataset: Dataset, signal: Literal["q", "v"]) -> Float[np.ndarray, " nv"]:
     """Standard deviation of the white noise of a signal, from its third differences within episodes [its units].
 
@@ -245,7 +185,7 @@ def white_noise(dataset: Dataset, signal: Literal["q", "v"]) -> Float[np.ndarray
     return np.sqrt(np.square(np.concatenate(thirds)).mean(axis=0) / 20.0)
 
 
-def _window_rows(dataset: Dataset, how: WindowObservation) -> Int[np.ndarray, "N m"]:
+def _window_rows(dataset: Dataset, how: WeakForm) -> Int[np.ndarray, "N m"]:
     """Row numbers of all windows: one after the other through every episode, none over a gap."""
     steps = np.diff(dataset.time)[np.diff(dataset.episode) == 0]
     median = float(np.median(steps)) if steps.size else 0.0

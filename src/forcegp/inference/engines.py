@@ -9,7 +9,7 @@ with N rows, r the rank of the mixing vectors, C latents and P points of all lat
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
@@ -136,7 +136,9 @@ class Inducing(Engine):
     def __post_init__(self) -> None:
         _require_whole(self, 1, "points")
         _require_whole(self, 0, "refine")
-        _require_number(self, "tolerance", "at least 0", lambda x: x >= 0.0)
+        tolerance = self.tolerance
+        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance >= 0.0:
+            raise InvalidInput(f"Inducing tolerance is {tolerance!r}; it must be at least 0")
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:
@@ -246,9 +248,3 @@ def _require_whole(engine: Engine, least: int, *names: str) -> None:
         given = getattr(engine, name)
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise InvalidInput(f"{type(engine).__name__} {name} is {given!r}; it must be a whole number >= {least}")
-
-
-def _require_number(engine: Engine, name: str, allowed: str, fine: Callable[[float], bool]) -> None:
-    given = getattr(engine, name)
-    if isinstance(given, bool) or not isinstance(given, int | float) or not fine(given):
-        raise InvalidInput(f"{type(engine).__name__} {name} is {given!r}; it must be {allowed}")

@@ -39,27 +39,10 @@ ROUNDING = 1e-13
 """Remainders below this fraction of the largest k(z, z) are rounding."""
 
 
-@dataclass(frozen=True, eq=False)
-class Pivots:
-    """K ~ rows^T rows (N, N) from the points `indices`; `remainder` is the diagonal of what is left, never negative.
-
-    `rows` is (m, N); its columns at the pivots are the transposed Cholesky factor of their own kernel matrix.
-    """
-
-    indices: Int[Tensor, " m"]
-    rows: Float[Tensor, "m N"]
-    remainder: Float[Tensor, " N"]
-
-    @property
-    def lower(self) -> Float[Tensor, "m m"]:
-        """The lower Cholesky factor of k(z_p, z_p) at the pivots p."""
-        return self.rows[:, self.indices].mT.tril()
-
-
 def pivoted_cholesky(
     kernel: DenseKernel, z: Float[Tensor, "N d"], relevance: Float[Tensor, " N"], most: int, tolerance: float = 0.0
-) -> Pivots:
-    """Greedy pivots, each where the relevance times what is left of k(z, z) is largest.
+) -> Int[Tensor, " m"]:
+    """Numbers of greedy pivots, each where the relevance times what is left of k(z, z) is largest.
 
     At most `most` of them; fewer where the sum of relevance times remainder falls below `tolerance`, but at least one,
     or nothing but rounding is left. Time O(N m^2), memory O(N m).
@@ -81,11 +64,11 @@ def pivoted_cholesky(
             column = kernel.cross(z[pivot : pivot + 1], z)[0]
             column = column - rows[:done].mT @ rows[:done, pivot]
             rows[done] = column / column[pivot].clamp_min(floor).sqrt()
-            rows[done, indices] = 0.0  # exactly, so that `lower` is triangular
+            rows[done, indices] = 0.0  # exactly
             remainder = (remainder - rows[done].square()).clamp_min_(0.0)
             remainder[pivot] = 0.0
             indices.append(pivot)
-        return Pivots(torch.tensor(indices, dtype=torch.long, device=z.device), rows[: len(indices)], remainder)
+        return torch.tensor(indices, dtype=torch.long, device=z.device)
 
 
 BLOCK_BYTES = 64 * 2**20
@@ -327,7 +310,7 @@ def inducing_pivots(
     relevance = C.square().sum(1)[candidates]
     share = tolerance / max(1, C.shape[-1]) * len(candidates)
     return [
-        candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share).indices]
+        candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share)]
         for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
     ]
 

@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.data import Dataset, WindowObservation, Windows, farthest_rows, observation_of
-from forcegp.errors import DataWarning, InvalidInput
+from forcegp.data import Dataset, WeakForm, Windows, farthest_rows
+from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
@@ -124,7 +124,7 @@ class StructuredGP(StructuredModel):
     def fit_windows(
         self,
         dataset: Dataset,
-        observe: WindowObservation | str,
+        observe: WeakForm,
         *,
         points: int | None = None,
         restarts: int | None = None,
@@ -141,7 +141,7 @@ class StructuredGP(StructuredModel):
         Parameters
         ----------
         dataset: raw, and at the rate of its sensors.
-        observe: `WeakForm(seconds=0.1)`, `VelocityIncrements(seconds=0.1)` or the name of one.
+        observe: `WeakForm(seconds=0.1)`.
         points: train on this many windows, those that lie farthest apart; None takes all. Inference is exact.
 
         The noise is that of a window's weighted mean acceleration; a model without `noise` learns it, from where the
@@ -155,7 +155,7 @@ class StructuredGP(StructuredModel):
         dataset: Dataset,
         learn: Learned | Sequence[Learned],
         *,
-        observe: WindowObservation | str | None = None,
+        observe: WeakForm | None = None,
         prior_strength: float = 0.0,
         points: int | None = None,
         restarts: int | None = None,
@@ -237,10 +237,12 @@ class StructuredGP(StructuredModel):
         return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
 
     def _fit_windows(
-        self, dataset: Dataset, observe: WindowObservation | str, points: int | None, search: Search
+        self, dataset: Dataset, observe: WeakForm, points: int | None, search: Search
     ) -> StructuredPosterior:
         """From windows: parameters and the posterior from all of them."""
-        windows = observation_of(observe).windows(checked_rows(self.system.robot.joint_names, dataset), points)
+        windows = require_type("observe", observe, WeakForm).windows(
+            checked_rows(self.system.robot.joint_names, dataset), points
+        )
         model = replace(self, noise=noise_of_windows(self.noise, windows))
         fitted = model._fit_with_loads(windows, dataset, search)
         reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
