@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import pickle
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,9 +13,8 @@ from tests.models.test_update import assert_same, fit
 from forcegp.codegen import library
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.inference import Inducing
 from forcegp.models import StructuredGP, load_posterior, predictor_code, save_posterior
-from forcegp.models.structured import posterior as posterior_module
+from forcegp.models.structured import update
 from forcegp.priors import JointForces, JointFriction, Payload
 
 FIRST, HORIZON = 14, 20.0
@@ -100,7 +98,7 @@ def test_it_is_the_posterior_of_kernels_with_a_factor_in_time(posterior, data, h
 
 
 def test_points_at_all_states_leave_nothing_out_and_nothing_is_forgotten_without_end(posterior, data, monkeypatch):
-    monkeypatch.setattr(posterior_module, "Inducing", partial(Inducing, tolerance=0.0))
+    monkeypatch.setattr(update, "ENOUGH", 0.0)
     again = data.rows(slice(FIRST, FIRST + 6))
     found = posterior.update(again, horizon=math.inf)
     assert_same(found, posterior.update(again), data, tolerance=1e-6)

@@ -8,6 +8,7 @@ Newton's method fails, or because it leaves the range of a table, is left to `in
 import ctypes
 import warnings
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -199,6 +200,18 @@ def fused(
         ended[rows], not_found[rows] = again.diverged_at, again.not_found
     warn_of_divergence(ended, not_found, method.failure, dt, what)
     return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended, not_found)
+
+
+class Motions(NamedTuple):
+    """q, v (..., T+1, nv) in rad and rad/s (m and m/s), a (..., T, nv) in rad/s^2 (m/s^2), as in a `Rollout`.
+
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    """
+
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    diverged_at: Tensor
 
 
 class FusedLoop:

@@ -20,7 +20,7 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
+from forcegp.models.fused_rollouts import STEPS, FusedLoop, Motions, fused
 from forcegp.models.kept_code import KeptCode
 from forcegp.models.prediction import Gaussian
 from forcegp.models.predictor_code import TermsFunction
@@ -55,18 +55,6 @@ class JointForces(NamedTuple):
     M: Tensor
     A: Tensor
     b: Tensor
-
-
-class Motions(NamedTuple):
-    """q, v (..., T+1, nv) in rad and rad/s (m and m/s), a (..., T, nv) in rad/s^2 (m/s^2), as in a `Rollout`.
-
-    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
-    """
-
-    q: Tensor
-    v: Tensor
-    a: Tensor
-    diverged_at: Tensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,10 +101,9 @@ class Predictor(Summary):
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
 
     def refreshed(self, posterior: Any) -> "Predictor":
-        """That of `posterior.update(...)` in milliseconds: the same programs with other tables; this one stays.
+        """That of `posterior.update(...)` in milliseconds: the same programs, traced at most once, with other tables.
 
-        Nothing is compiled, and nothing traced but once, if the programs were found on disk. Raises InvalidInput for
-        other posteriors, compressed covariances, and kernels that leave numbers in the programs.
+        Raises InvalidInput for other posteriors, compressed covariances, and kernels with numbers in the programs.
         """
         latent: Any = getattr(posterior, "latent", None)
         same = latent and latent.kernels is self.latent.kernels and posterior.system is self.posterior.system

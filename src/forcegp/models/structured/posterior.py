@@ -15,7 +15,6 @@ from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.inference import (
     Engine,
-    Inducing,
     InducingPosterior,
     LatentKernels,
     LatentPosterior,
@@ -25,7 +24,6 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
-from forcegp.inference.engines import InducingWeights
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
@@ -44,7 +42,7 @@ from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, St
 from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
 from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
-from forcegp.models.structured.update import Keep, learn_more_rows, on_rows, parts_kept
+from forcegp.models.structured.update import Keep, learn_and_forget, learn_more_rows
 from forcegp.models.training_data import ACCELERATION, FORCE, Noise, TrainingData, second_moments, shrunk
 from forcegp.priors import JointAccelerations, JointForces, NoForces
 from forcegp.robots.arguments import real_tensor
@@ -284,32 +282,9 @@ class StructuredPosterior(Posterior):
             )
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
         require_rows("rows", rows, self.system.robot.joint_names, "the model", example)
-        settings = {"rows_added": self.settings.get("rows_added", 0) + len(rows)}
         if horizon is not None:
-            until = float(rows.time.max())
-            seconds = until - self.settings.get("learned_until", float(rows.time.min()))
-            if budget is not None or seconds < 0.0:
-                raise InvalidInput(
-                    f"budget is {budget} and these rows end {seconds:.4g} s after those learned before; with a horizon "
-                    "give no budget, and rows in the order of time."
-                )
-            kept = parts_kept(horizon, seconds, self.model.prior, self.system.robot)
-            more, latent = on_rows(self.likelihood, self.parameters, self.model.noise, rows), self.latent
-            with torch.no_grad(), blas_threads(len(rows)):
-                if not isinstance(latent, InducingPosterior):
-                    kernels = exact(latent, "learning from more rows").kernels
-                    latent = Inducing(points=100).condition(kernels, self.likelihood.terms(self.parameters))
-                assert isinstance(latent, InducingPosterior)
-                latent = replace(latent, space=latent.space.learned(kept, more.terms(self.parameters)))
-            engine = InducingWeights(tuple(len(z) for z in latent.features))
-            settings |= {"engine": engine.to_dict(), "learned_until": until}
-            return replace(self, latent=latent, engine=engine).with_settings(**settings)
-        before = exact(self.latent, "learning from more rows")
-        likelihood, latent = learn_more_rows(
-            self.likelihood, self.parameters, before, self.model.noise, rows, budget, keep
-        )
-        settings |= {"points": len(latent.system.deflation.C), "budget": budget}
-        return replace(self, likelihood=likelihood, latent=latent).with_settings(**settings)
+            return learn_and_forget(self, rows, budget, horizon)
+        return learn_more_rows(self, rows, budget, keep)
 
     @override
     def refined_on_motions(

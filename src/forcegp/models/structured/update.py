@@ -11,14 +11,16 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, InvalidInput, require_known
-from forcegp.inference import ExactPosterior
-from forcegp.inference.cholesky_update import rows_to_keep, with_only, with_rows
+from forcegp.inference import ExactPosterior, InducingPosterior, exact
+from forcegp.inference.cholesky_update import with_only, with_rows
+from forcegp.inference.engines import ENOUGH, InducingWeights
 from forcegp.inference.memory import require_memory
 from forcegp.models.search import blas_threads
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
+from forcegp.models.structured.motion_unknowns import Structured
 from forcegp.models.structured.prior_checks import check_distance
-from forcegp.models.training_data import ACCELERATION, Noise, TrainingData
+from forcegp.models.training_data import TrainingData
 from forcegp.priors import ForcePrior
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
@@ -33,27 +35,16 @@ OTHER_NOISE = 0.1
 """Part of the fit's level of noise by which rows may state another one without a warning."""
 
 
-def learn_more_rows(
-    likelihood: MarginalLikelihood,
-    parameters: Mapping[str, Tensor],
-    latent: ExactPosterior,
-    noise: Noise | None,
-    rows: Dataset,
-    budget: int | None,
-    keep: Keep = rows_to_keep,
-) -> tuple[MarginalLikelihood, ExactPosterior]:
-    """What `StructuredPosterior.update` documents: the rows that are conditioned on afterwards, and the posterior.
-
-    `latent` is the posterior on the rows of `likelihood` at `parameters`, `noise` that of the model.
-    """
+def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, keep: Keep) -> Structured:
+    """What `StructuredPosterior.update` documents without a horizon."""
+    latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
     budget = None if budget is None else whole_number("budget", budget, 2)
-    training = likelihood.training
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
     _require_memory(latent, len(rows), height, budget)
-    more = on_rows(likelihood, parameters, noise, rows)
+    more = _on_rows(posterior, rows)
     added, reference = more.training, more.training.reference
     with torch.no_grad(), blas_threads(training.q.numel()):
-        features, W, residual, variance = more.terms(parameters)
+        features, W, residual, variance = more.terms(posterior.parameters)
         variance = variance.expand(len(W), *variance.shape[1:])
         for start in range(0, len(W), height):
             part = slice(start, start + height)
@@ -62,10 +53,37 @@ def learn_more_rows(
             if budget is not None and len(training.q) > budget:
                 kept = keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
-    return replace(more, training=replace(training, reference=reference)), latent
+    likelihood = replace(more, training=replace(training, reference=reference))
+    told = {"points": len(latent.system.alpha), "budget": budget}
+    told["rows_added"] = posterior.settings.get("rows_added", 0) + len(rows)
+    return replace(posterior, likelihood=likelihood, latent=latent).with_settings(**told)
 
 
-def parts_kept(horizon: float | Mapping[str, float], seconds: float, prior: ForcePrior, robot: Robot) -> list[float]:
+def learn_and_forget(
+    posterior: Structured, rows: Dataset, budget: int | None, horizon: float | Mapping[str, float]
+) -> Structured:
+    """What it documents with one. An exact posterior goes over to inducing points among its rows."""
+    settings, until, latent = posterior.settings, float(rows.time.max()), posterior.latent
+    seconds = until - settings.get("learned_until", float(rows.time.min()))
+    if budget is not None or seconds < 0.0:
+        raise InvalidInput(
+            f"budget is {budget} and these rows end {seconds:.4g} s after those learned before; with a horizon give no "
+            "budget, and rows in the order of time."
+        )
+    kept = _parts_kept(horizon, seconds, posterior.model.prior, posterior.system.robot)
+    more = _on_rows(posterior, rows)
+    with torch.no_grad(), blas_threads(len(rows)):
+        if not isinstance(latent, InducingPosterior):
+            kernels, terms = exact(latent, "learning from more rows").kernels, posterior.likelihood.terms
+            latent = InducingPosterior.condition(kernels, terms(posterior.parameters), points=100, tolerance=ENOUGH)
+        latent = replace(latent, space=latent.space.learned(kept, more.terms(posterior.parameters)))
+    engine = InducingWeights(tuple(len(z) for z in latent.features))
+    told = {"engine": engine.to_dict(), "learned_until": until}
+    told["rows_added"] = settings.get("rows_added", 0) + len(rows)
+    return replace(posterior, latent=latent, engine=engine).with_settings(**told)
+
+
+def _parts_kept(horizon: float | Mapping[str, float], seconds: float, prior: ForcePrior, robot: Robot) -> list[float]:
     """exp(-seconds / horizon) of every latent, from one horizon in s or {term: its own}. Raises InvalidInput."""
     terms = term_slices(prior, robot)
     horizons = horizon if isinstance(horizon, Mapping) else {name: horizon for name, *_ in terms}
@@ -77,14 +95,13 @@ def parts_kept(horizon: float | Mapping[str, float], seconds: float, prior: Forc
     return [math.exp(-seconds / own) for part in found for own in part]
 
 
-def on_rows(
-    likelihood: MarginalLikelihood, parameters: Mapping[str, Tensor], noise: Noise | None, rows: Dataset
-) -> MarginalLikelihood:
+def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
     """The likelihood of other rows, checked, with the standardization at hand instead of one that is computed again."""
+    likelihood, noise = posterior.likelihood, posterior.model.noise
     training, stated = likelihood.training, rows.noise_std
     reference = training if training.reference is None else training.reference
     if noise is not None and noise.from_data and reference.noise_std is None:
-        _warn_of_another_noise(parameters[ACCELERATION].exp().cpu().numpy(), rows)
+        _warn_of_another_noise(posterior.noise_std.cpu().numpy(), rows)
     if reference.noise_std is not None and stated is not None and stated.ndim == 1:
         rows = replace(rows, noise_std=np.tile(stated, (len(rows), 1)))  # every row states it then
     added = replace(TrainingData.of(rows, training.q.device), reference=reference)
@@ -105,7 +122,7 @@ def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
             "of the fit is used for them, too; state the noise of every row (noise_std of shape (rows, nv)) in the fit "
             "and here, or fit again to all rows",
             DataWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
