@@ -21,7 +21,9 @@ def examples() -> list[str]:
 def test_the_examples_run(examples, tmp_path):
     pytest.importorskip("pybullet")
     pytest.importorskip("gymnasium")
-    limited, plan, states, many = run_example(examples[0] + examples[1], tmp_path).splitlines()
+    limited, plan, states, many, kept = run_example("".join(examples[:3]), tmp_path).splitlines()
+    assert kept == "True True"
+    assert (tmp_path / "next.csv").exists()
     assert many == "(64, 14)"
     assert limited == "torch.Size([7]) tensor(False)"
     assert (plan, states) == ("torch.Size([7])", "torch.Size([5, 14])")
@@ -49,7 +51,7 @@ def test_dynamics_for_planners_in_torch(predictor):
 def test_the_crocoddyl_model_has_the_derivatives_of_its_accelerations(examples, predictor):
     crocoddyl = pytest.importorskip("crocoddyl", reason="crocoddyl is not installed")
     names = {}
-    exec(examples[2], names)
+    exec(examples[3], names)
     state = crocoddyl.StateVector(2)
     costs = crocoddyl.CostModelSum(state, 1)
     costs.addCost("u", crocoddyl.CostModelResidual(state, crocoddyl.ResidualModelControl(state, 1)), 0.1)

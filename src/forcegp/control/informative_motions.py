@@ -41,7 +41,7 @@ from forcegp.summary import Summary, rounded
 QUANTITIES = ("position", "velocity", "acceleration", "torque")
 SPANS, SAMPLES = 2.5, 20  # pieces of a spline per second, samples in each
 SHRINK, ROUNDS, EXACT = 0.85, 40, 1e-12  # of a motion beyond its limits; rounding
-LONGEST = 120.0  # s, for the memory of all samples
+LONGEST, INSIDE = 120.0, 0.95  # s, for the memory of all samples; of the positions, for a start that is not given
 STATES, MOST_ROWS = 150, 150  # where the spread is computed; those learned so far that take part in the search
 DRY = 0.05  # velocity in rad/s (m/s) within which the dry friction of a robot without learned forces turns
 Values = Float[np.ndarray, "n nv"]
@@ -283,7 +283,7 @@ def excitation(
       identification of base parameters and friction.
     * limits: of "position" (from the start), "velocity", "acceleration" and "torque", numbers or one per joint, in rad,
       s and Nm (m, N); those of the URDF count, too, `margin` times.
-    * start: posture (nv,); None takes the mean of the training rows, or the middle of the joints' ranges.
+    * start: posture (nv,); None takes the mean of the training rows, or the middle of the joints' limits.
     * surfaces: contacts whose points keep `clearance` m away; None takes the model's. No other collision is looked at.
     * motions: how many to look at; the first third at random, the others as changes to the best so far.
 
@@ -298,8 +298,12 @@ def excitation(
         if not isinstance(value, int | float) or not 0.0 < value <= most:
             raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
     if start is None:
-        middles = [x.lower + (x.upper - x.lower) / 2.0 if x.upper - x.lower < np.inf else 0.0 for x in robot.joints]
-        start = model.training.q.mean(0) if isinstance(model, Posterior) else middles
+        half = np.array([(x.upper - x.lower) / 2.0 for x in robot.joints])
+        middle = np.array([x.lower if np.isfinite(x.lower) else 0.0 for x in robot.joints]) + np.nan_to_num(
+            half, posinf=0.0
+        )
+        start = model.training.q.mean(0).numpy() if isinstance(model, Posterior) else middle
+        start = start.clip(middle - INSIDE * margin * half, middle + INSIDE * margin * half)
     start = finite_vector("start", start, robot.nv)
     bounds = motion_limits(robot, start, require_type("limits", limits or {}, Mapping), margin)
     rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1)
