@@ -34,6 +34,7 @@ from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.components import inverse_dynamics
+from forcegp.models.structured.update import learn_more_rows
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number
 from forcegp.summary import Summary, rounded
@@ -65,7 +66,7 @@ class LearnedForces:
     def __init__(self, posterior: StructuredPosterior, rows: int) -> None:
         self.rows, free, own = rows, posterior.system.with_contacts(()), posterior.likelihood
         own = replace(own, system=free, fixed_standardization=own.standardization)
-        self.posterior = replace(posterior, model=replace(posterior.model, system=free), likelihood=own, target=None)
+        self.posterior = replace(posterior, likelihood=own, target=free)
         latent, given = exact(posterior.latent, "choosing a motion"), posterior.training
         kept = far_apart(given.q, given.v, given.u, MOST_ROWS)
         self.few = replace(self.posterior, latent=with_only(latent, torch.as_tensor(kept)))
@@ -80,7 +81,10 @@ class LearnedForces:
         q, v, _, u = (x[some] for x in motion[1:])
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, system = posterior.noise_std.numpy(), posterior.system
-        return posterior.update(Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, system=system))
+        rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, system=system)
+        before = posterior.likelihood, posterior.parameters, exact(posterior.latent, "choosing a motion")
+        likelihood, latent = learn_more_rows(*before, posterior.model.noise, rows, None)
+        return replace(posterior, likelihood=likelihood, latent=latent)
 
     def spread(self, posterior: StructuredPosterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""
