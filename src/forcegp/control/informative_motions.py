@@ -26,7 +26,7 @@ from forcegp.control.controller import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
-from forcegp.errors import InvalidInput, require_known, require_type
+from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.inference.cholesky_update import with_only
 from forcegp.inference.posterior import exact
 from forcegp.integration.integrators import check_time_step
@@ -265,6 +265,7 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], mar
     return limits
 
 
+@usable_arguments("excitation")
 def excitation(
     model: Robot | MechanicalSystem | Posterior,
     *,
@@ -309,8 +310,8 @@ def excitation(
         start = model.training.q.mean(0).numpy() if isinstance(model, Posterior) else middle
         start = start.clip(middle - INSIDE * margin * half, middle + INSIDE * margin * half)
     start = finite_vector("start", start, robot.nv)
-    bounds = motion_limits(robot, start, require_type("limits", limits or {}, Mapping), margin)
-    rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1)
+    bounds = motion_limits(robot, start, require_type("limits", {} if limits is None else limits, Mapping), margin)
+    rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
     learned = model if isinstance(model, StructuredPosterior) and model.latent_names else None
     teaches = BaseParameters(system, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
     surfaces = (system if surfaces is None else system.with_contacts(surfaces)).contacts
