@@ -1,4 +1,4 @@
-"""The pictures of docs/control.md, of one seed each: `tracking` as errors over time and as a film of the arm, contacts.
+"""The pictures of docs/control.md, of one seed: `tracking` over time and as a film, contacts, and an excitation.
 
 python -m benchmarks.control_pictures
 """
@@ -12,10 +12,12 @@ import torch
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
+import forcegp
 from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
-from benchmarks.tracking import GAINS, RATE, controllers, excitation, followed, robot_of, rows_of, task_of
+from benchmarks.excitation import LIMITS, Learner
+from benchmarks.tracking import GAINS, MIDDLE, RATE, controllers, excitation, followed, robot_of, rows_of, task_of
 from forcegp import MechanicalSystem, PDGravity, Robot
-from forcegp.evaluation import contacts_figure
+from forcegp.evaluation import contacts_figure, excitation_figure
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SERIES, SMALL, TRUTH, new_figure, quiet, save_figure
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "control"
@@ -133,3 +135,6 @@ if __name__ == "__main__":
     arm, found = motions()
     save_figure(errors(found), FOLDER / "tracking.png")
     film(arm, found).save(FOLDER / "tracking.gif", PillowWriter(fps=FRAMES_PER_SECOND), dpi=80)
+    learner = Learner(SEED)
+    chosen = forcegp.excitation(learner.before, limits=LIMITS, start=MIDDLE, task=learner.task, seed=SEED)
+    save_figure(excitation_figure(chosen), FOLDER / "excitation.png")

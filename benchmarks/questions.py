@@ -229,11 +229,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "error along a task after 10 s of the chosen motion / of random Fourier series (median)",
         ),
         "excitation_over_random_splines": ("", "the same: / of random splines, each joint scaled to its own limits"),
-        "excitation_without_task_over_random_series": (
-            "",
-            "the same, chosen without a log of the task / random series",
-        ),
-        "excitation_rank_correlation": ("", "predicted spread and error afterwards over 30 motions: rank correlation"),
+        "excitation_rank_correlation": ("", "predicted spread and error afterwards over 14 motions: rank correlation"),
         "excitation_limits_used": ("<= 1", "largest position, velocity, acceleration or torque over its limit"),
         "excitation_cpu_seconds": ("<= 60", "CPU time of choosing, 7 joints and 10 s, slowest seed [s]"),
     },

@@ -22,9 +22,11 @@ def test_the_examples_run(examples, tmp_path):
     pytest.importorskip("pybullet")
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
-    limited, plan, states, many, lasted, *touched, rows = run_example("".join(examples[:4]), tmp_path).splitlines()
-    assert (lasted, rows) == ("True", "2400")
+    printed = run_example("".join(examples[:5]), tmp_path).splitlines()
+    limited, plan, states, many, lasted, *touched, rows, kept = printed
+    assert (lasted, rows, kept) == ("True", "2400", "True True")
     assert touched == []
+    assert (tmp_path / "next.csv").exists()
     assert many == "(64, 14)"
     assert limited == "torch.Size([7]) tensor(False)"
     assert (plan, states) == ("torch.Size([7])", "torch.Size([5, 14])")
@@ -52,7 +54,7 @@ def test_dynamics_for_planners_in_torch(predictor):
 def test_the_crocoddyl_model_has_the_derivatives_of_its_accelerations(examples, predictor):
     crocoddyl = pytest.importorskip("crocoddyl", reason="crocoddyl is not installed")
     names = {}
-    exec(examples[4], names)
+    exec(examples[5], names)
     state = crocoddyl.StateVector(2)
     costs = crocoddyl.CostModelSum(state, 1)
     costs.addCost("u", crocoddyl.CostModelResidual(state, crocoddyl.ResidualModelControl(state, 1)), 0.1)

@@ -13,7 +13,7 @@ from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import excitation_figure
 from forcegp.inference import OptimizerOptions
-from forcegp.priors import JointFriction
+from forcegp.priors import ContactFriction, JointFriction, SumPrior
 
 FREE = arm_system(0)
 START = [0.3, 0.8, -0.6]
@@ -138,8 +138,9 @@ def test_a_point_stays_away_from_surfaces():
 
 
 def test_a_model_in_contact_learns_what_moves_freely():
-    found = excitation(fitted(JointFriction(), arm_system()), **FEW | {"motions": 3}, surfaces=[], rows=10)
-    assert (found.spread[1] < found.spread[0]).all()
+    for prior in (JointFriction(), SumPrior([JointFriction(), ContactFriction()])):
+        found = excitation(fitted(prior, arm_system()), **FEW | {"motions": 3}, surfaces=[], rows=10)
+        assert (found.spread[1] < found.spread[0]).all()
 
 
 def test_models_without_learned_forces_move_for_parameters():
@@ -201,6 +202,13 @@ def test_joints_without_ends_move_within_their_velocities():
 def test_what_cannot_be_is_refused(posterior, changes, message):
     with pytest.raises(InvalidInput, match=message):
         excitation(posterior, **FEW | changes)
+
+
+def test_without_a_start_it_is_inside_of_the_limits(posterior):
+    how = {"motions": 1, "seconds": 4.0, "margin": 0.2}
+    np.testing.assert_allclose(excitation(FREE, **how).start, 0.0, atol=1e-12)  # the limits are -3 and 3
+    middle = posterior.training.q.mean(0).numpy()
+    np.testing.assert_allclose(excitation(posterior, **how).start, middle.clip(-0.57, 0.57))
 
 
 def test_only_robots_and_models_move():

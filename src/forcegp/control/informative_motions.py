@@ -26,14 +26,15 @@ from forcegp.control.controller import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
-from forcegp.errors import InvalidInput, require_known, require_type
-from forcegp.inference.cholesky_update import with_only
+from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
+from forcegp.inference.cholesky_update import rows_to_keep, with_only
 from forcegp.inference.posterior import exact
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.components import inverse_dynamics
+from forcegp.models.structured.update import learn_more_rows
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number
 from forcegp.summary import Summary, rounded
@@ -41,7 +42,7 @@ from forcegp.summary import Summary, rounded
 QUANTITIES = ("position", "velocity", "acceleration", "torque")
 SPANS, SAMPLES = 2.5, 20  # pieces of a spline per second, samples in each
 SHRINK, ROUNDS, EXACT = 0.85, 40, 1e-12  # of a motion beyond its limits; rounding
-LONGEST = 120.0  # s, for the memory of all samples
+LONGEST, INSIDE = 120.0, 0.95  # s, for the memory of all samples; of the positions, for a start that is not given
 STATES, MOST_ROWS = 150, 150  # where the spread is computed; those learned so far that take part in the search
 DRY = 0.05  # velocity in rad/s (m/s) within which the dry friction of a robot without learned forces turns
 Values = Float[np.ndarray, "n nv"]
@@ -65,7 +66,7 @@ class LearnedForces:
     def __init__(self, posterior: StructuredPosterior, rows: int) -> None:
         self.rows, free, own = rows, posterior.system.with_contacts(()), posterior.likelihood
         own = replace(own, system=free, fixed_standardization=own.standardization)
-        self.posterior = replace(posterior, model=replace(posterior.model, system=free), likelihood=own, target=None)
+        self.posterior = replace(posterior, likelihood=own, target=free)
         latent, given = exact(posterior.latent, "choosing a motion"), posterior.training
         kept = far_apart(given.q, given.v, given.u, MOST_ROWS)
         self.few = replace(self.posterior, latent=with_only(latent, torch.as_tensor(kept)))
@@ -80,7 +81,8 @@ class LearnedForces:
         q, v, _, u = (x[some] for x in motion[1:])
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, system = posterior.noise_std.numpy(), posterior.system
-        return posterior.update(Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, system=system))
+        rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, system=system)
+        return learn_more_rows(posterior, rows, None, rows_to_keep)
 
     def spread(self, posterior: StructuredPosterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""
@@ -261,6 +263,7 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], mar
     return limits
 
 
+@usable_arguments("excitation")
 def excitation(
     model: Robot | MechanicalSystem | Posterior,
     *,
@@ -283,7 +286,7 @@ def excitation(
       identification of base parameters and friction.
     * limits: of "position" (from the start), "velocity", "acceleration" and "torque", numbers or one per joint, in rad,
       s and Nm (m, N); those of the URDF count, too, `margin` times.
-    * start: posture (nv,); None takes the mean of the training rows, or the middle of the joints' ranges.
+    * start: posture (nv,); None takes the mean of the training rows, or the middle of the joints' limits.
     * surfaces: contacts whose points keep `clearance` m away; None takes the model's. No other collision is looked at.
     * motions: how many to look at; the first third at random, the others as changes to the best so far.
 
@@ -298,11 +301,15 @@ def excitation(
         if not isinstance(value, int | float) or not 0.0 < value <= most:
             raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
     if start is None:
-        middles = [x.lower + (x.upper - x.lower) / 2.0 if x.upper - x.lower < np.inf else 0.0 for x in robot.joints]
-        start = model.training.q.mean(0) if isinstance(model, Posterior) else middles
+        half = np.array([(x.upper - x.lower) / 2.0 for x in robot.joints])
+        middle = np.array([x.lower if np.isfinite(x.lower) else 0.0 for x in robot.joints]) + np.nan_to_num(
+            half, posinf=0.0
+        )
+        start = model.training.q.mean(0).numpy() if isinstance(model, Posterior) else middle
+        start = start.clip(middle - INSIDE * margin * half, middle + INSIDE * margin * half)
     start = finite_vector("start", start, robot.nv)
-    bounds = motion_limits(robot, start, require_type("limits", limits or {}, Mapping), margin)
-    rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1)
+    bounds = motion_limits(robot, start, require_type("limits", {} if limits is None else limits, Mapping), margin)
+    rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
     learned = model if isinstance(model, StructuredPosterior) and model.latent_names else None
     teaches = BaseParameters(system, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
     surfaces = (system if surfaces is None else system.with_contacts(surfaces)).contacts

@@ -238,7 +238,7 @@ def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = T
         return Choice(Inducing(), f"inducing: {rows}, and the processes have {size.features} features at most")
     if fits and size.rows * size.rank <= MOST_EXACT_ENTRIES:
         return Choice(exact, f"exact: {rows} need {gib(needed)}, {gib(free)} are free")
-    many = Inducing(points=MANY_POINTS)
+    many = Inducing(points=MANY_POINTS, refine=0)  # on all rows an iteration would take half a minute
     many.require_memory(size, device)
     return Choice(many, f"inducing: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")
 

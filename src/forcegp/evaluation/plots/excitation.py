@@ -32,7 +32,7 @@ def excitation_figure(chosen: Excitation) -> Figure:
             std = posterior.curve(panels[j].latent, v).std
             style.draw_line(axes, v, std, color, 1.2, f"standard deviation {when}")
         axes.set_yscale("log")
-        style.quiet(axes, x="velocity in rad/s (m/s)", y="" if j else "of friction in Nm (N)")
+        style.quiet(axes, x="velocity in rad/s (m/s)", y="" if j else "standard deviation in Nm (N)")
     style.legend_below(figure, *grid[:, 0])
     style.heading(figure, f"The next {chosen.seconds:g} s")
     return figure
