@@ -71,6 +71,17 @@ def test_calls_are_the_run(monitor):
         torch.testing.assert_close(torch.stack([getattr(call, name) for call in calls]), getattr(whole, name))
 
 
+def test_a_broken_sample_is_an_error_and_no_alarm_later(monitor):
+    q, v, u = motion(1.0, 3)
+    monitor.restart()
+    for k in range(50):
+        monitor(q[k], v[k], u[k])
+    with pytest.raises(InvalidInput, match="give finite numbers"):
+        monitor(np.full(2, np.nan), v[50], u[50])
+    later = [bool(monitor(q[k], v[k], u[k]).alarm) for k in range(51, 90)]
+    assert not any(later)
+
+
 def test_distances_are_mahalanobis_of_a_covariance_that_moves_with_the_inertia(monitor):
     q, v, u = motion(1.0, 4)
     state, row = monitor.run(q, v, u), 50

@@ -89,7 +89,10 @@ class ContactMonitor(Summary):
     ) -> None:
         self.model, system = model, system_of(model)
         if system.contacts:
-            raise InvalidInput("ContactMonitor looks for contacts that are not modelled; posterior.with_contacts([]).")
+            raise InvalidInput(
+                "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
+                "motion, or give posterior.with_contacts([])."
+            )
         known = not (isinstance(model, Predictor) and model.kind != "none")
         covariance = covariance or ("noise" if known else "noise and posterior")
         require_known("covariance", covariance, "ContactMonitor", ("noise", "noise and posterior"))
@@ -146,8 +149,8 @@ class ContactMonitor(Summary):
 
     def __call__(self, q: Any, v: Any, u: Any) -> ContactState:
         """What the step to this sample shows, called every `dt` s; q, v and u (nv,), which acts from now on."""
-        sample = self._motion(q, v, u)
-        before, self._before = self._before, sample
+        before, self._before = self._before, None  # of a broken sample the next one takes nothing over
+        self._before = sample = self._motion(q, v, u)
         if before is None:
             return self._state(self._torque, self._torque.new_zeros(()))
         middle = 0.5 * (before[0] + sample[0]), 0.5 * (before[1] + sample[1])
