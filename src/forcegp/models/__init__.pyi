@@ -7,8 +7,8 @@ from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .identification.identification import Identification as Identification
 from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned
-from .prediction import Gaussian as Gaussian, Prediction as Prediction
-from .predictor import Linearization as Linearization, Predictor as Predictor
+from .prediction import Linearization as Linearization, Gaussian as Gaussian, Prediction as Prediction
+from .predictor import Predictor as Predictor
 from .protocol import Model as Model, Posterior as Posterior
 from .rollout import Rollout as Rollout, StepLinearization as StepLinearization
 from .search import ALL_ROWS as ALL_ROWS, default_options as default_options, default_restarts as default_restarts

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from jaxtyping import Float
@@ -120,3 +120,22 @@ def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Predict
         return type(first)(*(joined([getattr(part, item.name) for part in parts]) for item in fields(first)))
 
     return joined(blocks)
+
+
+class Linearization(NamedTuple):
+    """a(q, v, u) and its derivatives at a state (nv,) or states (n, nv): da_dq[..., i, j] = d a_i / d q_j."""
+
+    a: Tensor
+    da_dq: Tensor
+    da_dv: Tensor
+    da_du: Tensor
+
+
+class JointForces(NamedTuple):
+    """Q_K + Q_U (..., nv) at states under their u, dQ/du and M (..., nv, nv), A (..., m, nv) and b (..., m)."""
+
+    Q: Tensor
+    dQ_du: Tensor
+    M: Tensor
+    A: Tensor
+    b: Tensor

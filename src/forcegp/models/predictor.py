@@ -8,7 +8,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, Motions, fused
 from forcegp.models.kept_code import KeptCode
-from forcegp.models.prediction import Gaussian
+from forcegp.models.prediction import Gaussian, JointForces, Linearization
 from forcegp.models.predictor_code import TermsFunction
 from forcegp.models.rollout import StepLinearization, by_sample, checked_start, linearized_step, stepped
 from forcegp.models.structured.components import Components, forces_around, inverse_dynamics
@@ -36,25 +36,6 @@ INSTEAD_OF_TRANSFORMS = (
 BY_TORCH = "predictions are computed by torch, some hundred times slower"
 BLOCK_NUMBERS = 2**18
 """Kernel values that torch works on at once: 2 MiB, so that they stay in the processor's cache."""
-
-
-class Linearization(NamedTuple):
-    """a(q, v, u) and its derivatives at a state (nv,) or states (n, nv): da_dq[..., i, j] = d a_i / d q_j."""
-
-    a: Tensor
-    da_dq: Tensor
-    da_dv: Tensor
-    da_du: Tensor
-
-
-class JointForces(NamedTuple):
-    """Q_K + Q_U (..., nv) at states under their u, dQ/du and M (..., nv, nv), A (..., m, nv) and b (..., m)."""
-
-    Q: Tensor
-    dQ_du: Tensor
-    M: Tensor
-    A: Tensor
-    b: Tensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)

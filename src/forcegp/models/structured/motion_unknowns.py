@@ -180,5 +180,5 @@ def _space(posterior: Structured) -> WeightSpace:
         for c, z in enumerate(terms.features):
             relevance = deflation.C[..., c].square().sum(1)
             most = POINTS.get(z.shape[-1], MORE)
-            points.append(z[pivoted_cholesky(kernels.dense[c], z, relevance, most).indices])
+            points.append(z[pivoted_cholesky(kernels.dense[c], z, relevance, most)])
         return WeightSpace.of(kernels, terms.features, points, deflation.C, deflation.t)
