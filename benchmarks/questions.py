@@ -196,12 +196,6 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "normal_force_force_true_friction_noise": ("", "the friction of the simulation with that noise: force [N]"),
         "normal_force_path_true_friction_noise": ("", "the same: place [mm]"),
     },
-    "mujoco_forces": {
-        "mujoco_difference": ("<= 1e-8", "largest difference of MuJoCo's accelerations from predict [rad/s^2]"),
-        "mujoco_step_ratio": ("<= 1.3", "CPU time of mj_step with learned friction in seven joints / without"),
-        "mujoco_step_us": ("", "the same with it [us]"),
-        "mujoco_threads_identical": (">= 1", "1 if motions on 8 threads are those on one to the last bit"),
-    },
     "contact_monitor": {
         "monitor_5n": (">= 0.99", "pushes of 5 N at the elbow that are found, one false alarm in 10 hours asked for"),
         "monitor_5n_delay_ms": ("<= 60", "the same: delay [ms]"),
@@ -210,6 +204,12 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "monitor_3n_laws": ("", "pushes of 3 N found with Coulomb's and viscous friction of the same rows"),
         "monitor_3n_urdf": ("", "pushes of 3 N found with the URDF alone"),
         "monitor_call_ms": ("<= 1", "CPU time of one call [ms]"),
+    },
+    "mujoco_forces": {
+        "mujoco_difference": ("<= 1e-8", "largest difference of MuJoCo's accelerations from predict [rad/s^2]"),
+        "mujoco_step_ratio": ("<= 1.3", "CPU time of mj_step with learned friction in seven joints / without"),
+        "mujoco_step_us": ("", "the same with it [us]"),
+        "mujoco_threads_identical": (">= 1", "1 if motions on 8 threads are those on one to the last bit"),
     },
     "swing_up": {
         "swing_up_learned_over_true": ("<= 1.05", "cost of a swing-up by MPPI at 50 Hz: learned / true model"),

@@ -11,6 +11,7 @@ import sys
 
 import pytest
 from tests.cli.test_import import FLAGS
+from tests.control import test_monitor as monitored
 from tests.models.arm import arm_data
 from tests.recordings.log_files import motion, table, write_text
 from tests.validation.moving_arm import moving_arm
@@ -47,6 +48,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
         "results/report.md",
     ),
     "rollout": (("run", "test.h5", "--starts", 1, "--seconds", 0.05, "--out", "motion"), "motion/rollout.h5"),
+    "monitor": (("free-run", "pushed.h5", "--free", "free.h5", "--out", "touched"), "touched/contacts.csv"),
     "excite": (
         ("run", "--seconds", 1, "--motions", 2, "--clearance", 0.001, "--surface", "none", "--out", "next.csv"),
         "next.png",
@@ -64,7 +66,10 @@ def folder(forcegp, tmp_path_factory):
         arm_data(rows, seed).save(place / f"{name}.h5")
     moving_arm(1.0, 2).save(place / "log.h5")
     write_text(place / "log.csv", table(motion()))
-    assert forcegp("fit", "arm.h5", *QUICK, "--out", "run", folder=place).returncode == 0
+    for name, seconds, seed in (("free", 55.0, 1), ("pushed", 3.0, 7)):
+        monitored.saved(place / f"{name}.h5", monitored.motion(seconds, seed))
+    for words in (("arm.h5", "--out", "run"), ("free.h5", "--prior", "joint-friction", "--out", "free-run")):
+        assert forcegp("fit", *words, *QUICK, folder=place).returncode == 0
     return place
 
 
