@@ -45,7 +45,7 @@ class Monitor(Command):
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: contacts.csv, contacts.json and contacts.png."""
     free: Annotated[Path | None, LOG, unless_given("LOG", "--free-seconds of LOG")] = None
-    """A log in which nothing touches the robot, of 50 s or more, which the model did not learn from."""
+    """A log in which nothing touches the robot, of 40 s or more, which the model did not learn from."""
     free_seconds: Annotated[float | None, unless_given("S", "--free")] = None
     """Nothing touches the robot in the first S seconds of LOG; they serve as --free, and are not looked at."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside, or by the names")] = None
@@ -108,7 +108,7 @@ class Monitor(Command):
             [each["link"], *(f"{each[name]:.2f}" for name in ("start", "end", "newton")), f"{each['peak'] / limit:.1f}"]
             for each in contacts
         ]
-        terminal.show(columns(title, header, rows))
+        terminal.show(columns(title, header, rows) if rows else title)
         return {**content, "contacts": contacts}
 
     def _dataset(self, terminal: Terminal, path: Path, posterior: Any) -> forcegp.Dataset:

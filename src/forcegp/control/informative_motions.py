@@ -33,6 +33,7 @@ from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact, MechanicalSystem
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
+from forcegp.models.search import blas_threads
 from forcegp.models.structured.components import inverse_dynamics
 from forcegp.models.structured.update import learn_more_rows
 from forcegp.robots import Robot
@@ -322,17 +323,18 @@ def excitation(
     elif isinstance(teaches, LearnedForces):
         q, v = (rng.uniform(low, high, (STATES, robot.nv)) for low, high in (bounds[x] for x in QUANTITIES[:2]))
         teaches.judged_at = start + q, v, teaches.torques(start + q, v, 0.0 * v)
-    for k in range(motions):
-        points, changed = draft.random(rng), k >= max(1, motions // 3)
-        if changed:  # change some joints for some time
-            middle, width = rng.uniform(0.0, len(points)), rng.uniform(1.0, len(points))
-            near = np.exp(-((np.arange(len(points)) - middle) ** 2) / (2.0 * width**2))[:, None]
-            points = best.points + size * near * (rng.random(robot.nv) < 0.5) * points
-        motion = draft.kept(points)
-        score = teaches.score(motion)
-        size *= (1.3 if score < least else 0.96) if changed else 1.0
-        best, least = (motion, score) if score < least else (best, least)
-        progress(k + 1, motions)
+    with blas_threads(MOST_ROWS):
+        for k in range(motions):
+            points, changed = draft.random(rng), k >= max(1, motions // 3)
+            if changed:  # change some joints for some time
+                middle, width = rng.uniform(0.0, len(points)), rng.uniform(1.0, len(points))
+                near = np.exp(-((np.arange(len(points)) - middle) ** 2) / (2.0 * width**2))[:, None]
+                points = best.points + size * near * (rng.random(robot.nv) < 0.5) * points
+            motion = draft.kept(points)
+            score = teaches.score(motion)
+            size *= (1.3 if score < least else 0.96) if changed else 1.0
+            best, least = (motion, score) if score < least else (best, least)
+            progress(k + 1, motions)
     if not np.isfinite(least):
         raise InvalidInput(
             f"none of {motions} motions shows all base parameters; give more seconds, limits or motions."

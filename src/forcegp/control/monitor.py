@@ -25,9 +25,9 @@ from forcegp.summary import Summary
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
 
-BLOCK = 5.0
+BLOCK = 2.0
 """Seconds of free motion of which the largest distance counts once: what follows upon it resembles it."""
-LEAST_BLOCKS = 10
+LEAST_BLOCKS = 20
 PLACES = 5
 """Points along each link where a contact is tried."""
 EXPLAINED = float(chi2.ppf(0.95, 1))
@@ -39,7 +39,7 @@ class ContactState:
     """What a monitor found at rows (...): `torque` (..., nv) in Nm (N) of what touches the robot, low-pass filtered.
 
     `distance` (...) is its Mahalanobis distance from free motion, squared; `alarm` where that is over the threshold.
-    `probability` is the share of stretches of 5 s of free motion in which the distance stays below this one.
+    `probability` is the share of stretches of 2 s of free motion in which the distance stays below this one.
     """
 
     torque: Float[Tensor, "*rows nv"]
@@ -124,7 +124,7 @@ class ContactMonitor(Summary):
     def calibrate(self, free: Sequence[Motion], *, false_alarms_per_hour: float = 0.1) -> "ContactMonitor":
         """Learn the noise and the threshold from recordings (T, nv) of free motion; returns the monitor.
 
-        The largest distances of stretches of 5 s follow a Gumbel distribution (Fisher, Tippett 1928), whose quantile is
+        The largest distances of stretches of 2 s follow a Gumbel distribution (Fisher, Tippett 1928), whose quantile is
         the threshold: so minutes of free motion serve for a rate of one in hours, as far as its tail is the same. Take
         another motion than the model learned from, as varied as those to come.
         """
