@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from scipy.signal import butter
 from tests.data.samples import assert_equal, dataset
 from tests.models.arm import arm_system
 
@@ -254,15 +253,6 @@ def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
     assert again.report["earlier"]["cutoff"] == 12.0
 
 
-@pytest.mark.parametrize(("cutoff", "order"), [(12.0, 1), (12.0, 4), (3.0, 7)])
-def test_the_halo_ends_where_the_slowest_mode_of_the_filter_has_decayed(cutoff, order):
-    _, poles, _ = butter(order, 2.0 * np.pi * cutoff, analog=True, output="zpk")
-    decay = np.abs(poles.real).min()
-    halo = Preparation(cutoff=cutoff, order=order, delay=(0.03, -0.05)).halo
-    assert decay * (halo - 0.05) == pytest.approx(-np.log(1e-12))
-    assert Preparation(delay=-0.02).halo == 0.02
-
-
 def test_velocities_can_be_the_source():
     data, _ = noisy(4.0)
     prepared = Preparation(cutoff=12.0, differentiate="v").apply(data)
@@ -284,11 +274,13 @@ def test_the_price_is_the_noise_that_is_left():
 @pytest.mark.parametrize(
     ("cutoff", "late", "seed"), [(6.0, {"delay": 0.013}, 0), (20.0, {"delay": -0.0037}, 1), (80.0, {"lag": 0.02}, 2)]
 )
-def test_pieces_with_their_halo_are_the_whole(cutoff, late, seed):
+def test_rows_depend_on_those_near_them_only(cutoff, late, seed):
     data, _ = noisy(4.0, seed)
     preparation = Preparation(cutoff=cutoff, **late)
     whole = preparation.apply(data).dataset
-    reach = round(preparation.halo * RATE) + 24
+    late, lag = abs(late.get("delay", 0.0)), late.get("lag", 0.0)
+    slowest = 2.0 * np.pi * cutoff * np.sin(0.5 * np.pi / preparation.order)  # pole of Butterworth's filter
+    reach = round((late + 27.6 * (lag + 1.0 / slowest)) * RATE) + 24  # exp(-27.6) = 1e-12; splines and differences
     first, last = 900, 1100
     piece = preparation.apply(data.rows(slice(max(0, first - reach), last + reach))).dataset
     inner = (piece.time >= data.time[first]) & (piece.time < data.time[last])
@@ -337,6 +329,3 @@ def test_what_cannot_be_prepared_is_named():
         Preparation(delay=(0.0, 0.0, 0.1)).apply(data)
     with pytest.raises(DatasetError, match=r"episode 0 .*3\.998 s.* 2\.5 s"):
         Preparation(trim=2.5).apply(data)
-    with pytest.raises(InvalidInput, match="automatic cut-off or delay is not known"):
-        _ = Preparation(cutoff="auto").halo
-    assert Preparation(cutoff="auto").resolved(data).halo > 0.1

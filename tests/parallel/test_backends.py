@@ -8,7 +8,7 @@ from tests.parallel import tasks
 from tests.parallel.conformance import BackendConformance, WorkersConformance
 
 from forcegp.errors import InvalidInput
-from forcegp.parallel import Joblib, Serial, backend_for, backend_of
+from forcegp.parallel import Joblib, Serial, backend_for
 
 
 class TestSerial(BackendConformance):
@@ -35,9 +35,9 @@ class TestJoblib(WorkersConformance):
 
 
 def test_backends_by_name():
-    assert backend_of("serial") == Serial() == backend_of("serial", 1)
-    assert backend_of("joblib", 3) == Joblib(3)
-    assert backend_of("joblib") == Joblib(os.cpu_count())
+    assert backend_for("serial") == Serial() == backend_for("serial", 1)
+    assert backend_for("joblib", 3) == Joblib(3)
+    assert backend_for("joblib") == Joblib(os.cpu_count())
 
 
 def test_what_functions_mean_by_jobs_and_backend():
@@ -58,11 +58,11 @@ def test_what_functions_mean_by_jobs_and_backend():
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda: backend_of("dask"), "no backend 'dask'; choose serial, joblib"),
-        (lambda: backend_of("joblib", 0), "jobs is 0; give the number of tasks at once, at least 1"),
+        (lambda: backend_for("dask"), "no backend 'dask'; choose serial, joblib"),
+        (lambda: backend_for("joblib", 0), "jobs is 0; give the number of tasks at once, at least 1"),
         (lambda: backend_for(None, -2), "jobs is -2; give"),
         (lambda: Joblib(1.5), "jobs is 1.5; give"),  # type: ignore[arg-type]  # the mistake that is told
-        (lambda: backend_of("serial", 2), "serial does one task at a time, not 2; choose joblib"),
+        (lambda: backend_for("serial", 2), "serial does one task at a time, not 2; choose joblib"),
     ],
 )
 def test_wrong_arguments_are_told(make, told):

@@ -14,7 +14,7 @@ from forcegp.analytical.least_squares import Fit, NoiseLevels, weighted_least_sq
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import dataset_first, require_rows
+from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots.arguments import whole_number
@@ -27,7 +27,6 @@ REWEIGHTINGS = 2
 """Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
 
 
-@dataset_first
 def identify_analytical(
     dataset: Dataset,
     system: MechanicalSystem | None = None,
@@ -66,7 +65,7 @@ def identify_analytical(
     Raises InvalidInput for options that make no sense and for a system in contact.
     """
     with usable_arguments("identify_analytical"):
-        given = dataset.system if system is None else system
+        given = require_type("dataset", dataset, Dataset).system if system is None else system
         system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
         require_rows("dataset", dataset, system.robot.joint_names, "the robot")
         for name, given, allowed in (
@@ -171,7 +170,6 @@ STRETCHES = 4
 """Stretches of time that logs of fewer than three episodes are cut into."""
 
 
-@dataset_first
 def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> NoiseLevels:
     """Noise of accelerations and forces about systems identified without the rows in question.
 
@@ -183,6 +181,7 @@ def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> No
     there are three or more, else by `STRETCHES` stretches of time.
     Raises InvalidInput for free inertias, whose mass matrix need not be one, and for too few rows.
     """
+    require_type("dataset", dataset, Dataset)
     if how.get("inertias", "consistent") != "consistent":
         raise InvalidInput("held-out noise needs a mass matrix that can be inverted; use inertias='consistent'.")
     residuals, masses = [], []

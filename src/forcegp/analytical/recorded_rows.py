@@ -25,12 +25,10 @@ from jaxtyping import Float
 
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import dataset_first
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.mechanics import KnownForce, LoadJointFriction, MechanicalSystem, RigidBodyBias, State
 
 
-@dataset_first
 def motion_residuals(
     dataset: Dataset, system: MechanicalSystem
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
@@ -40,6 +38,7 @@ def motion_residuals(
     the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u| shrinks
     the residual of any model.
     """
+    require_type("dataset", dataset, Dataset)
     q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=system.robot.device) for x in ("q", "v", "u", "a"))
     dynamics = system.dynamics(q, v, u)
     force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]

@@ -22,8 +22,7 @@ from forcegp.errors import InvalidInput
 
 PLACE = tuple(f"{name}_{axis}" for name in ("point", "force", "force_std") for axis in "xyz")
 COLUMNS = ("start", "end", "peak", "probability", "link", "also", "newton", *PLACE)
-APART = 0.25
-"""Alarms that are less apart in s belong to one contact."""
+APART = 0.25  # alarms that are less apart in s belong to one contact
 
 
 @dataclass(frozen=True, kw_only=True)

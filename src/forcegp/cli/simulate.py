@@ -18,6 +18,7 @@ import forcegp.simulation
 from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import Command, Debug, Json, require_free_file
 from forcegp.cli.terminal import Terminal
+from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,14 +26,17 @@ class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, by default a plane and
-    viscous friction (Rath, Geist, Trimpe 2021). Equal seeds give equal way-points; train and test need different ones.
+    viscous friction (Rath, Geist, Trimpe 2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
+    friction in every joint, without PyBullet. Equal seeds give equal motions; train and test need different ones.
 
     For instance:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
       forcegp simulate kuka-surface --friction stribeck --patch 4 --joint-friction stribeck --out rough.h5
+      forcegp simulate ur5-free --seconds 60 --seed 1 --out arm.h5
+      forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
     """
 
-    scenario: Positional[Literal["kuka-surface"]]
+    scenario: Positional[Literal["kuka-surface", "ur5-free", "double-pendulum"]]
     """What to simulate."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
@@ -49,11 +53,11 @@ class Simulate(Command):
     coulomb or stribeck. Default: viscous; coulomb with --contact bullet, which has no other."""
     friction_coefficient: Annotated[float | None, arg(metavar="F")] = None
     """Viscous in N/(m/s), default 1; coulomb and stribeck: friction per normal force while sliding, default 0.3."""
-    joint_friction: Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"] = (
-        "none"
-    )
+    joint_friction: (
+        Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"] | None
+    ) = None
     """Friction of the joints that nobody models either: dry and viscous, with stribeck and exponential more near rest;
-    asymmetric, load, lugre and drift have no kernel of their own."""
+    asymmetric, load, lugre and drift have no kernel of their own. Default: none; free arms stribeck."""
     patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """Makes friction so many times as large on the strip 0 < x < 0.25 m of the surface; 1 for none."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
@@ -90,8 +94,13 @@ class Simulate(Command):
 
     def _config(self) -> dict[str, Any]:
         """The fields of the scenario's configuration that the options set."""
-        same = ("seconds", "seed", "noise", "episodes", "friction", "joint_friction", "surface", "contact")
-        fields = {name: getattr(self, name) for name in same}
+        given = {name: getattr(self, name) for name in ("seconds", "seed", "noise", "episodes", "joint_friction")}
+        fields = {name: value for name, value in given.items() if value is not None}
+        if self.scenario != "kuka-surface":
+            for word in self.words("friction", "friction_coefficient", "patch", "surface", "contact"):
+                raise InvalidInput(f"{word} means nothing to {self.scenario}, whose arm touches nothing; leave it out.")
+            return {"arm": self.scenario, **fields}
+        fields |= {name: getattr(self, name) for name in ("friction", "surface", "contact")}
         fields["patch_factor"] = self.patch
         if self.friction_coefficient is not None:
             dry = self.friction in ("coulomb", "stribeck") or self.contact == "bullet"
@@ -103,7 +112,8 @@ def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) ->
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
     chosen = forcegp.simulation.SCENARIOS[scenario]
     config = chosen.config(**options)
-    _import_silently("pybullet")
+    if scenario == "kuka-surface":
+        _import_silently("pybullet")
     with terminal.progress(f"simulating seed {config.seed}") as report:
         return chosen.simulate(config, report)
 

@@ -28,10 +28,8 @@ Motion = tuple[Any, Any, Any]
 BLOCK = 2.0
 """Seconds of free motion of which the largest distance counts once: what follows upon it resembles it."""
 LEAST_BLOCKS = 20
-PLACES = 5
-"""Points along each link where a contact is tried."""
-EXPLAINED = float(chi2.ppf(0.95, 1))
-"""Links whose misfit is larger by less explain a torque as well as the best."""
+PLACES = 5  # points along each link where a contact is tried
+EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less explain a torque as well as the best
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,10 +45,8 @@ int evaluate(const double *const *t) { /* take these tables, and report whether 
 }
 """
 PURPOSE = Purpose("a passive force for MuJoCo", "the environment variable XDG_CACHE_HOME", "use predictor.rollouts")
-STATES = 5
-"""Random ones at which the robots are compared."""
-ALIKE = 1e-6
-"""Largest relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF."""
+STATES = 5  # random ones, at which robots are compared
+ALIKE = 1e-6  # relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF
 
 
 class MujocoForces(Summary):

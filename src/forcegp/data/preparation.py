@@ -17,8 +17,6 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 AUTOMATIC = "auto", "each"
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
-FORGOTTEN = 1e-12
-"""What may be left of a row's influence beyond the halo."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,21 +72,6 @@ class Preparation:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
         if self.differentiate not in ("q", "v"):
             raise InvalidInput(f"differentiate is {self.differentiate!r}; allowed: 'q' or 'v'.")
-
-    @property
-    def halo(self) -> float:
-        """Seconds on either side of a row that influence it, to one part in 10^12.
-
-        A log that is prepared piece by piece needs so much before and after each piece, and 24 rows more for splines
-        and differences. Raises InvalidInput while cut-off or delay are "auto": `resolved` finds them first.
-        """
-        if "auto" in (self.cutoff, self.delay, self.lag) or "each" in (self.delay, self.lag):
-            raise InvalidInput("the halo of an automatic cut-off or delay is not known; find them first: resolved().")
-        reach = max(map(abs, seconds_of(self.delay))) - np.log(FORGOTTEN) * max(seconds_of(self.lag))
-        if self.cutoff is not None:
-            slowest = 2.0 * np.pi * float(self.cutoff) * np.sin(0.5 * np.pi / self.order)  # slowest Butterworth pole
-            reach += -np.log(FORGOTTEN) / slowest
-        return float(reach)
 
     @property
     def changes_nothing(self) -> bool:

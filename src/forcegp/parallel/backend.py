@@ -303,32 +303,23 @@ class _Processes(Pool):
 BACKENDS: dict[str, type[Backend]] = {kind.name: kind for kind in (Serial, Joblib)}
 
 
-def backend_of(name: str, jobs: int | None = None) -> Backend:
-    """The backend of this name: serial or joblib.
-
-    jobs: tasks at once; None is as many as this machine has cores. Raises InvalidInput for another name, and for more
-    than one job of serial.
-    """
-    if name not in BACKENDS:
-        raise InvalidInput(f"there is no backend {name!r}; choose {', '.join(BACKENDS)}")
-    if jobs is not None:
-        check_jobs(jobs)
-    if name == Joblib.name:
-        return Joblib(os.cpu_count() or 1 if jobs is None else jobs)
-    if jobs not in (None, 1):
-        raise InvalidInput(f"backend serial does one task at a time, not {jobs}; choose joblib, or leave jobs out")
-    return Serial()
-
-
 def backend_for(given: Backend | str | None, jobs: int | None = None) -> Backend:
     """What a function means that takes both: a backend, its name, or None for processes as soon as jobs is above 1.
 
-    Raises InvalidInput as `backend_of`, and for a backend with jobs of its own together with others.
+    Raises InvalidInput for other names, more than one job of serial, and other jobs beside a backend's own.
     """
     if given is None:
         given = Serial.name if jobs in (None, 1) else Joblib.name
     if isinstance(given, str):
-        return backend_of(given, jobs)
+        if given not in BACKENDS:
+            raise InvalidInput(f"there is no backend {given!r}; choose {', '.join(BACKENDS)}")
+        if jobs is not None:
+            check_jobs(jobs)
+        if given == Joblib.name:
+            return Joblib(os.cpu_count() or 1 if jobs is None else jobs)
+        if jobs not in (None, 1):
+            raise InvalidInput(f"backend serial does one task at a time, not {jobs}; choose joblib, or leave jobs out")
+        return Serial()
     if not isinstance(given, Backend):
         raise InvalidInput(
             f"backend is a {type(given).__name__}; give Serial(), Joblib(jobs), or one of the names "

@@ -1,4 +1,4 @@
-"""Scenarios by name, and every number of `kuka-surface`. Loads no library: a command line lists the options at once."""
+"""Scenarios by name, and every number of them. Loads no library: a command line lists the options at once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
 import forcegp.data
-from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.errors import InvalidInput, require_known, usable_arguments
 
 Range = tuple[str, float, float]
 """What is allowed in words, the least and the largest value."""
@@ -307,6 +307,31 @@ _LENGTHS = {item.name: len(item.default) for item in fields(KukaSurfaceConfig) i
 _CHOICES = {"friction": Friction, "joint_friction": JointFriction, "surface": Surface, "contact": ContactKind}
 
 
+@dataclass(frozen=True, kw_only=True)
+class FreeArmConfig:
+    """PD control with gravity compensation along sines of random size and rate, two per joint, about a posture.
+
+    Friction is (c + (s - c) exp(-(v / v_s)^2)) tanh(v / w) + d v, with c, s and d in proportion to the largest torque
+    of a joint and s = c for "coulomb". `noise` in rad/s^2. Raises InvalidInput naming the field and its range.
+    """
+
+    arm: Literal["ur5-free", "double-pendulum"]
+    seconds: float = 60.0
+    seed: int = 0
+    noise: float = 0.1
+    episodes: int = 1
+    joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
+
+    @usable_arguments("FreeArmConfig")
+    def __post_init__(self) -> None:
+        checked_numbers("seconds", self.seconds, POSITIVE, None)
+        checked_numbers("noise", self.noise, NOT_NEGATIVE, None)
+        require_integer("seed", self.seed, 0, 2**31)
+        require_integer("episodes", self.episodes, 1, 10_000)
+        require_known("joint_friction", self.joint_friction, "a free arm", ("none", "coulomb", "stribeck"))
+        require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A simulation that makes a Dataset. Its libraries are imported at `simulate`, so that listing scenarios is quick.
@@ -327,12 +352,15 @@ class Scenario:
         return getattr(import_module(module), name)(config, progress)
 
 
+FREE_ARM = "forcegp.simulation.free_arms:simulate_free_arm"
 SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
     {
         "kuka-surface": Scenario(
             summary="a KUKA iiwa slides its tool on a surface with friction that nobody models",
             config=KukaSurfaceConfig,
             function="forcegp.simulation.kuka_surface:simulate_kuka_surface",
-        )
+        ),
+        "ur5-free": Scenario("a UR5 that touches nothing, with friction in every joint", FreeArmConfig, FREE_ARM),
+        "double-pendulum": Scenario("two driven rods with friction in both hinges", FreeArmConfig, FREE_ARM),
     }
 )

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from forcegp.data import Dataset, require_disjoint
-from forcegp.data.dataset_arguments import dataset_first
-from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.errors import InvalidInput, require_type, usable_arguments
 
 FORMS = "episodes:N,N..., leave-one-out, fraction:F[:SEED] or blocks:N:K,K..."
 DEFAULT_FRACTION, DEFAULT_BLOCKS = 0.25, "blocks:5:3,5"
@@ -186,7 +185,6 @@ def hold_out_blocks(dataset: Dataset, blocks: int, held_out: Sequence[int], guar
     return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
 
 
-@dataset_first
 @usable_arguments("split_named")
 def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split, ...]:
     """The splits of a text, as `forcegp validate --split` takes it: several for leave-one-out, else one.
@@ -195,6 +193,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     Episodes that `forcegp import` made may be named by a part of the name of their log.
     Raises InvalidInput for anything else, and as the functions above.
     """
+    require_type("dataset", dataset, Dataset)
     kind, _, rest = text.partition(":")
     if text == "auto":
         if len(dataset.episodes) == 1:

@@ -1,0 +1,75 @@
+"""`ur5-free` and `double-pendulum`: arms that touch nothing, with friction in every joint, by our own dynamics."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from forcegp import __version__
+from forcegp.data import Dataset, units_for
+from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
+from forcegp.robots import Robot
+from forcegp.simulation.kuka_surface_config import FreeArmConfig
+
+RATE, FINE = 240, 4  # rows per second, and steps between two
+STIFFNESS = 100.0  # of the controller in 1/s^2, critically damped
+COULOMB, STATIC, VISCOUS = 0.02, 0.03, 0.01  # of a joint's largest torque; viscous per rad/s
+STRIBECK, SMOOTH, SIZE, RATES = 0.1, 0.02, 0.35, (0.8, 3.5)  # [rad/s]; of the sines that joints follow [rad, rad/s]
+ARMS = {  # URDF, posture, and inertia of geared rotors in parts of the largest torque [kg m^2 / Nm]
+    "ur5-free": ("ur5.urdf", (0.0, -1.2, 1.4, -0.8, -1.5, 0.0), 0.01),
+    "double-pendulum": ("double_pendulum.urdf", (0.4, -0.5), 0.0),
+}
+
+
+def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None] | None = None) -> Dataset:
+    """Rows k: q, v, the torque u until row k + 1, and a at the row, so that M a + h = u + Q_U with the true Q_U."""
+    file, middle, rotors = ARMS[config.arm]
+    robot = Robot.from_urdf(Path(__file__).parent / file)
+    most = np.array([joint.effort_limit for joint in robot.joints])
+    robot = robot.with_armature(rotors * most)
+    plant = robot.compile()
+    static = STATIC if config.joint_friction == "stribeck" else COULOMB
+    size = most if config.joint_friction != "none" else 0.0 * most
+
+    def friction(v: np.ndarray) -> np.ndarray:
+        dry = COULOMB + (static - COULOMB) * np.exp(-((v / STRIBECK) ** 2))
+        return -size * (dry * np.tanh(v / SMOOTH) + VISCOUS * v)
+
+    def acceleration(q: np.ndarray, v: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """At the row for dt = 0, else of a step that is implicit in friction, to first order: it may be stiff."""
+        M, h = (x.numpy() for x in plant.mass_matrix_and_bias(torch.from_numpy(q), torch.from_numpy(v)))
+        slope = dt * size * (static / SMOOTH * (1.0 - np.tanh(v / SMOOTH) ** 2) + VISCOUS)
+        return np.linalg.solve(M + np.diag(slope), u + friction(v) - h)
+
+    steps, rows, noise = max(2, round(config.seconds * RATE)), [], []
+    for episode in range(config.episodes):
+        rng = np.random.default_rng([config.seed, episode])
+        amplitude, w = SIZE * rng.uniform(0.5, 1.0, (2, robot.nv)), rng.uniform(*RATES, (2, robot.nv))
+        q, v = np.array(middle), np.zeros(robot.nv)
+        for k in range(steps):
+            t = k / RATE
+            ramp, slope = 1.0 - np.exp(-(t**2)), 2.0 * t * np.exp(-(t**2))  # from rest
+            x, dx = (amplitude * np.sin(w * t)).sum(0), (amplitude * w * np.cos(w * t)).sum(0)
+            wanted = STIFFNESS * (middle + ramp * x - q) + 2.0 * STIFFNESS**0.5 * (slope * x + ramp * dx - v)
+            M, g = plant.mass_matrix(torch.from_numpy(q)), plant.gravity_forces(torch.from_numpy(q))
+            u = np.clip(M.numpy() @ wanted + g.numpy(), -most, most)
+            rows.append((q, v, u, acceleration(q, v, u, 0.0), friction(v)))
+            for _ in range(FINE):
+                v = v + acceleration(q, v, u, 1.0 / (RATE * FINE)) / (RATE * FINE)
+                q = q + v / (RATE * FINE)
+            if progress is not None and k % RATE == 0:
+                progress(episode * steps + k, config.episodes * steps)
+        noise.append(np.random.default_rng([config.seed, episode, 1]).standard_normal((steps, robot.nv)))
+    q, v, u, a, Q_U = map(np.array, zip(*rows, strict=True))
+    return Dataset(
+        q=q, v=v, u=u, a=a + config.noise * np.concatenate(noise),
+        time=np.tile(np.arange(steps) / RATE, config.episodes),
+        episode=np.repeat(np.arange(config.episodes), steps),
+        units=units_for(robot),
+        system=MechanicalSystem(robot, known_forces=(Actuation(), RigidBodyBias())),
+        noise_std=np.full(robot.nv, config.noise) if config.noise > 0 else None,
+        truth={"a": a, "Q_U": Q_U} | ({"Q_U.joint-friction": Q_U} if size.any() else {}),
+        metadata={"scenario": config.arm, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}},
+    )  # fmt: skip
