@@ -1,15 +1,32 @@
 """`forcegp simulate` with other friction, surfaces and contacts."""
 
 import json
+from importlib.util import find_spec
 
 import pytest
 
 from forcegp import Dataset
 from forcegp.mechanics import Sphere
 
-pytest.importorskip("pybullet")
+SURFACES = pytest.mark.skipif(find_spec("pybullet") is None, reason="pip install 'forcegp[sim]'")
 
 
+@pytest.mark.parametrize("arm", ["ur5-free", "double-pendulum"])
+def test_free_arms_need_no_other_library(forcegp, tmp_path, arm):
+    made = forcegp("simulate", arm, "--seconds", 0.5, "--seed", 3, "--out", "log.h5", "--json", folder=tmp_path)
+    assert made.returncode == 0, made.stderr
+    data, config = Dataset.load(tmp_path / "log.h5"), json.loads(made.stdout)["config"]
+    assert (len(data), config["arm"], config["seed"], config["joint_friction"]) == (120, arm, 3, "stribeck")
+    assert data.metadata["scenario"] == arm
+    refused = forcegp("simulate", arm, "--surface", "sphere", "--out", "no.h5", folder=tmp_path)
+    assert refused.returncode == 2
+    assert f"--surface means nothing to {arm}" in refused.stderr
+    refused = forcegp("simulate", arm, "--joint-friction", "lugre", "--out", "no.h5", folder=tmp_path)
+    assert refused.returncode == 2
+    assert "lugre" in refused.stderr
+
+
+@SURFACES
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
@@ -34,6 +51,7 @@ def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
     assert isinstance(data.system.contacts[0].surface, Sphere) == ("sphere" in options)
 
 
+@SURFACES
 @pytest.mark.parametrize(
     ("options", "message"),
     [

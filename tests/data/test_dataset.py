@@ -298,10 +298,16 @@ def test_episodes_are_selected_whole():
     data = dataset(episode=np.repeat([7, 3, 5, 9], 10))
     assert data.episodes == (7, 3, 5, 9)
     assert data.select_episodes([5, 7]).episodes == (7, 5)
+    train, test = data.split_by_episode([3])
+    assert train.episodes == (7, 5, 9)
+    assert test.episodes == (3,)
+    assert len(train) + len(test) == len(data)
     with pytest.raises(InvalidInput, match=r"no episodes \[4\]; this Dataset has \[7, 3, 5, 9\]"):
         data.select_episodes([4])
     with pytest.raises(InvalidInput, match="none asked for"):
         data.select_episodes([])
+    with pytest.raises(InvalidInput, match="none is left to train on"):
+        data.split_by_episode([7, 3, 5, 9])
 
 
 def test_the_class_is_public():

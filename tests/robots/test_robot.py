@@ -79,6 +79,7 @@ def test_links_show_who_moves_them_and_their_inertia(tree):
     np.testing.assert_allclose(camera.inertia, turn @ inertia @ turn.T, atol=1e-18)
     assert tree.link("base").joint is None
     assert tree.link("lens").mass == 0.0
+    assert set(tree.link_names) == set(tree.frame_names)
 
 
 def test_repr_names_robot_and_joints(chain):

@@ -207,6 +207,20 @@ class Dataset(Summary):
             )
         return self.rows(np.isin(self.episode, wanted))
 
+    def split_by_episode(self, test_episodes: Iterable[int]) -> tuple[Dataset, Dataset]:
+        """`(train, test)`, where `test` holds whole episodes and no trajectory is in both.
+
+        Raises InvalidInput for numbers that do not occur and when nothing is left for training.
+        """
+        wanted = set(test_episodes)
+        test = self.select_episodes(sorted(wanted))
+        rest = [number for number in self.episodes if number not in wanted]
+        if not rest:
+            raise InvalidInput(
+                f"all {len(self.episodes)} episodes {list(self.episodes)} are for testing; none is left to train on."
+            )
+        return self.select_episodes(rest), test
+
     def save(self, path: str | Path) -> None:
         """Write an HDF5 file (docs/data-format.md); an interrupted write leaves the old file, or none."""
         write_fields(Path(path), self._fields())

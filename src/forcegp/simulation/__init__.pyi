@@ -1,2 +1,8 @@
+from .free_arms import simulate_free_arm as simulate_free_arm
 from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface
-from .kuka_surface_config import KukaSurfaceConfig as KukaSurfaceConfig, SCENARIOS as SCENARIOS, Scenario as Scenario
+from .kuka_surface_config import (
+    FreeArmConfig as FreeArmConfig,
+    KukaSurfaceConfig as KukaSurfaceConfig,
+    SCENARIOS as SCENARIOS,
+    Scenario as Scenario,
+)

@@ -47,12 +47,13 @@ def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None
     for episode in range(config.episodes):
         rng = np.random.default_rng([config.seed, episode])
         amplitude, w = SIZE * rng.uniform(0.5, 1.0, (2, robot.nv)), rng.uniform(*RATES, (2, robot.nv))
-        q, v = np.array(middle), np.zeros(robot.nv)
+        home = middle + rng.uniform(-SIZE, SIZE, robot.nv)
+        q, v = home, np.zeros(robot.nv)
         for k in range(steps):
             t = k / RATE
             ramp, slope = 1.0 - np.exp(-(t**2)), 2.0 * t * np.exp(-(t**2))  # from rest
             x, dx = (amplitude * np.sin(w * t)).sum(0), (amplitude * w * np.cos(w * t)).sum(0)
-            wanted = STIFFNESS * (middle + ramp * x - q) + 2.0 * STIFFNESS**0.5 * (slope * x + ramp * dx - v)
+            wanted = STIFFNESS * (home + ramp * x - q) + 2.0 * STIFFNESS**0.5 * (slope * x + ramp * dx - v)
             M, g = plant.mass_matrix(torch.from_numpy(q)), plant.gravity_forces(torch.from_numpy(q))
             u = np.clip(M.numpy() @ wanted + g.numpy(), -most, most)
             rows.append((q, v, u, acceleration(q, v, u, 0.0), friction(v)))
