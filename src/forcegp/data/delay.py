@@ -29,7 +29,12 @@ MOST_ROWS = 5_000
 SIGNIFICANT = 3.0
 """Standard deviations by which a delay must differ from zero to be used."""
 
-WORTH = 0.8
+FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0
+"""Of smooth signs of the velocity, relative to its root mean square: together nearly any friction curve."""
+
+ROWS_PER_PARAMETER = 3
+
+WORTH = 0.98
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 
 
@@ -55,18 +60,25 @@ class Delay:
 
     @property
     def each(self) -> Float[np.ndarray, " nv"]:
-        """That of each joint where it is more than three standard deviations from zero and explains a fifth, else 0."""
+        """That of each joint where it is more than three standard deviations from zero and explains something, else 0."""
         remains = self.residual[1] / np.maximum(self.residual[0], TINY)
         return np.where((np.abs(self.seconds) > SIGNIFICANT * self.std) & (remains < WORTH), self.seconds, 0.0)
 
     @property
-    def significant(self) -> float:
-        """The common delay if it is more than three standard deviations from zero and explains a fifth, else 0.
+    def shared(self) -> bool:
+        """Whether most joints show the common delay, to within three standard deviations or a half of it."""
+        apart = np.abs(self.seconds - self.common)[np.isfinite(self.seconds)]
+        near = np.maximum(SIGNIFICANT * self.std[np.isfinite(self.seconds)], 0.5 * abs(self.common))
+        return bool(2 * (apart <= near).sum() > len(apart))
 
-        A log whose torque is mostly friction shows delays that explain nothing: they are properties of the friction.
+    @property
+    def significant(self) -> float:
+        """The common delay if it is more than three standard deviations from zero and explains something, else 0.
+
+        Most joints must show it: the delay of one is not that of all.
         """
         sure = abs(self.common) > SIGNIFICANT * self.common_std and self.remains < WORTH  # NaN is neither
-        return self.common if sure else 0.0
+        return self.common if sure and self.shared else 0.0
 
     @property
     def reason(self) -> str:
@@ -78,7 +90,8 @@ class Delay:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
         if abs(self.common) <= SIGNIFICANT * self.common_std:
             return f"{size}, less than three standard deviations: none is assumed"
-        return f"{size}, but it explains less than a fifth of what inverse dynamics does not: none is assumed"
+        why = "it explains next to nothing of what inverse dynamics does not" if self.shared else "most joints show another"
+        return f"{size}, but {why}: none is assumed"
 
 
 def estimate_delay(
@@ -90,10 +103,10 @@ def estimate_delay(
 ) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
-    For every shift up to `largest` [s] to either side, u is fitted by least squares to what a rigid body with friction
-    in the joint needs: inertial, centrifugal and gravity torques of `robot` (default: that of `dataset.system`), each
-    with a factor of its own, acceleration, velocity and sign of the velocity of the joint, and a constant. So the delay
-    does not rest on the robot's parameters being right. The best shift has the least sum of squares, by a parabola
+    For every shift up to `largest` [s] to either side, u is fitted by least squares to what rigid bodies with friction
+    in the joints need: the torque regressor of `robot` (default: that of `dataset.system`), acceleration and velocity
+    of the joint, smooth signs of the velocity of several widths, and a constant. So the delay rests neither on the
+    robot's parameters nor on a law of friction: with one smooth sign, Stribeck friction looked 20 ms late. The best shift has the least sum of squares, by a parabola
     through the three smallest: among shifts up to 50 ms and, where it lies at their end, up to `largest`, for each
     joint and for all together. Its standard
     deviation comes from leaving out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and
@@ -225,19 +238,22 @@ class _Shifts:
         return np.concatenate(parts, axis=1)
 
 
-def _features(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows 7"]:
+def _features(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
     """What the torque of each joint may be made of, except for its parameters."""
     import torch  # half a second, which only delays should cost
 
     q, v, a = (torch.tensor(getattr(dataset, name), device=robot.device) for name in ("q", "v", "a"))
     with torch.no_grad():
-        gravity = robot.gravity_forces(q)
-        bias = robot.bias_forces(q, v)
-        inertial = robot.inverse_dynamics(q, v, a) - bias
-        parts = [part.cpu().numpy() for part in (inertial, bias - gravity, gravity)]
-    slow = 0.1 * np.sqrt(np.square(dataset.v).mean(axis=0)) + 1e-12
-    columns = [*parts, dataset.a, dataset.v, np.tanh(dataset.v / slow), np.ones_like(dataset.v)]
-    return np.stack(columns, axis=-1).transpose(1, 0, 2)
+        if len(dataset) > ROWS_PER_PARAMETER * 10 * robot.nv:
+            torque = robot.kinematics(q, v).torque_regressor(a).flatten(-2)
+        else:  # factors of the robot's own torques, of which there are three
+            gravity, bias = robot.gravity_forces(q), robot.bias_forces(q, v)
+            parts = (robot.inverse_dynamics(q, v, a) - bias, bias - gravity, gravity)
+            torque = torch.stack(parts, dim=-1)
+    speed = np.square(dataset.v).mean(axis=0) ** 0.5 + TINY
+    dry = [np.tanh(dataset.v / (width * speed)) for width in FRICTION_WIDTHS]
+    own = np.stack([dataset.a, dataset.v, *dry, np.ones_like(dataset.v)], axis=-1)
+    return np.concatenate([torque.cpu().numpy(), own], axis=-1).transpose(1, 0, 2)
 
 
 def _orthonormal(features: Float[np.ndarray, "rows columns"]) -> np.ndarray:
