@@ -22,6 +22,7 @@ from forcegp.mechanics import (
     StribeckJointFriction,
     ViscousJointFriction,
 )
+from forcegp.robots import Robot
 from forcegp.summary import Summary
 
 Rows = Float[np.ndarray, "rows nv"]
@@ -66,14 +67,7 @@ class AnalyticalIdentification(Summary):
         inertias belong to no robot.
         """
         robot = with_bodies(self.given.robot, self.bodies.pseudo_inertias(self._in_bodies))
-        found = self.terms.known_forces(self._in_terms)
-        dry = [f.coefficients for f in found if type(f) is CoulombJointFriction]
-        dry += [f.coulomb for f in found if isinstance(f, StribeckJointFriction | LoadJointFriction)]
-        viscous = [f.coefficients for f in found if type(f) is ViscousJointFriction]
-        damping, friction = (None if not x else torch.as_tensor(x[0]).numpy() for x in (viscous, dry))
-        others = [force for force in self.given.known_forces if type(force) not in self.terms.kinds]
-        robot = with_joint_dynamics(robot, damping, friction)
-        return replace(self.given, robot=robot, known_forces=(*others, *found))
+        return with_terms(self.given, robot, self.terms, self._in_terms)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -195,6 +189,18 @@ class AnalyticalIdentification(Summary):
 
     def _recorded(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> RecordedRows:
         return RecordedRows(self.given, self.terms, q, v, u)
+
+
+def with_terms(given: MechanicalSystem, robot: Robot, terms: JointTerms, x: np.ndarray) -> MechanicalSystem:
+    """The system with this robot and the terms of these coordinates as known forces, friction in its URDF as well."""
+    found = terms.known_forces(x)
+    dry = [f.coefficients for f in found if type(f) is CoulombJointFriction]
+    dry += [f.coulomb for f in found if isinstance(f, StribeckJointFriction | LoadJointFriction)]
+    viscous = [f.coefficients for f in found if type(f) is ViscousJointFriction]
+    damping, friction = (None if not x else torch.as_tensor(x[0]).numpy() for x in (viscous, dry))
+    others = [force for force in given.known_forces if type(force) not in terms.kinds]
+    robot = with_joint_dynamics(robot, damping, friction)
+    return replace(given, robot=robot, known_forces=(*others, *found))
 
 
 def _unit(kind: str, prismatic: bool) -> str:

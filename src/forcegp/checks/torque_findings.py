@@ -7,7 +7,7 @@ import numpy as np
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, look, ok, plain, wrong
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
-from forcegp.data.delay import SIGNIFICANT, WORTH
+from forcegp.data.delay import SIGNIFICANT
 from forcegp.errors import DatasetError
 
 NO_WORSE = 2.0  # factor by which more may remain without a rotor inertia
@@ -117,13 +117,13 @@ def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     except DatasetError:
         return  # too short
     step = float(np.median(np.diff(inputs.even.time)))
-    if delay.significant and abs(delay.common) > LEAST_DELAY * step:
-        yield _delay(inputs.names, delay, delay.common, delay.common_std, delay.remains)
+    if abs(delay.significant) > LEAST_DELAY * step:
+        yield _delay(inputs.names, delay, delay.significant, delay.common_std, delay.remains)
     for joint, name in enumerate(inputs.names):
         own, std = float(delay.seconds[joint]), float(delay.std[joint])
         remains = float(delay.residual[1, joint] / max(delay.residual[0, joint], 1e-12))
         differs = abs(own - delay.significant) > max(SIGNIFICANT * std, 2.0 * step, 2e-3)
-        worth = remains < min(WORTH, MUCH) and delay.residual[0, joint] > 1e-4
+        worth = remains < MUCH and delay.residual[0, joint] > 1e-4 and log.fit.rests_on_robot[joint]
         if np.isfinite(own) and differs and worth and abs(own) > SIGNIFICANT * std:
             yield _delay((name,), delay, own, std, remains)
 

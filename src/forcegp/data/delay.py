@@ -5,6 +5,7 @@ Of both, the number of seconds is taken at which inverse dynamics fits the torqu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -19,7 +20,7 @@ from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 
-USUAL_DELAY, LARGEST_DELAY = 0.05, 0.2  # s
+LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s
 STEPS = 100
 """Shifts that are tried to either side."""
 
@@ -60,38 +61,46 @@ class Delay:
 
     @property
     def each(self) -> Float[np.ndarray, " nv"]:
-        """That of each joint where it is more than three standard deviations from zero and explains something, else 0."""
+        """That of each joint where it is more than three standard deviations from zero and explains something, or 0."""
         remains = self.residual[1] / np.maximum(self.residual[0], TINY)
         return np.where((np.abs(self.seconds) > SIGNIFICANT * self.std) & (remains < WORTH), self.seconds, 0.0)
 
-    @property
-    def shared(self) -> bool:
-        """Whether most joints show the common delay, to within three standard deviations or a half of it."""
-        apart = np.abs(self.seconds - self.common)[np.isfinite(self.seconds)]
-        near = np.maximum(SIGNIFICANT * self.std[np.isfinite(self.seconds)], 0.5 * abs(self.common))
-        return bool(2 * (apart <= near).sum() > len(apart))
+    def _showing(self, seconds: float) -> np.ndarray:
+        """Delays of the joints that show this one, to within three standard deviations or a half of it."""
+        each, std = (x[np.isfinite(self.seconds)] for x in (self.seconds, self.std))
+        near = np.abs(each - seconds) <= np.maximum(SIGNIFICANT * np.nan_to_num(std), 0.5 * abs(seconds))
+        return each[near] if 2 * near.sum() > len(near) else each[:0]
 
     @property
     def significant(self) -> float:
-        """The common delay if it is more than three standard deviations from zero and explains something, else 0.
+        """The delay that most joints show, if it is more than three standard deviations from zero, else 0.
 
-        Most joints must show it: the delay of one is not that of all.
+        It is the common one, or else the median of the joints: where friction makes up most of a torque, noise of the
+        velocity can look like a delay, which the likelihood of all joints then follows.
         """
-        sure = abs(self.common) > SIGNIFICANT * self.common_std and self.remains < WORTH  # NaN is neither
-        return self.common if sure and self.shared else 0.0
+        if not np.isfinite(self.common):
+            return 0.0
+        median = float(np.median(self.seconds[np.isfinite(self.seconds)]))
+        for seconds, remains in ((self.common, self.remains), (median, 0.0)):
+            showing = self._showing(seconds)
+            spread = max(self.common_std, float(np.std(showing)) / len(showing) ** 0.5 if len(showing) else np.inf)
+            if abs(seconds) > max(SIGNIFICANT * spread, LEAST_DELAY) and remains < WORTH:
+                return seconds
+        return 0.0
 
     @property
     def reason(self) -> str:
         """The common delay and what became of it, for people."""
         if not np.isfinite(self.common):
             return f"the torques show no common {self.kind}"
-        size = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms"
-        if self.significant:
+        size, used = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms", self.significant
+        if used == self.common:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
-        if abs(self.common) <= SIGNIFICANT * self.common_std:
-            return f"{size}, less than three standard deviations: none is assumed"
-        why = "it explains next to nothing of what inverse dynamics does not" if self.shared else "most joints show another"
-        return f"{size}, but {why}: none is assumed"
+        if used:
+            return (
+                f"{1e3 * used:.1f} ms, which most joints show (all together {size}, by joints that are mostly friction)"
+            )
+        return f"{size}, but not more than three standard deviations in most joints: none is assumed"
 
 
 def estimate_delay(
@@ -106,11 +115,11 @@ def estimate_delay(
     For every shift up to `largest` [s] to either side, u is fitted by least squares to what rigid bodies with friction
     in the joints need: the torque regressor of `robot` (default: that of `dataset.system`), acceleration and velocity
     of the joint, smooth signs of the velocity of several widths, and a constant. So the delay rests neither on the
-    robot's parameters nor on a law of friction: with one smooth sign, Stribeck friction looked 20 ms late. The best shift has the least sum of squares, by a parabola
-    through the three smallest: among shifts up to 50 ms and, where it lies at their end, up to `largest`, for each
-    joint and for all together. Its standard
-    deviation comes from leaving out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and
-    the bootstrap for general stationary observations").
+    robot's parameters nor on a law of friction: with one smooth sign, Stribeck friction looked 20 ms late. The best
+    shift has the least sum of squares, by a parabola through the three smallest: among shifts up to 50 ms and, where it
+    lies at their end, up to `largest`, for each joint and for all together. Its standard deviation comes from leaving
+    out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and the bootstrap for general
+    stationary observations").
 
     `kind="lag"` finds the time constant T of an actuator of first order instead: u(t) acts with T u_a' + u_a = u.
 
@@ -120,13 +129,14 @@ def estimate_delay(
     robot = _robot(dataset, robot)
     near = _estimated(dataset, robot, min(largest, USUAL_DELAY), kind)
     open_ones = np.isnan(near.seconds) & np.isfinite(near.residual[0])
-    if largest <= USUAL_DELAY or not (open_ones.any() or np.isnan(near.common)):
+    at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
+    if largest <= USUAL_DELAY or not (open_ones.any() or at_end):
         return near
     try:
         far = _estimated(dataset, robot, largest, kind)
     except DatasetError:  # too short for that
         return near
-    if np.isnan(near.common):
+    if at_end:
         return far
     parts = {
         name: np.where(open_ones, getattr(far, name), getattr(near, name)) for name in ("seconds", "std", "residual")
@@ -137,7 +147,7 @@ def estimate_delay(
 def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, kind: str) -> Delay:
     parts = _Shifts(dataset, largest, kind)
     zero = int(np.argmin(np.abs(parts.shifts)))
-    features = _features(robot, dataset.rows(parts.rows))
+    features = torque_columns(robot, dataset.rows(parts.rows))
     nv = dataset.nv
     profiles = np.full((nv, BLOCKS + 1, len(parts.shifts)), np.nan)  # of all rows, and of all but one block
     residual = np.full((2, nv), np.nan)
@@ -204,6 +214,16 @@ def lagged(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"],
     return np.asarray(moved) + values[0]
 
 
+def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
+    """The dataset with each joint's torque taken so many seconds later, after a lag [s] where one is given."""
+    u = dataset.u.copy()
+    for number, rows, _ in episodes_in_order(dataset):
+        for joint, shift in enumerate(seconds):
+            acting = lagged(rows.u[:, joint], rows.time, lags[joint] if len(lags) else 0.0)
+            u[dataset.episode == number, joint] = delayed(acting, rows.time, shift)
+    return replace(dataset, u=u, truth={})
+
+
 class _Shifts:
     """The rows that are compared, and how to shift a torque against them."""
 
@@ -238,7 +258,7 @@ class _Shifts:
         return np.concatenate(parts, axis=1)
 
 
-def _features(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
+def torque_columns(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
     """What the torque of each joint may be made of, except for its parameters."""
     import torch  # half a second, which only delays should cost
 

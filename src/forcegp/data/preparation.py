@@ -1,5 +1,6 @@
 """From a raw log to rows that can be learned from, and what that costs: filter, align, differentiate, thin out."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -9,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import delayed, estimate_delay, lagged
+from forcegp.data.delay import estimate_delay, shifted
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
+from forcegp.data.held_out_cutoff import held_out_cutoff
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
@@ -152,8 +154,15 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         each = spectrum.cutoff
         known = np.isfinite(each)
         cutoff = float(f"{each[known].max():.3g}") if known.any() else None
-        chosen = replace(given, cutoff=cutoff)
         reasons["cutoff"] = _why(cutoff, spectrum, dataset)
+        system = dataset.system
+        if cutoff is not None and system is not None and not system.contacts:
+            with contextlib.suppress(DatasetError):  # too short, or sampled too slowly: the spectrum has to do
+                best, tried = held_out_cutoff(dataset, system.robot, cutoff, given.differentiate, given.order)
+                shares = ", ".join(f"{100.0 * share:.2g} % at {frequency:g} Hz" for frequency, share in tried.items())
+                reasons["cutoff"] += f"; of held-out torques stay unexplained {shares}"
+                cutoff = best
+        chosen = replace(given, cutoff=cutoff)
         reasons["cutoff_per_joint"] = _plain(each)
     for name in LATE:
         how = getattr(given, name)
@@ -161,7 +170,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
             continue
         found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
         chosen = replace(chosen, **{name: found.significant if how == "auto" else tuple(found.each)})
-        reasons[name] = found.reason if how == "auto" else "that of each joint where it is sure and explains a fifth"
+        reasons[name] = found.reason if how == "auto" else "that of each joint where it is sure"
         reasons[f"{name}_common"], reasons[f"{name}_common_std"] = _plain(np.array([found.common, found.common_std]))
         reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = _plain(found.seconds), _plain(found.std)
     return chosen, reasons
@@ -187,12 +196,7 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     shifts, lags = (_per_joint(given, dataset.nv) for given in (chosen.delay, chosen.lag))
     if not any((*shifts, *lags)):
         return dataset
-    u = dataset.u.copy()
-    for number, rows, _ in episodes_in_order(dataset):
-        for joint, (shift, lag) in enumerate(zip(shifts, lags, strict=True)):
-            acting = lagged(rows.u[:, joint], rows.time, lag)
-            u[dataset.episode == number, joint] = delayed(acting, rows.time, shift)
-    return replace(dataset, u=u, truth={})
+    return shifted(dataset, shifts, lags)
 
 
 def seconds_of(given: float | tuple[float, ...] | str) -> tuple[float, ...]:

@@ -1,0 +1,268 @@
+"""`identify_payload`: mass, centre of mass and inertia of what a robot holds, from joint torques.
+
+The payload is one more body, fixed to a link, in the equations of `forcegp.analytical.recorded_rows`:
+
+    Y(q, v, a) pi + h Y_b(q, v, a) pi_p + M_0 a + t(x; v, a) = Q,
+
+with h = 1 in the rows in which the robot holds it and b the body that carries it (Atkeson, An & Hollerbach 1986).
+Equations are averaged over windows of time, which takes noise of the acceleration, under which inertias look too small,
+but leaves friction as sharp as it is. Without a `baseline` the links are those of the URDF. With one they are
+estimated, too, and an error that both logs share is not mistaken for the payload.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import block_diag
+from scipy.stats import t as student
+
+from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
+from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.analytical.identification import ROWS, joint_terms
+from forcegp.analytical.least_squares import Fit, weighted_least_squares
+from forcegp.analytical.recorded_rows import RecordedRows
+from forcegp.analytical.result import with_terms
+from forcegp.data import Dataset
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.errors import InvalidInput, require_type, usable_arguments
+from forcegp.mechanics import MechanicalSystem
+from forcegp.robots import Robot
+from forcegp.robots.arguments import whole_number
+from forcegp.robots.inertia import pseudo_inertia, standard_basis
+from forcegp.robots.urdf_file import replace_inertial
+from forcegp.summary import Summary
+
+LAWS = "viscous", "stribeck", "offset"
+USUAL = 0.5, 0.05  # kg; m: where the search begins, and the size of the body
+WEAK = 0.01  # weight of the prior on a payload: a factor of e in its mass costs 0.02 nats
+WINDOW = 0.4  # s
+STRETCHES = 20  # of time; residuals of different ones count as independent
+QUANTITIES = ("mass", *(f"center_of_mass.{x}" for x in "xyz"), *(f"inertia.{x}" for x in ("xx", "yy", "zz")))
+UNITS = dict(zip(QUANTITIES, ("kg", *("m",) * 3, *("kg m^2",) * 3), strict=True))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PayloadEstimate(Summary):
+    """What `identify_payload` found, in the frame of `link`; inertia is about the payload's own centre of mass.
+
+    `pseudo_inertia` (4, 4) is that of the payload, `joints` friction and rotors with their standard
+    errors, `system` the robot with all of it, and `baseline` whether a log without the payload was used.
+    """
+
+    link: str
+    pseudo_inertia: Float[np.ndarray, "4 4"]
+    values: dict[str, float]
+    standard_errors: dict[str, float]
+    joints: dict[str, tuple[float, float]]
+    system: MechanicalSystem
+    baseline: bool
+    rows: int
+    fit: Fit
+
+    @property
+    def mass(self) -> float:
+        """In kg."""
+        return self.values["mass"]
+
+    @property
+    def center_of_mass(self) -> Float[np.ndarray, "3"]:
+        """In m, in the frame of the link."""
+        return np.array([self.values[f"center_of_mass.{x}"] for x in "xyz"])
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals of `values`, by Student's distribution with one degree of freedom less than `STRETCHES`."""
+        reach = float(student.ppf(0.975, STRETCHES - 1))
+        return {
+            name: (value - reach * self.standard_errors[name], value + reach * self.standard_errors[name])
+            for name, value in self.values.items()
+        }
+
+    def facts(self) -> dict[str, object]:
+        """Mass, place and what they rest on."""
+        center = ", ".join(f"{1e3 * x:.1f}" for x in self.center_of_mass)
+        return {
+            "payload": f"{self.mass:.3f} ± {self.standard_errors['mass']:.3f} kg at ({center}) mm of {self.link}",
+            "compared with": "a log without it" if self.baseline else "the URDF",
+            "rows": self.rows,
+            "converged": self.fit.settled,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON values."""
+        numbers = {
+            name: {"unit": UNITS[name], "value": value, "standard_error": self.standard_errors[name],
+                   "interval_95": list(self.intervals[name])}
+            for name, value in self.values.items()
+        }  # fmt: skip
+        joints = {name: {"value": value, "standard_error": error} for name, (value, error) in self.joints.items()}
+        whole = {"link": self.link, "baseline": self.baseline, "rows": self.rows, "converged": self.fit.settled}
+        return {"payload": numbers, "joints": joints, **whole}
+
+
+def identify_payload(
+    dataset: Dataset,
+    system: MechanicalSystem | None = None,
+    *,
+    baseline: Dataset | None = None,
+    link: str | None = None,
+    friction: tuple[str, ...] = LAWS,
+    rotors: str | None = "armature",
+    rows: int = ROWS,
+) -> PayloadEstimate:
+    """Mass, centre of mass and inertia of a payload on `link`, with friction and rotor inertia estimated along.
+
+    Parameters
+    ----------
+    dataset: a log with the payload: q, v, u and a, filtered alike (`forcegp.data.Preparation`), in no contact.
+    system: the robot without the payload. None takes that of the dataset.
+    baseline: a log of the same robot without the payload. None trusts the inertias of the URDF.
+    link: what carries it; None is the last link of the last joint.
+    friction, rotors: as for `identify_analytical`.
+    rows: use so many of each log at most, evenly spread.
+
+    Standard errors are those of residuals that are independent between stretches of time (sandwich estimator; White
+    1980, "A heteroskedasticity-consistent covariance matrix estimator"), so that errors of the friction law, which
+    last, count.
+    Raises InvalidInput for another robot, an unknown or unmoved link, too few rows and a system in contact.
+    """
+    with usable_arguments("identify_payload"):
+        given = require_type("dataset", dataset, Dataset).system if system is None else system
+        system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
+        logs = [dataset] if baseline is None else [dataset, baseline]
+        for name, log in zip(("dataset", "baseline"), logs, strict=False):
+            require_rows(name, log, system.robot.joint_names, "the robot")
+            if len(log) < 10 * STRETCHES:
+                raise InvalidInput(f"{name} has {len(log)} rows; a payload needs {10 * STRETCHES} or more.")
+        if whole_number("rows", rows, 0) < 10 * STRETCHES:
+            raise InvalidInput(f"rows is {rows}; it must be at least {10 * STRETCHES}.")
+    robot, _ = thickened(system.robot)
+    system = system.with_robot(robot)
+    link = _last_link(robot) if link is None else link
+    robot.link(link)  # raises UnknownLink
+    placement = robot.layout.links[link]
+    if placement.body < 0:
+        raise InvalidInput(f"link {link!r} does not move, so nothing on it shows; give a moving one.")
+    offset = np.linalg.inv(robot.layout.child_frames[placement.body]) @ placement.offset
+    chosen = [np.unique(np.linspace(0, len(log) - 1, min(rows, len(log))).astype(int)) for log in logs]
+    q, v, u, a = (np.concatenate([getattr(log, x)[at] for log, at in zip(logs, chosen, strict=True)]) for x in "qvua")
+    holds = np.repeat([1.0, 0.0][: len(logs)], [len(at) for at in chosen])
+
+    links, usual = body_pseudo_inertias(robot).cpu().numpy(), _usual(offset)
+    bodies = ConsistentBodies(usual[None] if baseline is None else np.concatenate([links, usual[None]]))
+    stated = (links.reshape(-1, 16) @ np.linalg.pinv(standard_basis().numpy()).T)[: robot.nv if baseline is None else 0]
+    terms = joint_terms(system, friction, rotors, q, v, u, a)
+    recorded = RecordedRows(system, terms, q, v, u)
+    regressor = recorded.regressor(a)
+    held = regressor[:, :, [placement.body]] * holds[:, None, None, None]
+    regressor = np.concatenate([regressor, held], axis=2)
+    split, known = bodies.size, len(stated)
+    windows = _Windows([log.rows(at) for log, at in zip(logs, chosen, strict=True)])
+
+    def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        parameters = np.concatenate([stated, bodies.parameters(x[:split])])
+        r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
+        in_bodies = np.einsum("nibp,bpk->nibk", in_parameters[:, :, known:], bodies.derivatives(x[:split]))
+        return windows.mean(r), windows.mean(np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1))
+
+    center, spread = terms.prior()
+    weights = np.concatenate([np.ones(split - 10), np.full(10, WEAK**0.5)])
+
+    def prior(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance, in_bodies = bodies.distance(x[:split])
+        values = np.concatenate([weights * distance, (x[split:] - center) / spread])
+        return values, block_diag(weights[:, None] * in_bodies, np.diag(1.0 / spread))
+
+    low, high = terms.bounds
+    bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
+    longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
+    start = np.concatenate([np.zeros(split), terms.start()])
+    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest)
+
+    def numbers(x: np.ndarray) -> np.ndarray:
+        return _numbers(bodies.pseudo_inertias(x[:split])[-1], offset)
+
+    covariance = _sandwich(fit, windows.lengths)
+    step = 1e-5 * np.eye(len(fit.x))[split - 10 : split]
+    slopes = np.stack([(numbers(fit.x + d) - numbers(fit.x - d)) / 2e-5 for d in step], axis=1)
+    errors = np.sqrt(np.diag(slopes @ covariance[split - 10 : split, split - 10 : split] @ slopes.T))
+    of_terms = np.sqrt(np.diag(covariance)[split:]) * terms.slopes(fit.x[split:]).ravel()
+    found, there = bodies.pseudo_inertias(fit.x[:split]), np.linalg.inv(offset)
+    payload = there @ found[-1] @ there.T
+    bare = robot if baseline is None else with_bodies(robot, found[:-1])
+    values = terms.values(fit.x[split:]).ravel()
+    return PayloadEstimate(
+        link=link,
+        pseudo_inertia=payload,
+        values=dict(zip(QUANTITIES, numbers(fit.x).tolist(), strict=True)),
+        standard_errors=dict(zip(QUANTITIES, errors.tolist(), strict=True)),
+        joints={name: (float(x), float(e)) for name, x, e in zip(terms.names, values, of_terms, strict=True)},
+        system=with_terms(system, _carrying(bare, link, payload), terms, fit.x[split:]),
+        baseline=baseline is not None,
+        rows=len(q),
+        fit=fit,
+    )
+
+
+class _Windows:
+    """Means over windows of time, times the root of their rows, so that white noise keeps its size."""
+
+    def __init__(self, logs: list[Dataset]) -> None:
+        number = np.concatenate([np.full(len(log), k) for k, log in enumerate(logs)])
+        episode, time = (np.concatenate([getattr(log, name) for log in logs]) for name in ("episode", "time"))
+        keys = np.stack([number, episode, np.floor(time / WINDOW)])
+        self.starts = np.flatnonzero(np.r_[True, (np.diff(keys) != 0).any(axis=0)])
+        self.roots = np.sqrt(np.diff(np.r_[self.starts, len(time)]))
+        self.lengths = np.bincount(number[self.starts]).tolist()
+        """Windows of every log."""
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """(rows, ...) as (windows, ...)."""
+        sums = np.add.reduceat(values, self.starts, axis=0)
+        return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _last_link(robot: Robot) -> str:
+    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file."""
+    last = robot.nv - 1
+    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
+
+
+def _usual(offset: np.ndarray) -> np.ndarray:
+    """A usual payload on the link at this pose (4, 4), in the frame of its body."""
+    mass, size = USUAL
+    return offset @ pseudo_inertia(mass, np.zeros(3), 0.4 * mass * size**2 * np.eye(3)) @ offset.T
+
+
+def _numbers(pseudo: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """`QUANTITIES` of a pseudo-inertia (4, 4) in the frame of its body, for a link at this pose in it."""
+    there = np.linalg.inv(offset) @ pseudo @ np.linalg.inv(offset).T
+    center = there[:3, 3] / there[3, 3]
+    second = there[:3, :3] - there[3, 3] * np.outer(center, center)
+    return np.array([there[3, 3], *center, *(np.trace(second) - np.diag(second))])
+
+
+def _sandwich(fit: Fit, lengths: list[int]) -> np.ndarray:
+    """Covariance of the coordinates from the scatter of the gradient over stretches of time."""
+    rows, places = [], 0
+    for length in lengths:
+        rows += np.array_split(np.arange(places, places + length), STRETCHES)
+        places += length
+    scaled = fit.jacobian / fit.noise[:, None]
+    gradients = np.stack([np.einsum("nik,ni->k", scaled[at], (fit.residual / fit.noise)[at]) for at in rows])
+    gradients -= gradients.mean(axis=0)
+    curvature = np.linalg.inv(fit.information + fit.prior_information)
+    scatter = gradients.T @ gradients * STRETCHES / (STRETCHES - 1)
+    return curvature @ (scatter + fit.prior_information) @ curvature
+
+
+def _carrying(robot: Robot, link: str, payload: np.ndarray) -> Robot:
+    """The robot whose link has the payload of this pseudo-inertia (4, 4) added."""
+    held = robot.link(link)
+    whole = payload + pseudo_inertia(held.mass, np.array(held.center_of_mass), np.array(held.inertia))
+    center = whole[:3, 3] / whole[3, 3]
+    second = whole[:3, :3] - whole[3, 3] * np.outer(center, center)
+    inertia = np.trace(second) * np.eye(3) - second
+    return robot.with_text(replace_inertial(robot.urdf_text, link, whole[3, 3], center, inertia, source=robot.source))
