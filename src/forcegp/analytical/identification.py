@@ -156,13 +156,15 @@ def joint_terms(
     """Terms whose coordinates are in proportion to the forces, velocities and M of these rows.
 
     Forces are those measured or those of inverse dynamics, whichever are larger: light joints may have friction alone,
-    passive ones are not driven.
+    passive ones are not driven. Inertia is at least what these forces accelerate: the rotor of a wrist has a thousand
+    times that of its link.
     """
     kinematics = system.robot.kinematics(*(torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v)))
     needed = kinematics.inverse_dynamics(torch.as_tensor(np.array(a), device=system.robot.device)).cpu().numpy()
     mass = system.mass_matrix(kinematics).diagonal(dim1=-2, dim2=-1).mean(0).cpu().numpy()
     needed, measured, speed = (np.sqrt((x**2).mean(0)) for x in (needed, u, v))
     torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in (np.maximum(needed, measured), speed))
+    mass = np.maximum(mass, torque / np.maximum(np.sqrt((a**2).mean(0)), 1e-12)) if a.any() else mass
     return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)
 
 
