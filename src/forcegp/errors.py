@@ -99,6 +99,14 @@ class DatasetError(ForceGPError):
     """Data that break the Dataset's contract: row, column and remedy are named."""
 
 
+class MistakenUnit(DatasetError):
+    """Numbers that fit another unit: `quantity` and `unit` are those of `ColumnMapping.unit`."""
+
+    def __init__(self, message: str, quantity: str, unit: str):
+        super().__init__(message)
+        self.quantity, self.unit = quantity, unit
+
+
 class FileFormatError(ForceGPError):
     """A file that is not what its name promises, or is from an unknown version."""
 

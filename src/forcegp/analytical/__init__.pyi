@@ -7,4 +7,4 @@ from .identification import identify_analytical as identify_analytical, held_out
 from .least_squares import ROUNDS as ROUNDS, NoiseLevels as NoiseLevels
 from .result import AnalyticalIdentification as AnalyticalIdentification
 from .recorded_rows import motion_residuals as motion_residuals, residual_scores as residual_scores
-from .payload import PayloadEstimate as PayloadEstimate, identify_payload as identify_payload
+from .payload import LAWS as LAWS, PayloadEstimate as PayloadEstimate, identify_payload as identify_payload

@@ -192,13 +192,15 @@ def identify_payload(
     found, there = bodies.pseudo_inertias(fit.x[:split]), np.linalg.inv(offset)
     payload = there @ found[-1] @ there.T
     bare = robot if baseline is None else with_bodies(robot, found[:-1])
-    values = terms.values(fit.x[split:]).ravel()
+    values = terms.values(fit.x[split:])
+    if rotors == "armature":
+        values[-1] += robot.armature.cpu().numpy()  # which the equations hold already
     return PayloadEstimate(
         link=link,
         pseudo_inertia=payload,
         values=dict(zip(QUANTITIES, numbers(fit.x).tolist(), strict=True)),
         standard_errors=dict(zip(QUANTITIES, errors.tolist(), strict=True)),
-        joints={name: (float(x), float(e)) for name, x, e in zip(terms.names, values, of_terms, strict=True)},
+        joints={name: (float(x), float(e)) for name, x, e in zip(terms.names, values.ravel(), of_terms, strict=True)},
         system=with_terms(system, _carrying(bare, link, payload), terms, fit.x[split:]),
         baseline=baseline is not None,
         rows=len(q),

@@ -40,6 +40,8 @@ class Finding:
     seen: what was seen, with joint, row, time and numbers.
     remedy: what to do about it; empty if nothing.
     joints: names of the joints concerned; numbers: the numbers of `seen`, for programs.
+    correction: what an import has to state about the columns, for `ColumnMapping.corrected_by`: unit, sign and order by
+    signal, for all joints or one each, in the order of the joints.
     """
 
     severity: Severity
@@ -48,13 +50,27 @@ class Finding:
     remedy: str = ""
     joints: tuple[str, ...] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
+    correction: Mapping[str, Mapping[str, tuple[Any, ...]]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        return {**vars(self), "joints": list(self.joints), "numbers": dict(self.numbers)}
+        correction = {what: {name: list(x) for name, x in each.items()} for what, each in self.correction.items()}
+        return {**vars(self), "joints": list(self.joints), "numbers": dict(self.numbers), "correction": correction}
 
 
 wrong, look, ok = partial(Finding, severity="wrong"), partial(Finding, severity="look"), partial(Finding, severity="ok")
+
+
+def import_flags(correction: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> str:
+    """The options of `forcegp import` that state units and signs: `--unit q=deg --sign u=1,-1`."""
+    texts = []
+    for what in ("unit", "sign"):
+        stated = correction.get(what, {})
+        each = (
+            f"{name}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for name, own in stated.items()
+        )
+        texts += [f"--{what} {','.join(each)}"] if stated else []
+    return " ".join(texts)
 
 
 def worst(findings: Sequence[Finding]) -> Severity:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.check_input import DEGREE, CheckInput, Finding, listed, wrong
+from forcegp.checks.check_input import DEGREE, CheckInput, Finding, import_flags, listed, wrong
 from forcegp.checks.torques import (
     Correction,
     TorqueFit,
@@ -106,13 +106,15 @@ def _torque_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
     if not turned.any():
         return
     joints = inputs.named(_places(turned))
+    signs = {"sign": {"u": tuple(np.where(turned, -1.0, 1.0))}}
     finding = wrong(
         subject="torque sign",
         seen=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
         f"motion needs ({_remains(now.fit, other, turned)}).",
-        remedy="Turn the sign of u (forcegp import --sign), or of the joint's whole motion if its axis in the URDF "
-        "points the other way.",
+        remedy=f"forcegp import {import_flags(signs)}; or turn the joint's whole motion if its axis in the URDF points "
+        "the other way.",
         joints=joints,
+        correction=signs,
     )
     correction = now.correction.torque(np.arange(given.nv), np.where(turned, -1.0, 1.0))
     yield _hypothesis(now.robot, correction, given, finding=finding, concerns=_places(turned))
@@ -141,6 +143,7 @@ def _torque_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Itera
         remedy="Correct the order of the torque columns.",
         joints=inputs.named(_places(moved)),
         numbers={"order": list(inputs.named(order))},
+        correction={"order": {"u": tuple(int(place) for place in order)}},
     )
     yield replace(better, finding=finding)
 
@@ -154,12 +157,14 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
             alone = turned is not inputs.rotates
             if not turned.any() or (alone and (inputs.rotates.sum() == 1 or len(places) > ALL_TRIED)):
                 continue
+            units = {"unit": {"q": _degrees(given, "q", turned), "v": _degrees(given, "v", turned)}}
             finding = wrong(
                 subject="degrees",
                 seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
                 "for radians.",
-                remedy="Convert positions (and velocities) to radians: forcegp import --unit q=deg, or np.deg2rad.",
+                remedy=f"forcegp import {import_flags(units)}, or np.deg2rad.",
                 joints=inputs.named(_places(turned)),
+                correction=units,
             )
             correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)
@@ -189,15 +194,17 @@ def _motion_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
             continue
         turned = np.where(places == joint, -1.0, 1.0)
         motion = now.correction.motion(places, turned)
-        for seen, correction in (
-            (f"positions and velocities of {name} have", motion),
-            (f"the whole joint {name} (motion and torque) has", motion.torque(places, turned)),
+        for seen, correction, signals in (
+            (f"positions and velocities of {name} have", motion, "qv"),
+            (f"the whole joint {name} (motion and torque) has", motion.torque(places, turned), "qvu"),
         ):
+            signs = {"sign": dict.fromkeys(signals, tuple(turned))}
             finding = wrong(
                 subject="motion sign",
                 seen=f"{seen} the opposite sign of the URDF's.",
-                remedy="Turn the signs (forcegp import --sign), or the joint's axis in the URDF.",
+                remedy=f"forcegp import {import_flags(signs)}, or turn the joint's axis in the URDF.",
                 joints=(name,),
+                correction=signs,
             )
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
 
@@ -209,12 +216,16 @@ def _motion_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Itera
         order = np.arange(given.nv)
         order[[one, other]] = order[[other, one]]
         motion = now.correction.motion(order, ones)
-        for what, correction in (("positions and velocities", motion), ("all signals", motion.torque(order, ones))):
+        for what, correction, signals in (
+            ("positions and velocities", motion, "qv"),
+            ("all signals", motion.torque(order, ones), "qvu"),
+        ):
             finding = wrong(
                 subject="joints exchanged",
                 seen=f"{what} of {listed(inputs.named((one, other)))} stand in each other's place.",
                 remedy="Correct the order of the columns, or the joint names of the log.",
                 joints=inputs.named((one, other)),
+                correction={"order": dict.fromkeys(signals, tuple(int(place) for place in order))},
             )
             yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
 
@@ -242,6 +253,15 @@ def _gravity(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hy
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
         yield _hypothesis(with_gravity(now.robot, gravity), now.correction, given, finding=finding, cost=cost)
+
+
+def _degrees(given: Dataset, signal: str, turned: np.ndarray) -> tuple[str, ...]:
+    """The unit of the signal of every joint, with degrees where `turned`."""
+    units = given.units[signal]
+    each = [units] * given.nv if isinstance(units, str) else units
+    return tuple(
+        unit.replace("rad", "deg") if degrees else str(unit) for unit, degrees in zip(each, turned, strict=True)
+    )
 
 
 def _worth(now: Hypothesis, joint: int) -> bool:

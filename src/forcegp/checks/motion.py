@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, GAP, CheckInput, Finding, listed, look, ok
+from forcegp.checks.check_input import DEGREE, GAP, CheckInput, Finding, import_flags, listed, look, ok
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
@@ -134,6 +134,9 @@ FACTORS = {
 }
 """Ratios of v to dq/dt, and the unit of v that explains each."""
 
+UNITS = {1.0 / DEGREE: "deg/s", 1.0 / RPM: "rpm", 1000.0: "mrad/s", 0.5 / np.pi: "rev/s"}
+"""Of them those that `forcegp import --unit v=` takes where q is in rad."""
+
 CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
 UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
 FEW = 0.05  # share below which a factor is meant seriously
@@ -158,7 +161,7 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
         compared = ((joint, _compared(pieces, name, source, joint)) for joint in range(even.nv))
         fits = {joint: fit for joint, fit in compared if fit is not None}
         findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in fits.items()]
-        found += _merged([item for item in findings if item is not None], even.nv)
+        found += _merged([item for item in findings if item is not None], inputs.names)
         if not found and fits and name == "v":
             error = max(unexplained for _, _, unexplained in fits.values())
             seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
@@ -229,7 +232,7 @@ def _finding(
     return None
 
 
-def _merged(findings: list[Finding], nv: int) -> list[Finding]:
+def _merged(findings: list[Finding], names: tuple[str, ...]) -> list[Finding]:
     """One finding for all joints where they are the same."""
     kinds: dict[tuple, list[Finding]] = {}
     for item in findings:
@@ -240,11 +243,26 @@ def _merged(findings: list[Finding], nv: int) -> list[Finding]:
     for group in kinds.values():
         first = group[0]
         joints = tuple(name for item in group for name in item.joints)
-        every = len(joints) == nv and nv > 2
+        every = joints == names and len(names) > 2
         seen = first.seen.replace(first.joints[0], "all joints" if every else listed(joints))
         factors = [item.numbers["factor"] for item in group]
         alike = max(factors) - min(factors) < CLOSE * abs(factors[0])
         each = "" if alike else f" Factors: {', '.join(f'{factor:.3g}' for factor in factors)}."
-        numbers = {"each": [dict(item.numbers) for item in group]}
-        merged.append(replace(first, joints=joints, seen=f"{seen}{each}", numbers=numbers) if group[1:] else first)
+        numbers = {"each": [dict(item.numbers) for item in group]} if group[1:] else first.numbers
+        correction = _correction(first, joints, names)
+        flags = import_flags(correction)
+        remedy = f"forcegp import {flags}; or {first.remedy[0].lower()}{first.remedy[1:]}" if flags else first.remedy
+        more = {"seen": f"{seen}{each}" if group[1:] else first.seen, "remedy": remedy, "correction": correction}
+        merged.append(replace(first, joints=joints, numbers=numbers, **more))
     return merged
+
+
+def _correction(first: Finding, joints: tuple[str, ...], names: tuple[str, ...]) -> dict[str, Any]:
+    """The unit or sign of v of these joints that would make it dq/dt; nothing where that is not the mistake."""
+    factor = first.numbers["factor"]
+    if first.severity != "wrong" or first.subject != "velocity" or first.numbers["unexplained"] > FEW:
+        return {}
+    if abs(factor + 1.0) < CLOSE:
+        return {"sign": {"v": tuple(-1.0 if name in joints else 1.0 for name in names)}}
+    unit = next((unit for known, unit in UNITS.items() if abs(factor / known - 1.0) < CLOSE), None)
+    return {"unit": {"v": (unit,)}} if unit is not None and joints == names else {}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, plain, worst
+from forcegp.checks.dynamics import dynamics_findings
 from forcegp.checks.excitation import (
     excitation_findings,
     noise_findings,
@@ -169,6 +170,11 @@ def check(
     preparation = Preparation(cutoff="auto") if preparation is None else preparation
     inputs = CheckInput.of(dataset, system, require_type("preparation", preparation, Preparation))
     findings, comparison = _findings(inputs, system)
+    if comparison is not None and "torque unit" not in {each.subject for each in findings if each.severity == "wrong"}:
+        shown = list(dynamics_findings(inputs, comparison))
+        if "payload" in {each.subject for each in shown}:  # which explains a heavy last link better than a factor
+            findings = [each for each in findings if each.subject != "masses" or each.joints != inputs.names[-1:]]
+        findings += shown
     if inputs.robot is not None:
         findings += robot_findings(inputs.robot)
     if inputs.prepared is not None:

@@ -48,11 +48,13 @@ def _factors(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
         "motor current (multiply by the torque constant), a rotor inertia that is missing, or wrong masses; "
         "compare with the data sheet."
     )
+    correction: dict[str, dict[str, tuple[str, ...]]] = {}
     for unit, size in (("kNm", 1e-3), ("mNm", 1e3)):
         if np.abs(np.log(factors / size)).max() < np.log(ROUGHLY):
             what = f"the measured torque of {listed(joints)} is {common:.4g} times what the motion needs"
             seen = f"{what}: it looks like {unit}."
-            remedy = f"Convert it (forcegp import --unit u={unit}, or a factor)."
+            remedy = f"forcegp import --unit u={unit}, or a factor."
+            correction = {"unit": {"u": (unit,)}} if alike else {}
     yield Finding(
         severity="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
         subject="torque unit",
@@ -60,6 +62,7 @@ def _factors(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
         remedy=remedy,
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
+        correction=correction,
     )
 
 
@@ -111,7 +114,7 @@ def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     assert inputs.compared is not None
     if inputs.prepared is None:
         return  # without an order
-    data = log.correction.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.compared)
+    data = log.correction.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared.dataset)
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:

@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 from forcegp import __version__
+from forcegp.cli.auto import Auto
 from forcegp.cli.check import Check
 from forcegp.cli.command import Command
 from forcegp.cli.compare import Compare
@@ -48,6 +49,7 @@ or step by step:
 Every command has --help, --json and --debug. forcegp --version prints the version."""
 
 COMMANDS: dict[str, tuple[type[Command], str]] = {
+    "auto": (Auto, "from logs and a URDF to a validated model, in one command"),
     "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
     "simulate": (Simulate, "make a dataset with ground truth"),
     "import": (Import, "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot"),

@@ -148,6 +148,10 @@ class LinearExpression:
         """Is this one column as it is?"""
         return self.constant == 0.0 and list(self.weights.values()) == [1.0]
 
+    def __str__(self) -> str:
+        terms = [name if weight == 1.0 else f"{weight:g}*`{name}`" for name, weight in self.weights.items()]
+        return " + ".join(terms + [f"{self.constant:g}"] * (self.constant != 0.0 or not terms))
+
     def value(self, columns: Mapping[str, np.ndarray], rows: int) -> Float[np.ndarray, " rows"]:
         """The combination of these columns; a column by itself comes out to the last bit."""
         result = None

@@ -10,7 +10,7 @@ from scipy.interpolate import make_interp_spline
 
 from forcegp.data import differentiate
 from forcegp.data.filtering import JITTER
-from forcegp.errors import DatasetError
+from forcegp.errors import DatasetError, MistakenUnit
 from forcegp.recordings.reading import RawRecording, Spool
 
 REPEATED = 0.05
@@ -135,18 +135,16 @@ def _require_rate(recording: RawRecording, step: float) -> None:
     rate = 1.0 / step
     if SLOWEST <= rate <= FASTEST:
         return
-    factors = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-    hint = "Map another column as the time."
-    if rate < SLOWEST:
-        fitting = [unit for unit, factor in factors.items() if 10.0 <= rate * factor <= 2e4]
-        if fitting:
-            hint = f"Is the time in {' or '.join(fitting)}? Then add `unit` time={fitting[0]}."
-    else:
+    seen = f"{recording.label}: the median step is {step:.6g} s, {rate:.3g} rows per second, no rate of a robot's log."
+    if rate > FASTEST:
         hint = "Is the time in s rather than in a smaller unit? Then add `unit` time=s."
-    raise DatasetError(
-        f"{recording.label}: the median step is {step:.6g} s, {rate:.3g} rows per second, no rate of a robot's log. "
-        f"{hint}"
-    )
+        raise MistakenUnit(f"{seen} {hint}", "time", "s")
+    factors = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+    fitting = [unit for unit, factor in factors.items() if 10.0 <= rate * factor <= 2e4]
+    if fitting:
+        hint = f"Is the time in {' or '.join(fitting)}? Then add `unit` time={fitting[0]}."
+        raise MistakenUnit(f"{seen} {hint}", "time", fitting[0])
+    raise DatasetError(f"{seen} Map another column as the time.")
 
 
 def _first_of_each(time: np.ndarray, begins: np.ndarray, least: float) -> np.ndarray:

@@ -213,6 +213,9 @@ def _what_was_done(
         "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
+        "columns": {
+            name: [str(item.expression) for item in plan.signals if item.signal == name] for name in plan.logged
+        },
         "signals": {name: "logged" if name in plan.logged else made[name] for name in SIGNALS},
         "recordings": [
             {

@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from pathlib import Path
@@ -161,6 +161,52 @@ class ColumnMapping:
             stated = {"time": None, "step": None} | stated
         return replace(self, **stated)
 
+    def corrected_by(
+        self,
+        correction: Mapping[str, Mapping[str, tuple[Any, ...]]],
+        joints: tuple[str, ...],
+        columns: Mapping[str, Sequence[str]],
+    ) -> "ColumnMapping":
+        """The mapping after a correction that `forcegp.check` found, whose entries are in the order of `joints`.
+
+        Units replace what was stated, signs multiply it, and an order (joint k has the column of joint order[k]) needs
+        the `columns` of every signal, as `import_recordings` returns them.
+        """
+        places = [joints.index(name) for name in self.joints or joints]
+
+        def in_order(values: Sequence[Any]) -> tuple[Any, ...]:
+            alike = len(set(values)) == 1
+            return (values[0],) if alike else tuple(values[place] for place in places)
+
+        changes: dict[str, Any] = {}
+        units = {name: in_order(values) for name, values in correction.get("unit", {}).items()}
+        if units:
+            changes["unit"] = {**self.unit, **units}
+        for signal, values in correction.get("sign", {}).items():
+            now = self.sign.get(signal, (1.0,))
+            now = now * len(places) if len(now) == 1 else now
+            turned = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
+            changes["sign"] = {**self.sign, **changes.get("sign", {}), signal: turned}
+        for signal, order in correction.get("order", {}).items():
+            if signal in columns:
+                changes[signal] = tuple(columns[signal][order[place]] for place in places)
+        return replace(self, **changes)
+
+    def flags(self) -> list[str]:
+        """The words of `forcegp import` that state columns, units, signs, scales and offsets."""
+        words: list[str] = []
+        for name, value in self.plain().items():
+            if name in SIGNALS or name == "joints":
+                words += [f"--{name}", ",".join(value) if isinstance(value, list) else str(value)]
+            elif isinstance(value, dict):
+                texts = (f"{key}={','.join(_word(x) for x in _listed(each))}" for key, each in value.items())
+                words += [f"--{name}", ",".join(texts)]
+            elif value is True:
+                words.append(f"--{name.replace('_', '-')}")
+            else:
+                words += [f"--{name}", ",".join(map(_word, _listed(value)))]
+        return words
+
     def plain(self) -> dict[str, Any]:
         """What is stated, as JSON and YAML hold it: a list of one is written as its only entry."""
         found: dict[str, Any] = {}
@@ -172,6 +218,10 @@ class ColumnMapping:
                 value = {name: _shortened(entry) for name, entry in value.items()}
             found[item.name] = list(value) if item.name == "joints" else _shortened(value)
         return found
+
+
+def _word(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _shortened(value: Any) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import forcegp.robots
-from forcegp.errors import DatasetError, DataWarning, FileFormatError
+from forcegp.errors import DatasetError, DataWarning, FileFormatError, MistakenUnit
 from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
 
@@ -242,14 +242,14 @@ def require_plausible_positions(
         degrees = item.unit.name == "rad" and max(-low, high) > TURNS
         where = f"{recording.label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
         if beyond:
-            hint = "Is it in degrees? Then add `unit` q=deg." if degrees else "Are unit, sign, offset and URDF right?"
-            raise DatasetError(
-                f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF. {hint} `beyond_limits` accepts it."
-            )
+            seen = f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF."
+            if degrees:
+                hint = "Is it in degrees? Then add `unit` q=deg. `beyond_limits` accepts it."
+                raise MistakenUnit(f"{seen} {hint}", "q", "deg")
+            raise DatasetError(f"{seen} Are unit, sign, offset and URDF right? `beyond_limits` accepts it.")
         if degrees and not stated and not np.isfinite(upper - lower):
-            raise DatasetError(
-                f"{where}, more than two turns. Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
-            )
+            hint = "Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
+            raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", "deg")
 
 
 def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None) -> None:

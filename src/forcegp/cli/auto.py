@@ -1,0 +1,302 @@
+"""`forcegp auto`: from logs and a URDF to a validated model, in one command."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, cast
+
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import arg
+
+import forcegp
+import forcegp.analytical
+import forcegp.checks
+import forcegp.evaluation
+import forcegp.recordings
+import forcegp.validation
+from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
+from forcegp.cli.command import CONFIG, URDF, unless_given
+from forcegp.cli.import_log import Import
+from forcegp.cli.input_options import SYSTEM_FILE
+from forcegp.cli.terminal import Terminal, number
+from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit
+
+MOST_CORRECTIONS = 8
+PASSED = 3.0  # rows per period of the cut-off that are kept: more repeat their neighbours
+METHOD = "torque-all"
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+
+
+@dataclass(frozen=True, kw_only=True)
+class Auto(Import):
+    """From logs and a URDF to a validated model: import, check, prepare, identify, learn, validate, report.
+
+    Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
+    corrects them at once. The folder gets the model of the recommended kind learned from all rows (model, for
+    forcegp evaluate, rollout, monitor ...; c with its C code), identified.urdf, payload.json, the comparison
+    (validation/report.md) and the dataset. A run that was interrupted resumes.
+
+    For instance:
+      forcegp auto run.csv --time t --q 'pos{1..6}' --u 'tau{1..6}' --robot arm.urdf --out answer
+      forcegp auto run1.csv run2.csv --robot arm.urdf --mapping columns.yaml --correct --out answer
+    """
+
+    interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
+    replaces: ClassVar[bool] = False
+
+    robot: Annotated[Path, URDF, arg(metavar="ARM.urdf")] = field()
+    """The robot that was recorded."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = field()
+    """The folder of results; an unfinished one resumes."""
+    correct: bool = False
+    """Correct the mistakes that are found in units, signs and the order of joints, and go on."""
+    accept: bool = False
+    """Go on although something is wrong with the log that nobody corrected."""
+    models: Annotated[tuple[str, ...], unless_given("NAME", "the URDF, identified, with friction learned")] = ()
+    """What is compared, as for forcegp validate."""
+    link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
+    """Where a payload may be."""
+    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
+    """Low-pass filter. auto: of which the parameters predict held-out torques best."""
+    delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    """How much later than it acts u was logged, in s."""
+    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None  # type: ignore[assignment]
+    """Keep every N-th row, after the filter."""
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
+        if not self.logs:
+            raise InvalidInput("give at least one log.")
+        begin = time.process_time()
+        self._require_own_folder()
+        system, mapping = self._system(), self._mapping(terminal)
+        assert system is not None
+        with self._log() as path:
+            dataset, done, mapping, mistakes = self._imported(terminal, system, mapping, path)
+            corrected = self._command(mapping)
+            if mistakes and not self.correct:
+                terminal.show(
+                    _findings(terminal, mistakes),
+                    Text(f"Run:\n{corrected}", style="bold", no_wrap=True, overflow="ignore"),
+                )
+                raise DatasetError(
+                    f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
+                )
+            with terminal.progress("checking"):
+                report = forcegp.check(dataset)
+            wrong = [finding for finding in report.findings if finding.severity == "wrong"]
+            if wrong and not self.accept:
+                terminal.show(_findings(terminal, wrong))
+                raise DatasetError(
+                    f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
+                    "add --accept to go on."
+                )
+            self.out.mkdir(parents=True, exist_ok=True)
+            path.replace(self.out / "log.h5")
+        with terminal.progress("preparing and identifying"):
+            rows, recording, settings = self._prepared_rows(dataset)
+            payload = forcegp.analytical.identify_payload(rows, link=self.link)
+            identified = forcegp.identify_analytical(rows, friction=forcegp.analytical.LAWS)
+        document, posterior = self._validated(terminal, rows, recording, system)
+        content: dict[str, Any] = {
+            "out": str(self.out),
+            "seconds": sum(each["seconds"] for each in done["recordings"]),
+            "import": done,
+            "mistakes": [finding.to_dict() for finding in mistakes],
+            "check": report.to_dict(),
+            "preparation": settings,
+            "payload": payload.to_dict(),
+            "weak": list(identified.weak_directions),
+            "models": document["models"],
+            "recommended": forcegp.validation.recommended(document),
+            "code": self._code(terminal, posterior),
+        }
+        answer = _answer(content, dataset, payload)
+        content |= {"answer": [": ".join(line) for line in answer], "cpu_seconds": time.process_time() - begin}
+        write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
+        write_text(self.out / "identified.urdf", identified.system.robot.to_urdf())
+        write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
+        table = Table.grid(padding=(0, 2))
+        table.add_column(style="bold", no_wrap=True)
+        table.add_column(overflow="fold")
+        for line in answer:
+            table.add_row(*line)
+        terminal.show(table)
+        return content
+
+    def _require_own_folder(self) -> None:
+        """Refuse a folder with other content: InvalidInput."""
+        present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
+        if self.out.is_file() or (present and "log.h5" not in present):
+            raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
+        if not self.out.parent.is_dir():
+            raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
+
+    @contextlib.contextmanager
+    def _log(self) -> Iterator[Path]:
+        """A place beside the results for the dataset, which is gone where the log is refused."""
+        path = self.out.parent / f".{self.out.name}.log.h5"
+        try:
+            yield path
+        finally:
+            path.unlink(missing_ok=True)
+
+    def _imported(
+        self, terminal: Terminal, system: forcegp.MechanicalSystem, mapping: forcegp.ColumnMapping, path: Path
+    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
+        """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
+        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
+        options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
+        mistakes: list[forcegp.checks.Finding] = []
+        for _ in range(MOST_CORRECTIONS):
+            try:
+                with terminal.progress("importing") as progress, atomic_file(path, overwrite=True) as temporary:
+                    done = forcegp.import_recordings(
+                        self.logs, temporary, mapping, system=system, options=options, report=progress
+                    )
+            except MistakenUnit as error:
+                correction = {"unit": {error.quantity: (error.unit,)}}
+                mistakes.append(_mistake(error, correction))
+                mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
+                continue
+            dataset = forcegp.Dataset.load(path)
+            found = [finding for finding in forcegp.checks.quick_check(dataset) if finding.correction]
+            if not found:
+                return dataset, done, mapping, mistakes
+            mistakes.append(found[0])
+            mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])
+        raise DatasetError("the log is not right after eight corrections; look at it with forcegp check.")
+
+    def _command(self, mapping: forcegp.ColumnMapping) -> str:
+        """The same command with the columns, units and signs of the mapping."""
+        stated = ("time", "step", "q", "v", "u", "a", "joints", "unit", "sign", "scale", "offset")
+        others = [name for name in self.options if name not in (*stated, "mapping", "logs", "robot", "out")]
+        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), "--robot", str(self.robot)]
+        return shlex.join([*words, *self.words(*(name for name in others if hasattr(type(self), name))),
+                           "--out", str(self.out)])  # fmt: skip
+
+    def _prepared_rows(self, raw: forcegp.Dataset) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
+        """Rows to learn from, the same at the full rate, and what was done."""
+        chosen = replace(self, every=1)._preparation().apply(raw)
+        numbers = chosen.preparation
+        step = forcegp.data.uniform_step(raw.time[raw.episode == raw.episodes[0]])
+        period = None if numbers.cutoff is None else 1.0 / float(numbers.cutoff)
+        every = self.every or (1 if period is None else max(1, int(period / (step * PASSED))))
+        numbers = replace(numbers, trim=self.trim or period or 0.0)
+        rows = replace(numbers, every=every).apply(raw)
+        with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
+            rows.dataset.save(temporary)
+        return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
+
+    def _validated(
+        self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, system: forcegp.MechanicalSystem
+    ) -> tuple[Mapping[str, Any], forcegp.models.Posterior]:
+        """The comparison of the models, and the recommended one, learned from all rows and stored."""
+        laws = forcegp.analytical.LAWS
+        comparison = forcegp.Comparison(
+            rows,
+            recording,
+            system,
+            forcegp.split_named(rows, "auto"),
+            points=min(100, len(rows) // 4),
+            identification=METHOD,
+            restarts=1,
+            friction=laws,
+        )
+        models = self.models or ("analytical", f"identified-{METHOD}", f"joint-friction@{METHOD}")
+        with terminal.progress("validating") as report:
+            found = forcegp.validate(
+                comparison, self.out / "validation", models=models, seeds=1, overwrite=self.overwrite, progress=report
+            )
+        with terminal.progress("learning from all rows"):
+            best = forcegp.validation.recommended(found.document)
+            posterior = forcegp.validation.fitted_on_all_rows(comparison, best)
+            forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
+        return found.document, posterior
+
+    def _code(self, terminal: Terminal, posterior: forcegp.models.Posterior) -> str | None:
+        """The folder of the model's C program; None where there is no compiler, or none of this model."""
+        try:
+            with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
+                forcegp.export_c(cast(forcegp.models.StructuredPosterior, posterior), folder)
+        except (CompilerError, InvalidInput) as error:
+            terminal.note(f"no C program: {error}")
+            return None
+        return str(self.out / "c")
+
+
+def _mistake(error: MistakenUnit, correction: Mapping[str, Any]) -> forcegp.checks.Finding:
+    seen, remedy = str(error).partition(" Is ")[0], f"forcegp import {forcegp.checks.import_flags(correction)}"
+    subject = f"unit of {error.quantity}"
+    return forcegp.checks.Finding(severity="wrong", subject=subject, seen=seen, remedy=remedy, correction=correction)
+
+
+def _findings(terminal: Terminal, findings: list[forcegp.checks.Finding]) -> Table:
+    table = Table.grid(padding=(0, 1))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        table.add_row(Text(finding.severity, style="bold red"), f"{finding.subject}: {terminal.worded(finding.seen)}")
+        table.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
+    return table
+
+
+def _answer(
+    content: Mapping[str, Any], dataset: forcegp.Dataset, payload: forcegp.analytical.PayloadEstimate
+) -> list[tuple[str, str]]:
+    """What was found, in ten lines."""
+    names, values = dataset.joint_names, payload.joints
+    import_, prepared = content["import"], content["preparation"]
+    deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
+    jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
+    rate, seconds = prepared["sample_rate"][0], content["seconds"]
+    mistakes = ", ".join(each["subject"] for each in content["mistakes"]) or "nothing"
+    late = prepared["delay"][0]
+    shifted = f"u was logged {1e3 * late:.1f} ms late (shifted)" if late else "u shows no delay"
+    filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
+
+    def each(field: str, pattern: str = "{:.3g}") -> str:
+        return ", ".join(pattern.format(values[f"{field}.{name}"][0]) for name in names)
+
+    center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
+    mass, error = payload.mass, payload.standard_errors["mass"]
+    held = f"{mass:.3g} ± {1.96 * error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
+    models = content["models"]
+    scores = "; ".join(f"{name} {_score(model)}" for name, model in models.items())
+    best = content["recommended"]
+    covered = models[best]["coverage_95"]
+    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
+    weak = ", ".join(name for name, _ in content["weak"][:3])
+    out = content["out"]
+    return [
+        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {len(names)} joints{jitter}"),
+        ("corrected", mistakes),
+        ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
+        ("dry friction", f"{each('coulomb')} Nm, near rest {each('breakaway')} more"),
+        ("viscous", f"{each('viscous')} Nms/rad"),
+        ("rotors", f"{each('armature')} kg m²"),
+        (
+            "payload",
+            held if mass > SURE * error and mass > LEAST_PAYLOAD else f"none ({mass:.2g} ± {1.96 * error:.1g} kg)",
+        ),
+        ("models", f"errors of motions after 1 s and of accelerations: {scores}"),
+        ("trust", f"{best}{intervals}"),
+        (
+            "record next",
+            f"forcegp excite {out}/model --seconds 10 --out next.csv"
+            + (f" (least is known of {weak})" if weak else ""),
+        ),
+        ("wrote", f"{out}/model, {out}/identified.urdf, {out}/validation/report.md"),
+    ]
+
+
+def _score(model: Mapping[str, Any]) -> str:
+    motions, error = model.get("motions"), model.get("nrmse")
+    last = None if not motions or not motions["rms"] else motions["rms"][-1]
+    return " / ".join(number(None if each is None else each["median"]) for each in (last, error))
