@@ -27,6 +27,7 @@ from forcegp.cli.fit import Fit
 from forcegp.cli.identify import Identify
 from forcegp.cli.import_log import Import
 from forcegp.cli.monitor import Monitor
+from forcegp.cli.payload import Payload
 from forcegp.cli.prepare import Prepare
 from forcegp.cli.reproduce import Reproduce
 from forcegp.cli.rollout import Rollout
@@ -58,6 +59,7 @@ COMMANDS: dict[str, tuple[type[Command], str]] = {
     "fit": (Fit, "learn the unknown forces from a dataset"),
     "compare": (Compare, "which kind of unknown force the data support"),
     "identify": (Identify, "estimate masses, inertias and friction coefficients, and their standard errors"),
+    "payload": (Payload, "mass, centre of mass and inertia of what the robot holds"),
     "evaluate": (Evaluate, "score a fitted model on another dataset"),
     "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
     "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),

@@ -1,0 +1,103 @@
+"""`forcegp payload`: mass, centre of mass and inertia of what a robot holds, from its log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.text import Text
+from tyro.conf import Positional, arg
+
+import forcegp
+import forcegp.analytical
+from forcegp.atomic_files import write_json, write_text
+from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.input_options import SYSTEM_FILE, PreparationOptions, RobotOptions
+from forcegp.cli.learning_options import friction_laws
+from forcegp.cli.terminal import Terminal, columns
+
+LABELS = {"mass": ("mass", "kg", 1.0)}
+LABELS |= {f"center_of_mass.{x}": (f"centre of mass {x}", "mm", 1e3) for x in "xyz"}
+LABELS |= {f"inertia.{x}": (f"inertia {x}", "kg m²", 1.0) for x in ("xx", "yy", "zz")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload(PreparationOptions, RobotOptions):
+    """Find the mass, centre of mass and inertia of a payload, with friction and rotors estimated along.
+
+    The log is a motion in the air that turns every joint in both directions, of 20 s or more. Without --baseline, what
+    the URDF's links lack counts as payload. With one, both logs share the links, which are estimated, too.
+
+    For instance:
+      forcegp payload loaded.h5 --robot arm.urdf
+      forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
+    """
+
+    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
+    """The log with the payload (a dataset, raw or prepared)."""
+    baseline: Annotated[Path | None, DATASET, unless_given("DATA", "the URDF", Path)] = None
+    """A log of the same robot without the payload."""
+    link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
+    """What carries the payload, and in whose frame it is reported."""
+    friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,stribeck,offset"
+    """What is estimated of friction, as for forcegp identify."""
+    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
+    """Low-pass filter of a log that is not prepared yet. auto: of which parameters predict held-out torques best."""
+    delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    """How much later than it acts u was logged, in s."""
+    out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
+    """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
+    overwrite: bool = False
+    """Replace the folder if forcegp wrote it."""
+    json: Json = False
+    debug: Debug = False
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Prepare, estimate, write and show."""
+        self.require_free(self.out)
+        laws = friction_laws(self.friction)
+        system, rows = self._rows(terminal, self.data)
+        baseline = None if self.baseline is None else self._rows(terminal, self.baseline)[1]
+        with terminal.progress("identifying"):
+            found = forcegp.analytical.identify_payload(rows, system, baseline=baseline, link=self.link, friction=laws)
+        content = {"data": str(self.data), **found.to_dict()}
+        if self.out is not None:
+            given = {"command": self.words("baseline", "link", "friction", "cutoff", "delay")}
+            with self.folder(self.out, {"data": str(self.data), **given}) as folder:
+                write_json(folder / "payload.json", content)
+                write_text(folder / "loaded.urdf", found.system.robot.to_urdf())
+                write_text(folder / SYSTEM_FILE, found.system.to_json() + "\n")
+        if not found.fit.settled:
+            terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
+        terminal.show(*_tables(found))
+        return content
+
+    def _rows(self, terminal: Terminal, path: Path) -> tuple[forcegp.MechanicalSystem, forcegp.Dataset]:
+        """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
+        dataset = forcegp.Dataset.load(path)
+        system = self.chosen_system(dataset, path)
+        if forcegp.data.preparation_report(dataset.metadata):
+            return system, dataset
+        with terminal.progress(f"preparing {path}"):
+            prepared = self._preparation().apply(replace(dataset, system=system))
+        for name in ("cutoff", "delay"):
+            if name in prepared.report["why"]:
+                terminal.note(f"{path}: {name}: {prepared.report['why'][name]}")
+        return system, prepared.dataset
+
+
+def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
+    rows = []
+    for name, (label, unit, factor) in LABELS.items():
+        low, high = (factor * end for end in found.intervals[name])
+        error = factor * found.standard_errors[name]
+        rows.append([label, f"{factor * found.values[name]:.4g}", f"{error:.2g}", f"{low:.4g} … {high:.4g}", unit])
+    title = f"payload in the frame of {found.link}, beside {'the baseline' if found.baseline else 'the URDF'}"
+    tables: list[Any] = [columns(title, ["", "", "std. error", "95 % interval", ""], rows)]
+    joints = list(dict.fromkeys(name.partition(".")[2] for name in found.joints))
+    fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
+    rows = [[joint, *(f"{found.joints[f'{field}.{joint}'][0]:.3g}" for field in fields)] for joint in joints]
+    tables.append(columns("joints, in Nm, rad/s and kg m²", ["joint", *(f.replace("_", "\n") for f in fields)], rows))
+    return [*tables, Text(f"{found.rows} rows.")]
