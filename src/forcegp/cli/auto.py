@@ -23,12 +23,11 @@ import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
 from forcegp.cli.command import CONFIG, URDF, unless_given
 from forcegp.cli.import_log import Import
-from forcegp.cli.input_options import SYSTEM_FILE
+from forcegp.cli.input_options import SYSTEM_FILE, time_step
 from forcegp.cli.terminal import Terminal, number
-from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit
+from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
-PASSED = 3.0  # rows per period of the cut-off that are kept: more repeat their neighbours
 METHOD = "torque-all"
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 
@@ -185,11 +184,9 @@ class Auto(Import):
         """Rows to learn from, the same at the full rate, and what was done."""
         chosen = replace(self, every=1)._preparation().apply(raw)
         numbers = chosen.preparation
-        step = forcegp.data.uniform_step(raw.time[raw.episode == raw.episodes[0]])
-        period = None if numbers.cutoff is None else 1.0 / float(numbers.cutoff)
-        every = self.every or (1 if period is None else max(1, int(period / (step * PASSED))))
-        numbers = replace(numbers, trim=self.trim or period or 0.0)
-        rows = replace(numbers, every=every).apply(raw)
+        period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)
+        numbers = replace(numbers, trim=self.trim or period)
+        rows = replace(numbers, every=self.every or numbers.thinning(time_step(raw))).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.dataset.save(temporary)
         return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
@@ -216,6 +213,8 @@ class Auto(Import):
             )
         with terminal.progress("learning from all rows"):
             best = forcegp.validation.recommended(found.document)
+            if best is None:
+                raise FitError(f"no model was fitted; {self.out / 'validation' / 'report.md'} has the reasons.")
             posterior = forcegp.validation.fitted_on_all_rows(comparison, best)
             forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
         return found.document, posterior

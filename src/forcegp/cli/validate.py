@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.validation
 from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
-from forcegp.cli.input_options import PreparationOptions, RobotOptions
+from forcegp.cli.input_options import PreparationOptions, RobotOptions, time_step
 from forcegp.cli.learning_options import friction_laws
 from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
@@ -31,7 +31,8 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
 
     Every model learns from the same rows; what is held out is whole episodes, or blocks of time with a guard around
     them. A run that was interrupted goes on with the same command; one with more --models or --seeds computes only
-    these. The page is report.md in the folder, the numbers are in results.json; see docs/validation.md.
+    these. The page is report.md in the folder, the numbers are in results.json, and the recommended model, learned from
+    all rows, is in model; see docs/validation.md.
 
     For instance:
       forcegp validate log.h5 --robot arm.urdf --split episodes:3,7 --cutoff 20 --trim 0.1 --every 5 --out results
@@ -44,7 +45,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset (HDF5), raw or prepared."""
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
-    """The folder of results; an unfinished one is gone on with."""
+    """The folder of results; an unfinished run resumes."""
     split: Annotated[str, arg(metavar="SPLIT")] = "auto"
     """What is held out. episodes:N,N...: these episodes. leave-one-out: every episode once. fraction:F[:SEED]: a
     fraction of the episodes. blocks:N:K,K...: of N blocks of time of every episode those of these numbers, from 1.
@@ -61,6 +62,8 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,coulomb"
     """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, offset and direction; or
     none."""
+    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None  # type: ignore[assignment]
+    """Keep every N-th row, after the filter."""
     points: Annotated[int, arg(metavar="N")] = 100
     """Rows that models learn from: those that lie farthest apart among two thirds of the training rows. Friction of the
     joints and other functions of one or two inputs learn from all, as identifications do."""
@@ -109,6 +112,12 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
                 overwrite=self.overwrite,
                 progress=report,
             )
+        best = forcegp.validation.recommended(validation.document)
+        if best is not None:
+            with terminal.progress(f"learning {best} from all rows"):
+                posterior = forcegp.validation.fitted_on_all_rows(comparison, best)
+                forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
+            terminal.note(f"{best}, learned from all rows: {self.out / 'model'}")
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
         terminal.show(*self._report(validation.document))
         brief = (
@@ -128,11 +137,13 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         raw = forcegp.Dataset.load(self.data)
         system = self.chosen_system(raw, self.data)
         raw = replace(raw, system=system)
-        preparation = self._preparation()
+        preparation = replace(self, every=self.every or 1)._preparation()
         if preparation.changes_nothing:
             rows = recording = raw
         else:
             preparation = preparation.resolved(raw)
+            if self.every is None:
+                preparation = replace(preparation, every=preparation.thinning(time_step(raw)))
             rows = preparation.apply(raw).dataset
             recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw).dataset
             self._warn_of_memory(terminal, preparation.cutoff, preparation.order)

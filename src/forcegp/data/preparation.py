@@ -18,6 +18,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 AUTOMATIC = "auto", "each"
+PASSED = 3.0  # rows in a period of the cut-off: more repeat their neighbours
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 
 
@@ -74,6 +75,10 @@ class Preparation:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
         if self.differentiate not in ("q", "v"):
             raise InvalidInput(f"differentiate is {self.differentiate!r}; allowed: 'q' or 'v'.")
+
+    def thinning(self, step: float) -> int:
+        """N, so that every N-th row at steps of `step` [s] holds what the filter leaves: `PASSED` rows per period."""
+        return 1 if self.cutoff in (None, "auto") else max(1, int(1.0 / (step * PASSED * float(self.cutoff))))
 
     @property
     def changes_nothing(self) -> bool:

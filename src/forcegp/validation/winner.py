@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from forcegp.analytical import NoiseLevels
-from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
 from forcegp.validation.candidates import Training, candidate
@@ -14,12 +13,10 @@ ORDER = "motion", "force_rms", "nrmse"
 """Scores that decide, the first one that there is: where a robot goes is what simulators and controllers need."""
 
 
-def recommended(document: Mapping[str, Any]) -> str:
-    """The name of the model to take, of the document of a `Validation`. Raises InvalidInput where none was scored."""
-    for score in ORDER:
-        if score in document["winners"]:
-            return document["winners"][score]["model"]
-    raise InvalidInput("no model was scored, so none is recommended; look at the failures in report.md.")
+def recommended(document: Mapping[str, Any]) -> str | None:
+    """The name of the model to take, of the document of a `Validation`; None where no model was scored."""
+    scores = (document["winners"][score]["model"] for score in ORDER if score in document["winners"])
+    return next(scores, None)
 
 
 def fitted_on_all_rows(comparison: Comparison, name: str, seed: int = 0) -> Posterior:
