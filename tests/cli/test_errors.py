@@ -96,7 +96,7 @@ WRONG = [
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
     ("simulate mars --out a.h5", "'mars'"),
     ("demo --out mine", "was not written by `forcegp demo`"),
-    ("learn arm.h5", "Available subcommands: demo, simulate, import, "),
+    ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),
     ("", "demo, simulate, import, "),
 ]
 

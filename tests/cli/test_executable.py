@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from tests.cli.test_import import FLAGS
 from tests.control import test_monitor as monitored
@@ -21,12 +22,20 @@ from forcegp.cli.main import COMMANDS
 QUICK = ("--points", 8, "--iterations", 2, "--restarts", 1)
 
 RUNS: dict[str, tuple[tuple[object, ...], str]] = {
+    "auto": (
+        (
+            *("moving.csv", "--time", "t", "--q", "q{1..3}", "--v", "v{1..3}", "--u", "u{1..3}", "--robot", "arm.urdf"),
+            *("--cutoff", "none", "--delay", 0, "--models", "analytical", "--accept", "--out", "answer"),
+        ),
+        "answer/validation/report.md",
+    ),
     "demo": (("--seconds", 0.5, "--points", 8, "--iterations", 2, "--out", "story"), "story/summary.png"),
     "simulate": (("kuka-surface", "--seconds", 0.1, "--out", "simulated.h5"), "simulated.h5"),
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
     "check": (("log.h5", "--plots", "look"), "look/check.png"),
     "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
+    "payload": (("log.h5", "--cutoff", "none", "--delay", 0, "--out", "held"), "held/payload.json"),
     "compare": (("arm.h5", "--prior", "joint", "--prior", "joint-friction", *QUICK, "--out", "c"), "c/comparison.json"),
     "identify": (("arm.h5", "--learn", "hand:mass", *QUICK, "--out", "found"), "found/identified.urdf"),
     "evaluate": (("run", "test.h5", "--plots", "figures"), "figures/evaluation.json"),
@@ -66,6 +75,11 @@ def folder(forcegp, tmp_path_factory):
         arm_data(rows, seed).save(place / f"{name}.h5")
     moving_arm(1.0, 2).save(place / "log.h5")
     write_text(place / "log.csv", table(motion()))
+    moving = moving_arm(6.0, 1)
+    (place / "arm.urdf").write_text(moving.system.robot.urdf_text)
+    header = "t," + ",".join(f"{name}{k}" for name in "qvu" for k in (1, 2, 3))
+    columns = np.column_stack([moving.time, moving.q, moving.v, moving.u])
+    np.savetxt(place / "moving.csv", columns, delimiter=",", header=header, comments="")
     for name, seconds, seed in (("free", 55.0, 1), ("pushed", 3.0, 7)):
         monitored.saved(place / f"{name}.h5", monitored.motion(seconds, seed))
     for words in (("arm.h5", "--out", "run"), ("free.h5", "--prior", "joint-friction", "--out", "free-run")):

@@ -31,6 +31,8 @@ VALID = {
         "--out",
         "out.h5",
     ),
+    "auto": ("auto", "log.csv", "--robot", "arm.urdf", "--step", "0", "--out", "out"),
+    "payload": ("payload", "test.h5", "--friction", "none-such"),
     "check": ("check", "test.h5"),
     "prepare": ("prepare", "test.h5", "--cutoff", "20", "--out", "out.h5"),
     "fit": ("fit", "train.h5", *SMALL, "--out", "out"),

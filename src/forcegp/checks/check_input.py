@@ -62,7 +62,7 @@ wrong, look, ok = partial(Finding, severity="wrong"), partial(Finding, severity=
 
 
 def import_flags(correction: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> str:
-    """The options of `forcegp import` that state units and signs: `--unit q=deg --sign u=1,-1`."""
+    """The options of `forcegp import` that state these units and signs."""
     texts = []
     for what in ("unit", "sign"):
         stated = correction.get(what, {})

@@ -61,11 +61,11 @@ def _rotors(inputs: CheckInput, found: PayloadEstimate) -> Iterator[Finding]:
         return
     joints = inputs.named(np.flatnonzero(more))
     sizes = ", ".join(f"{name} {values[inputs.names.index(name)]:.3g}" for name in joints)
-    flags = " ".join(f"--armature {name}={values[inputs.names.index(name)]:.3g}" for name in joints)
     yield look(
         subject="rotors",
         seen=f"the torques show rotor inertias that the robot does not have: {sizes} (kg m², or kg).",
-        remedy=f"{flags}; or forcegp identify, which estimates them with all else.",
+        remedy="State them as `armature`, one for each joint; or forcegp identify --model consistent estimates them with "
+        "all else.",
         joints=joints,
         numbers={"armature": dict(zip(inputs.names, values.tolist(), strict=True))},
     )

@@ -80,10 +80,8 @@ class Auto(Import):
             dataset, done, mapping, mistakes = self._imported(terminal, system, mapping, path)
             corrected = self._command(mapping)
             if mistakes and not self.correct:
-                terminal.show(
-                    _findings(terminal, mistakes),
-                    Text(f"Run:\n{corrected}", style="bold", no_wrap=True, overflow="ignore"),
-                )
+                terminal.show(_findings(terminal, mistakes), "Run:")
+                terminal.command(corrected)
                 raise DatasetError(
                     f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
                 )
@@ -257,7 +255,8 @@ def _answer(
     rate, seconds = prepared["sample_rate"][0], content["seconds"]
     mistakes = ", ".join(each["subject"] for each in content["mistakes"]) or "nothing"
     late = prepared["delay"][0]
-    shifted = f"u was logged {1e3 * late:.1f} ms late (shifted)" if late else "u shows no delay"
+    when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
+    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else "u shows no delay"
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
 
     def each(field: str, pattern: str = "{:.3g}") -> str:

@@ -138,6 +138,11 @@ class Terminal:
                 console = self.out if needed <= self.out.width else Console(highlight=False, width=needed)
                 console.print(renderable)
 
+    def command(self, words: str) -> None:
+        """A command to copy, in one line whatever the width."""
+        if not self.json:
+            self.out.print(Text(words, style="bold"), soft_wrap=True)
+
     def note(self, text: str) -> None:
         """Report on stderr what was done."""
         self.err.print(self.worded(text), style="dim", markup=False)

@@ -1,0 +1,129 @@
+"""`identify_payload` against payloads that Pinocchio's inverse dynamics carries."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from tests.robots.pinocchio_oracle import Oracle
+
+from forcegp.analytical import PayloadEstimate, identify_payload
+from forcegp.data import Dataset
+from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.mechanics import MechanicalSystem
+from forcegp.robots import Robot
+from forcegp.robots.urdf_file import replace_inertial
+from forcegp.simulation.free_arms import ARMS, FreeArmConfig, simulate_free_arm
+
+TEXT = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=0.1)).system.robot.urdf_text
+ROBOT = Robot.from_urdf_text(TEXT)
+MASS, CENTER, INERTIA = 1.3, np.array([0.03, -0.02, 0.06]), np.diag([2e-3, 3e-3, 1e-3])
+ROTORS = 0.01 * np.array([joint.effort_limit for joint in ROBOT.joints])
+
+
+def log(text, seed, *, seconds=30.0, noise=0.0, friction=1.0):
+    """A smooth motion of a UR5 with this URDF, and the torques that it needs."""
+    rng, time = np.random.default_rng(seed), np.arange(0.0, seconds, 0.02)
+    size, w, phase = rng.uniform(0.2, 0.5, (3, 6)), rng.uniform(0.5, 3.0, (3, 6)), rng.uniform(0, 6.3, (3, 6))
+    at = w * time[:, None, None] + phase
+    q = np.array(ARMS["ur5-free"][1]) + (size * np.sin(at)).sum(1)
+    v, a = (size * w * np.cos(at)).sum(1), -(size * w**2 * np.sin(at)).sum(1)
+    oracle = Oracle(text, ROBOT)
+    dry = 2.0 * ROTORS * (1.0 + 0.5 * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02)
+    u = np.array([oracle.inverse_dynamics(*row) for row in zip(q, v, a, strict=True)])
+    u += ROTORS * a + friction * (dry + ROTORS * v) + noise * rng.standard_normal(u.shape)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, joint_names=ROBOT.joint_names, system=MechanicalSystem(ROBOT))
+
+
+def loaded(mass=MASS, text=TEXT):
+    return replace_inertial(text, "tool0", mass, CENTER, INERTIA, source="a test")
+
+
+@pytest.fixture(scope="module")
+def found() -> PayloadEstimate:
+    return identify_payload(log(loaded(), 1, noise=0.05))
+
+
+def test_the_payload_is_found_with_friction_and_rotors(found):
+    assert found.link == "tool0"
+    assert found.mass == pytest.approx(MASS, rel=0.005)
+    np.testing.assert_allclose(found.center_of_mass, CENTER, atol=1e-3)
+    assert found.fit.settled
+    for joint, rotor in zip(ROBOT.joint_names, ROTORS, strict=True):
+        assert found.joints[f"armature.{joint}"][0] == pytest.approx(rotor, rel=0.03)
+        assert found.joints[f"coulomb.{joint}"][0] == pytest.approx(2.0 * rotor, rel=0.05)
+
+
+def test_the_system_moves_as_the_loaded_robot(found):
+    rows = log(loaded(), 2, friction=0.0)
+    q, v, a = (torch.tensor(x[::50]) for x in (rows.q, rows.v, rows.a))
+    robot = found.system.robot
+    np.testing.assert_allclose(robot.inverse_dynamics(q, v, a).numpy() + a.numpy() * ROTORS, rows.u[::50], atol=0.1)
+    assert pin.computeTotalMass(pin.buildModelFromXML(robot.to_urdf())) == pytest.approx(16.9939 + MASS, rel=1e-3)
+
+
+def test_intervals_hold():
+    """95 % intervals of mass and place over payloads and noise that no test has seen: 32 numbers, 28 at least."""
+    held = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        mass, center = rng.uniform(0.3, 3.0), rng.uniform(-0.08, 0.08, 3)
+        text = replace_inertial(TEXT, "tool0", mass, center, INERTIA, source="a test")
+        estimate = identify_payload(log(text, seed, noise=0.3), rows=800)
+        ends = list(estimate.intervals.values())[:4]
+        held += sum(low <= true <= high for (low, high), true in zip(ends, [mass, *center], strict=True))
+    assert held >= 28
+
+
+def test_a_baseline_takes_errors_of_the_urdf_away():
+    """A forearm that is 20 % heavier than its URDF is no payload."""
+    link = ROBOT.link("elbow_link")
+    heavier = replace_inertial(
+        TEXT, "elbow_link", 1.2 * link.mass, np.array(link.center_of_mass), 1.2 * np.array(link.inertia), source="x"
+    )
+    with_payload, without = log(loaded(text=heavier), 3, noise=0.05), log(heavier, 4, noise=0.05)
+    alone = identify_payload(with_payload, rows=800)
+    together = identify_payload(with_payload, baseline=without, rows=800)
+    assert abs(alone.mass - MASS) > 0.05
+    assert together.mass == pytest.approx(MASS, rel=0.01)
+    np.testing.assert_allclose(together.center_of_mass, CENTER, atol=3e-3)
+    assert together.to_dict()["baseline"] is True
+
+
+def test_no_payload_is_none():
+    nothing = identify_payload(log(TEXT, 5, noise=0.05), rows=800)
+    assert nothing.mass < 0.02
+    low, high = nothing.intervals["mass"]
+    assert low < 0.01
+    assert high < 0.1
+
+
+def test_the_frame_is_that_of_the_link(found):
+    """The same payload in the frame of the wrist, 82.3 mm before the tool."""
+    wrist = identify_payload(log(loaded(), 1, noise=0.05), link="wrist_3_link")
+    assert wrist.mass == pytest.approx(found.mass, rel=1e-3)
+    np.testing.assert_allclose(wrist.center_of_mass, found.center_of_mass + np.array([0.0, 0.0, 0.0823]), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"link": "base"}, "does not move"),
+        ({"link": "tool9"}, "tool9"),
+        ({"rows": 10}, "rows is 10"),
+        ({"friction": ("sticky",)}, "sticky"),
+        ({"baseline": "empty.h5"}, "baseline"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(change, message):
+    with pytest.raises(ForceGPError, match=message):
+        identify_payload(log(TEXT, 0, seconds=10.0), **change)
+
+
+def test_a_short_log_is_refused():
+    short = log(TEXT, 0, seconds=2.0)
+    with pytest.raises(InvalidInput, match="100 rows; a payload needs 200"):
+        identify_payload(short)
+    with pytest.raises(InvalidInput, match="system"):
+        identify_payload(replace(short, system=None))

@@ -1,0 +1,128 @@
+"""`forcegp auto`: mistakes are named with the command that corrects them, and that command gives the whole answer."""
+
+import json
+import shlex
+
+import numpy as np
+import pytest
+
+from forcegp import Dataset, Robot, load_posterior
+from forcegp.analytical import motion_residuals
+from forcegp.simulation.free_arms import FreeArmConfig, simulate_free_arm
+
+COLUMNS = (
+    "--time",
+    "Zeit",
+    "--q",
+    "Winkel_{1..2}",
+    "--v",
+    "Tempo_{1..2}",
+    "--u",
+    "Moment_{1..2}",
+    "--robot",
+    "arm.urdf",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A log of a double pendulum in ms, degrees and degrees per second, with one torque turned, and its URDF."""
+    place = tmp_path_factory.mktemp("auto")
+    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=25.0, seed=1, noise=0.0))
+    (place / "arm.urdf").write_text(data.system.robot.urdf_text)
+    rng = np.random.default_rng(0)
+    q = data.q + 1e-5 * rng.standard_normal(data.q.shape)
+    table = np.column_stack([1e3 * data.time, np.rad2deg(q), np.rad2deg(data.v), data.u * [1.0, -1.0]])
+    names = ("Zeit", *(f"{what}_{k}" for what in ("Winkel", "Tempo", "Moment") for k in (1, 2)))
+    np.savetxt(place / "log.csv", table, delimiter=";", header=";".join(names), comments="", fmt="%.9g")
+    return place
+
+
+@pytest.fixture(scope="module")
+def answered(folder, forcegp):
+    """The command that the first one printed, and what it answered."""
+    refused = forcegp("auto", "log.csv", *COLUMNS, "--out", "answer", folder=folder)
+    assert refused.returncode == 2
+    assert refused.stderr.strip().splitlines()[-1].startswith("forcegp: 4 mistakes in the log")
+    assert not (folder / "answer").exists()
+    command = refused.stdout[refused.stdout.index("forcegp auto") :].strip()
+    assert "\n" not in command
+    for flag in ("q=deg", "v=deg/s", "time=ms", "--sign u=1,-1"):
+        assert flag in command
+    done = forcegp(*shlex.split(command)[1:], "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return command, json.loads(done.stdout)
+
+
+def test_the_corrected_command_gives_a_model_that_works(folder, answered):
+    _, content = answered
+    assert content["mistakes"] == []
+    test = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=3.0, seed=2, noise=0.0))
+    model = load_posterior(folder / "answer" / "model")
+    error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()
+    assert error < 0.1 * np.abs(motion_residuals(test, test.system)[1]).mean()  # of the URDF
+    assert len(Dataset.load(folder / "answer" / "log.h5")) == 6000
+    identified = Robot.from_urdf(folder / "answer" / "identified.urdf")
+    assert identified.joint_names == test.joint_names
+    assert (folder / "answer" / "validation" / "report.md").is_file()
+
+
+def test_the_answer_holds_what_was_simulated(answered):
+    _, content = answered
+    values = content["payload"]["joints"]
+    for joint in ("upper_hinge", "lower_hinge"):
+        assert values[f"coulomb.{joint}"]["value"] == pytest.approx(0.4, rel=0.05)  # 0.02 of 20 Nm
+        assert values[f"viscous.{joint}"]["value"] == pytest.approx(0.2, rel=0.1)
+    answer = "\n".join(content["answer"])
+    assert "payload: none" in answer
+    assert "u was logged 2.3 ms early" in answer  # of steps of 4.2 ms, in which the simulated controller holds it
+    assert 8 <= len(content["answer"]) <= 11
+
+
+def test_a_second_run_takes_what_is_finished(folder, answered, forcegp):
+    command, content = answered
+    jobs = folder / "answer" / "validation" / "jobs"
+    before = {path: path.stat().st_mtime_ns for path in jobs.rglob("job.json")}
+    again = forcegp(*shlex.split(command)[1:], "--json", folder=folder)
+    assert again.returncode == 0, again.stderr
+    assert {path: path.stat().st_mtime_ns for path in jobs.rglob("job.json")} == before
+    assert json.loads(again.stdout)["answer"] == content["answer"]
+
+
+def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
+    """Up to the check: what comes after it is the same."""
+    monkeypatch.setattr("forcegp.cli.auto.Auto._prepared_rows", _stopped)
+    done = forcegp("auto", "log.csv", *COLUMNS, "--correct", "--out", "other", folder=folder)
+    assert "InvalidInput" not in done.stderr
+    assert "reached" in done.stderr
+    rows = Dataset.load(folder / "other" / "log.h5")
+    assert np.abs(rows.q).max() < 4.0
+    assert rows.time[-1] == pytest.approx(25.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("auto log.csv --robot nowhere.urdf --out x", "nowhere.urdf: no such file"),
+        ("auto log.csv --robot arm.urdf --out log.csv", "log.csv"),
+        ("auto nothing.csv --robot arm.urdf --out x", "nothing.csv does not exist"),
+        ("auto log.csv --out x", "--robot"),
+        ("auto log.csv --robot arm.urdf --out deep/er", "the folder deep does not exist"),
+        ("auto log.csv --robot arm.urdf --q Wnkel_{1..2} --u Moment_{1..2} --time Zeit --out x", "Wnkel_1"),
+        ("auto log.csv --robot arm.urdf --out mine", "mine was not written by forcegp auto"),
+    ],
+)
+def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
+    (folder / "mine").mkdir(exist_ok=True)
+    (folder / "mine" / "letter.txt").write_text("keep")
+    refused = forcegp(*words.split(), folder=folder)
+    assert refused.returncode == 2
+    assert message in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1
+    assert not (folder / "x").exists()
+
+
+def _stopped(*_):
+    from forcegp.errors import InvalidInput
+
+    raise InvalidInput("reached")

@@ -1,0 +1,71 @@
+"""Cut-offs that held-out torques choose; delays beside friction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.analytical.test_payload import ROBOT, TEXT, log
+
+from forcegp.analytical import identify_analytical, motion_residuals
+from forcegp.data import Preparation, estimate_delay
+from forcegp.data.held_out_cutoff import FACTORS, held_out_cutoff
+from forcegp.errors import DatasetError
+
+STEP = 0.004
+
+
+def raw(seed, noise, late=0.0):
+    """The motion at 250 Hz with noise of the positions, and torques that are logged late."""
+    rows = log(TEXT, seed, seconds=30.0)
+    time = np.arange(rows.time[0], rows.time[-1], STEP)
+    rng = np.random.default_rng(seed)
+    from scipy.interpolate import CubicSpline
+
+    q = CubicSpline(rows.time, rows.q)(time) + noise * rng.standard_normal((len(time), 6))
+    u = CubicSpline(rows.time, rows.u)(np.clip(time - late, rows.time[0], rows.time[-1]))
+    u += 0.05 * rng.standard_normal(u.shape)
+    v = np.gradient(q, STEP, axis=0)
+    return replace(rows, q=q, v=v, u=u, a=np.gradient(v, STEP, axis=0), time=time, episode=np.zeros(len(time), int))
+
+
+def test_the_chosen_cutoff_leaves_least_unexplained():
+    best, shares = held_out_cutoff(raw(1, 1e-4), ROBOT, 6.0)
+    assert shares[best] == min(shares.values())
+    assert len(shares) >= len(FACTORS)
+
+
+def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
+    """From a tenth of the right cut-off the search comes to where friction is not smeared."""
+    rows = raw(2, 1e-5)
+    low = 1.2
+    best, shares = held_out_cutoff(rows, ROBOT, low)
+    assert best > 1.9 * low
+    assert shares[min(shares)] > 2.0 * shares[best]
+
+    def error(cutoff):
+        """Rms of what the identified robot misses of the torques of another motion, without noise."""
+        prepared = Preparation(cutoff=cutoff, trim=1.0, every=5).apply(rows).dataset
+        found = identify_analytical(prepared, friction=("viscous", "stribeck"))
+        return np.sqrt(np.square(motion_residuals(log(TEXT, 9), found.system)[0]).mean())
+
+    assert error(best) < 0.6 * error(low)
+
+
+def test_preparations_take_it_and_report_why():
+    report = Preparation(cutoff="auto", delay="auto").apply(raw(3, 1e-4)).report
+    assert "of held-out torques stay unexplained" in report["why"]["cutoff"]
+    alone = Preparation(cutoff="auto").apply(replace(raw(3, 1e-4), system=None)).report
+    assert "held-out" not in alone["why"]["cutoff"]
+
+
+def test_short_logs_are_refused():
+    with pytest.raises(DatasetError, match="too few to choose a cut-off"):
+        held_out_cutoff(raw(1, 1e-4).rows(slice(0, 300)), ROBOT, 6.0)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.006])
+def test_stribeck_friction_is_no_delay(late):
+    """With one smooth sign of the velocity, friction like this looked 20 ms late."""
+    rows = Preparation(cutoff=12.0, trim=0.5).apply(raw(4, 1e-5, late)).dataset
+    found = estimate_delay(rows)
+    assert found.significant == pytest.approx(late, abs=1e-3)
