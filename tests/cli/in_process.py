@@ -20,7 +20,7 @@ PYTHON_FILTERS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, 
 """Which warnings Python does not show where nobody asks for them: https://docs.python.org/3/library/warnings.html."""
 
 
-def run_here(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+def run_here(*arguments: object, folder: Path | None = None, columns: int = 100) -> subprocess.CompletedProcess[str]:
     """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr.
 
     Files, pipes and warnings are those of a new process, and what the command could change here is put back.
@@ -30,7 +30,7 @@ def run_here(*arguments: object, folder: Path | None = None) -> subprocess.Compl
         undo.callback(torch.set_num_threads, torch.get_num_threads())
         undo.enter_context(contextlib.chdir(folder or Path.cwd()))
         environment = undo.enter_context(pytest.MonkeyPatch.context())
-        environment.setenv("COLUMNS", "100")
+        environment.setenv("COLUMNS", str(columns))
         undo.enter_context(warnings.catch_warnings())
         warnings.simplefilter("default")
         for category in PYTHON_FILTERS:

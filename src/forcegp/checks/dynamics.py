@@ -64,8 +64,8 @@ def _rotors(inputs: CheckInput, found: PayloadEstimate) -> Iterator[Finding]:
     yield look(
         subject="rotors",
         seen=f"the torques show rotor inertias that the robot does not have: {sizes} (kg m², or kg).",
-        remedy="State them as `armature`, one for each joint; or forcegp identify --model consistent estimates them with "
-        "all else.",
+        remedy="State them as `armature`, one for each joint; or forcegp identify --model consistent, which estimates "
+        "them with all else.",
         joints=joints,
         numbers={"armature": dict(zip(inputs.names, values.tolist(), strict=True))},
     )

@@ -252,7 +252,7 @@ def _answer(
     import_, prepared = content["import"], content["preparation"]
     deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
-    rate, seconds = prepared["sample_rate"][0], content["seconds"]
+    rate, seconds = 1.0 / time_step(dataset), content["seconds"]
     mistakes = ", ".join(each["subject"] for each in content["mistakes"]) or "nothing"
     late = prepared["delay"][0]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"

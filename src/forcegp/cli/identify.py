@@ -202,8 +202,7 @@ class Identify(IdentifyOptions):
       forcegp identify log.h5 --robot arm.urdf --model consistent --friction viscous,coulomb,offset --out identified
       forcegp identify log.h5 --robot arm.urdf --model consistent --motions 1 --out identified
       forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
-      forcegp identify log.h5 --robot arm.urdf --learn tool:mass,com,inertia --learn viscous-joint-friction=0.1
-        --noise learned --out identified
+      forcegp identify log.h5 --learn tool:mass,com,inertia --learn viscous-joint-friction=0.1 --out identified
     """
 
     json: Json = False

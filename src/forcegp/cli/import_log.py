@@ -33,8 +33,8 @@ class Import(PreparationOptions, RobotOptions):
 
     State which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or
     in a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
-    pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Nothing is filtered unless
-    --cutoff, --delay, --lag, --every or --trim is given.
+    pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
+    a --cutoff, --delay, --lag, --every or --trim, rows stay as they were logged.
 
     For instance:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
@@ -44,12 +44,12 @@ class Import(PreparationOptions, RobotOptions):
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "none", Path)] = None
     """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
-    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...")]]
+    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside", Path)] = None
-    """What the columns mean; flags replace its entries. Default: log.yaml or forcegp.yaml beside the log."""
+    """What the columns mean; flags replace its entries. Without it, log.yaml or forcegp.yaml beside the log is read."""
     write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "no", Path)] = None
     """Write the mapping that results from flags and --mapping."""
     time: Columns = None
@@ -59,13 +59,13 @@ class Import(PreparationOptions, RobotOptions):
     q: Columns = None
     """Positions, one per joint."""
     v: Columns = None
-    """Velocities. Default: as named after the joints, else central differences of q."""
+    """Velocities; without any they are central differences of q."""
     u: Columns = None
     """Forces or torques of the actuators; a constant such as 0 is for all joints."""
     a: Columns = None
-    """Accelerations. Default: central differences of v."""
-    joints: Text = None
-    """Names of the joints in the order of the columns. Default: those of --robot."""
+    """Accelerations; without any they are central differences of v."""
+    joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
+    """Names of the joints in the order of the columns."""
     unit: Text = None
     """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm."""
     sign: Text = None

@@ -4,11 +4,13 @@ import contextlib
 import errno
 import io
 import os
+import shutil
 import signal
 import sys
+import textwrap
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -87,14 +89,49 @@ def parse_arguments(words: Sequence[str]) -> Command:
 
 
 def _parse(kind: Any, words: Sequence[str], prog: str, description: str | None = None) -> Command:
-    complaint = io.StringIO()
+    complaint, shown, width = io.StringIO(), _Shown(), min(WIDEST, shutil.get_terminal_size().columns)
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(width)  # which tyro reads
     try:
-        with contextlib.redirect_stderr(complaint):
+        with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(shown):
             return tyro.cli(kind, prog=prog, description=description, args=words, config=(FlagCreatePairsOff,))
     except SystemExit as end:
         if not end.code:
+            names = "{" + ",".join(COMMANDS) + "}"
+            print("\n".join(wrapped(shown.getvalue().replace(names, "COMMAND"), width)))
             raise
         raise InvalidInput(f"{one_line(complaint.getvalue())} See {prog} --help.") from None
+    finally:
+        del os.environ["COLUMNS"]
+        os.environ |= {} if before is None else {"COLUMNS": before}
+
+
+class _Shown(io.StringIO):
+    """What would go to stdout: tyro draws boxes and colors that fit there."""
+
+    encoding = property(lambda _: sys.stdout.encoding if sys.__stdout__ is None else sys.__stdout__.encoding)
+
+    def isatty(self) -> bool:
+        return sys.__stdout__ is not None and sys.__stdout__.isatty()
+
+
+WIDEST = 100
+"""Columns of a help page at most."""
+
+
+def wrapped(text: str, width: int) -> Iterator[str]:
+    """The lines of a help page within so many columns: paragraphs at words, commands so that they can be pasted."""
+    options: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
+    for line in text.rstrip("\n").split("\n"):
+        if len(line) <= width or line.lstrip()[:1] in BOX:
+            yield line
+        elif line.startswith(" "):
+            yield from " \\\n".join(textwrap.wrap(line, width - 2, subsequent_indent="      ", **options)).split("\n")
+        else:
+            yield from textwrap.wrap(line, width, **options)
+
+
+BOX = ("\x1b", "│", "╭", "╰", "├", "|", "+")  # what begins a line of a box, which has its width
 
 
 def one_line(box: str) -> str:

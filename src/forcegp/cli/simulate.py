@@ -48,14 +48,15 @@ class Simulate(Command):
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
     episodes: Annotated[int, arg(metavar="N")] = 1
     """Number of independent trajectories, each from the start posture."""
-    friction: Literal["viscous", "coulomb", "stribeck"] | None = None
+    friction: Annotated[Literal["viscous", "coulomb", "stribeck"] | None, arg(help_behavior_hint="")] = None
     """Friction of the tool, the force that nobody models: viscous, or in proportion to the normal force
     coulomb or stribeck. Default: viscous; coulomb with --contact bullet, which has no other."""
     friction_coefficient: Annotated[float | None, arg(metavar="F")] = None
     """Viscous in N/(m/s), default 1; coulomb and stribeck: friction per normal force while sliding, default 0.3."""
-    joint_friction: (
-        Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"] | None
-    ) = None
+    joint_friction: Annotated[
+        Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"] | None,
+        arg(help_behavior_hint=""),
+    ] = None
     """Friction of the joints that nobody models either: dry and viscous, with stribeck and exponential more near rest;
     asymmetric, load, lugre and drift have no kernel of their own. Default: none; free arms stribeck."""
     patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
