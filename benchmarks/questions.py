@@ -10,6 +10,7 @@ TITLES = {
     "incremental": "Learning while the robot works",
     "prediction": "Predictions at control rates",
     "programs": "Models as programs",
+    "payload": "One command from a log, and payloads",
     "tracking": "Tracking with learned friction",
     "drift": "Learning while controlling",
     "normal_force": "A normal force without a sensor",
@@ -152,6 +153,19 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "c_parity_n1000": ("<= 1e-11", "the same, N = 1000"),
         "casadi_parity": ("<= 1e-12", "CasADi function of the first prior against predict"),
         "casadi_jacobian_parity": ("<= 1e-12", "its Jacobian against the predictor's"),
+    },
+    "payload": {
+        "auto_cpu_seconds": ("<= 150", "`forcegp auto` on 80 s of a UR5 at 500 Hz, log to exported model: CPU s"),
+        "auto_named": (">= 7", "its seven faults named: ms, degrees, degrees per second, sign, delay, payload, jitter"),
+        "payload_mass_urdf": (
+            "<= 2",
+            "20 payloads of .3 to 3 kg, 60 s each, beside the URDF: largest error of the mass [%]",
+        ),
+        "payload_place_urdf": ("<= 5", "the same: largest error of the centre of mass [mm]"),
+        "payload_held_urdf": (">= 0.9", "the same: share of 95 % intervals that hold"),
+        "payload_mass_baseline": ("<= 2", "the same beside 60 s without payload: largest error of the mass [%]"),
+        "payload_place_baseline": ("<= 5", "the same: largest error of the centre of mass [mm]"),
+        "payload_held_baseline": (">= 0.9", "the same: share of 95 % intervals that hold"),
     },
     "tracking": {
         "tracking_excitation_over_urdf": (

@@ -62,7 +62,7 @@ def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
 
 def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
-    commands, _ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the second needs a log of the reader's own
+    commands, *_ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the others need logs of the reader's own
     for command in commands.splitlines():
         program, *words = command.split()
         assert program == "forcegp"

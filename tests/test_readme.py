@@ -36,6 +36,14 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
     assert not missing
 
 
+def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Path):
+    readme = (repository / "README.md").read_text(encoding="utf-8")
+    assert len(readme.split()) <= 700
+    answer = (repository / "docs" / "auto" / "answer.txt").read_text(encoding="utf-8")
+    assert f"```text\n{answer}```" in readme
+    assert f"```text\n{answer}```" in (repository / "docs" / "auto.md").read_text(encoding="utf-8")
+
+
 def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
     example, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # the other has tests of its own
@@ -80,7 +88,7 @@ def test_the_pictures_and_pages_that_the_page_on_forces_names_exist(repository: 
 
 def test_the_reproduced_numbers_are_those_of_the_reproduction(repository: Path):
     document = json.loads((repository / "docs" / "reproduction" / "fig2b.json").read_text(encoding="utf-8"))
-    readme = (repository / "README.md").read_text(encoding="utf-8")
+    readme = (repository / "docs" / "features.md").read_text(encoding="utf-8")
     for model, curve in document["summary"]["curves"].items():
         cells = [
             f"{published.FIG2B_MAE[model][count]:.4f} / **{curve[str(count)]['mae']['median']:.4f}**"

@@ -10,7 +10,7 @@ from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.analytical import PayloadEstimate, identify_payload
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.errors import DatasetError, ForceGPError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_inertial
@@ -123,7 +123,7 @@ def test_what_makes_no_sense_is_refused(change, message):
 
 def test_a_short_log_is_refused():
     short = log(TEXT, 0, seconds=2.0)
-    with pytest.raises(InvalidInput, match="100 rows; a payload needs 200"):
+    with pytest.raises(DatasetError, match="100 rows; a payload needs 200"):
         identify_payload(short)
     with pytest.raises(InvalidInput, match="system"):
         identify_payload(replace(short, system=None))

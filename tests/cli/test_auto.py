@@ -69,10 +69,10 @@ def test_the_corrected_command_gives_a_model_that_works(folder, answered):
 
 def test_the_answer_holds_what_was_simulated(answered):
     _, content = answered
-    values = content["payload"]["joints"]
+    values = content["identified"]["parameters"]
     for joint in ("upper_hinge", "lower_hinge"):
-        assert values[f"coulomb.{joint}"]["value"] == pytest.approx(0.4, rel=0.05)  # 0.02 of 20 Nm
-        assert values[f"viscous.{joint}"]["value"] == pytest.approx(0.2, rel=0.1)
+        assert values[f"coulomb.{joint}"]["identified"] == pytest.approx(0.4, rel=0.05)  # 0.02 of 20 Nm
+        assert values[f"viscous.{joint}"]["identified"] == pytest.approx(0.2, rel=0.1)
     answer = "\n".join(content["answer"])
     assert "payload: none" in answer
     assert "u was logged 2.3 ms early" in answer  # of steps of 4.2 ms, in which the simulated controller holds it

@@ -26,7 +26,7 @@ from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import with_terms
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
-from forcegp.errors import InvalidInput, require_type, usable_arguments
+from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
@@ -126,7 +126,8 @@ def identify_payload(
     Standard errors are those of residuals that are independent between stretches of time (sandwich estimator; White
     1980, "A heteroskedasticity-consistent covariance matrix estimator"), so that errors of the friction law, which
     last, count.
-    Raises InvalidInput for another robot, an unknown or unmoved link, too few rows and a system in contact.
+    Raises InvalidInput for another robot, an unknown or unmoved link and a system in contact, and DatasetError for too
+    few rows.
     """
     with usable_arguments("identify_payload"):
         given = require_type("dataset", dataset, Dataset).system if system is None else system
@@ -135,7 +136,7 @@ def identify_payload(
         for name, log in zip(("dataset", "baseline"), logs, strict=False):
             require_rows(name, log, system.robot.joint_names, "the robot")
             if len(log) < 10 * STRETCHES:
-                raise InvalidInput(f"{name} has {len(log)} rows; a payload needs {10 * STRETCHES} or more.")
+                raise DatasetError(f"{name} has {len(log)} rows; a payload needs {10 * STRETCHES} or more.")
         if whole_number("rows", rows, 0) < 10 * STRETCHES:
             raise InvalidInput(f"rows is {rows}; it must be at least {10 * STRETCHES}.")
     robot, _ = thickened(system.robot)

@@ -23,12 +23,13 @@ import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
 from forcegp.cli.command import CONFIG, URDF, unless_given
 from forcegp.cli.import_log import Import
-from forcegp.cli.input_options import SYSTEM_FILE, time_step
+from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.terminal import Terminal, number
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
 METHOD = "torque-all"
+NAMES = {"analytical": "the URDF", f"identified-{METHOD}": "identified", f"joint-friction@{METHOD}": "friction learned"}
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 
 
@@ -98,8 +99,11 @@ class Auto(Import):
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing and identifying"):
             rows, recording, settings = self._prepared_rows(dataset)
-            payload = forcegp.analytical.identify_payload(rows, link=self.link)
-            identified = forcegp.identify_analytical(rows, friction=forcegp.analytical.LAWS)
+            identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
+            try:
+                payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
+            except DatasetError as error:
+                payload, why_not = None, f"not estimated: {error}"
         document, posterior = self._validated(terminal, rows, recording, system)
         content: dict[str, Any] = {
             "out": str(self.out),
@@ -108,13 +112,14 @@ class Auto(Import):
             "mistakes": [finding.to_dict() for finding in mistakes],
             "check": report.to_dict(),
             "preparation": settings,
-            "payload": payload.to_dict(),
+            "payload": None if payload is None else payload.to_dict(),
+            "identified": identified.to_dict(),
             "weak": list(identified.weak_directions),
             "models": document["models"],
             "recommended": forcegp.validation.recommended(document),
             "code": self._code(terminal, posterior),
         }
-        answer = _answer(content, dataset, payload)
+        answer = _answer(content, dataset, identified, why_not if payload is None else _held(payload))
         content |= {"answer": [": ".join(line) for line in answer], "cpu_seconds": time.process_time() - begin}
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
         write_text(self.out / "identified.urdf", identified.system.robot.to_urdf())
@@ -184,7 +189,7 @@ class Auto(Import):
         numbers = chosen.preparation
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)
         numbers = replace(numbers, trim=self.trim or period)
-        rows = replace(numbers, every=self.every or numbers.thinning(time_step(raw))).apply(raw)
+        rows = replace(numbers, every=self.every or numbers.thinning(raw)).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.dataset.save(temporary)
         return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
@@ -245,28 +250,26 @@ def _findings(terminal: Terminal, findings: list[forcegp.checks.Finding]) -> Tab
 
 
 def _answer(
-    content: Mapping[str, Any], dataset: forcegp.Dataset, payload: forcegp.analytical.PayloadEstimate
+    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: forcegp.AnalyticalIdentification, held: str
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
-    names, values = dataset.joint_names, payload.joints
+    names, values = dataset.joint_names, identified.values
     import_, prepared = content["import"], content["preparation"]
     deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
-    rate, seconds = 1.0 / time_step(dataset), content["seconds"]
-    mistakes = ", ".join(each["subject"] for each in content["mistakes"]) or "nothing"
+    seconds = content["seconds"]
+    rate = (len(dataset) - len(dataset.episodes)) / seconds
+    mistakes = ", ".join(_corrected(each) for each in content["mistakes"]) or "nothing"
     late = prepared["delay"][0]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else "u shows no delay"
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
 
     def each(field: str, pattern: str = "{:.3g}") -> str:
-        return ", ".join(pattern.format(values[f"{field}.{name}"][0]) for name in names)
+        return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in names)
 
-    center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
-    mass, error = payload.mass, payload.standard_errors["mass"]
-    held = f"{mass:.3g} ± {1.96 * error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
     models = content["models"]
-    scores = "; ".join(f"{name} {_score(model)}" for name, model in models.items())
+    scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
     best = content["recommended"]
     covered = models[best]["coverage_95"]
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
@@ -279,12 +282,9 @@ def _answer(
         ("dry friction", f"{each('coulomb')} Nm, near rest {each('breakaway')} more"),
         ("viscous", f"{each('viscous')} Nms/rad"),
         ("rotors", f"{each('armature')} kg m²"),
-        (
-            "payload",
-            held if mass > SURE * error and mass > LEAST_PAYLOAD else f"none ({mass:.2g} ± {1.96 * error:.1g} kg)",
-        ),
-        ("models", f"errors of motions after 1 s and of accelerations: {scores}"),
-        ("trust", f"{best}{intervals}"),
+        ("payload", held),
+        ("models", f"error of q after 1 s [rad] / nRMSE of the acceleration, on unseen time: {scores}"),
+        ("trust", f"{NAMES.get(best, best)}{intervals}"),
         (
             "record next",
             f"forcegp excite {out}/model --seconds 10 --out next.csv"
@@ -292,6 +292,20 @@ def _answer(
         ),
         ("wrote", f"{out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]
+
+
+def _held(payload: forcegp.analytical.PayloadEstimate) -> str:
+    mass, error = payload.mass, 1.96 * payload.standard_errors["mass"]
+    if mass < max(SURE / 1.96 * error, LEAST_PAYLOAD):
+        return f"none ({mass:.2g} ± {error:.1g} kg)"
+    center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
+    return f"{mass:.3g} ± {error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
+
+
+def _corrected(mistake: Mapping[str, Any]) -> str:
+    """`q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected."""
+    flags = forcegp.checks.import_flags(mistake["correction"])
+    return flags.replace("--unit ", "").replace("--", "") or mistake["subject"]
 
 
 def _score(model: Mapping[str, Any]) -> str:

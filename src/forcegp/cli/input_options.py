@@ -12,7 +12,6 @@ from typing_extensions import override
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
-import forcegp.data
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import require_unchanged
@@ -227,8 +226,3 @@ class PreparationOptions(CutoffOptions):
                 given = each[0] if len(each) == 1 else each
             late[name] = given
         return replace(super()._preparation(), every=self.every, trim=self.trim, **late)
-
-
-def time_step(dataset: forcegp.Dataset) -> float:
-    """Seconds between two rows. Raises DatasetError for uneven ones."""
-    return forcegp.data.uniform_step(dataset.time[dataset.episode == dataset.episodes[0]])

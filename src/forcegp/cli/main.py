@@ -109,7 +109,9 @@ def _parse(kind: Any, words: Sequence[str], prog: str, description: str | None =
 class _Shown(io.StringIO):
     """What would go to stdout: tyro draws boxes and colors that fit there."""
 
-    encoding = property(lambda _: sys.stdout.encoding if sys.__stdout__ is None else sys.__stdout__.encoding)
+    @property
+    def encoding(self) -> str:  # type: ignore[override]  # of texts it is None
+        return "utf-8" if sys.__stdout__ is None else sys.__stdout__.encoding
 
     def isatty(self) -> bool:
         return sys.__stdout__ is not None and sys.__stdout__.isatty()

@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.validation
 from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
-from forcegp.cli.input_options import PreparationOptions, RobotOptions, time_step
+from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import friction_laws
 from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
@@ -143,7 +143,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         else:
             preparation = preparation.resolved(raw)
             if self.every is None:
-                preparation = replace(preparation, every=preparation.thinning(time_step(raw)))
+                preparation = replace(preparation, every=preparation.thinning(raw))
             rows = preparation.apply(raw).dataset
             recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw).dataset
             self._warn_of_memory(terminal, preparation.cutoff, preparation.order)

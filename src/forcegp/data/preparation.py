@@ -18,7 +18,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 AUTOMATIC = "auto", "each"
-PASSED = 3.0  # rows in a period of the cut-off: more repeat their neighbours
+PASSED, FEW = 3.0, 2_000  # rows in a period of the cut-off, of which more repeat their neighbours; of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 
 
@@ -76,9 +76,12 @@ class Preparation:
         if self.differentiate not in ("q", "v"):
             raise InvalidInput(f"differentiate is {self.differentiate!r}; allowed: 'q' or 'v'.")
 
-    def thinning(self, step: float) -> int:
-        """N, so that every N-th row at steps of `step` [s] holds what the filter leaves: `PASSED` rows per period."""
-        return 1 if self.cutoff in (None, "auto") else max(1, int(1.0 / (step * PASSED * float(self.cutoff))))
+    def thinning(self, dataset: Dataset) -> int:
+        """N, so that every N-th row of the log holds what the filter leaves: `PASSED` rows per period, `FEW` in all."""
+        if self.cutoff in (None, "auto"):
+            return 1
+        step = uniform_step(dataset.time[dataset.episode == dataset.episodes[0]])
+        return max(1, min(int(1.0 / (step * PASSED * float(self.cutoff))), len(dataset) // FEW))
 
     @property
     def changes_nothing(self) -> bool:

@@ -213,7 +213,8 @@ def best_of(summary: Mapping[str, Any], runs: Runs, kinds: Sequence[str], score:
 
 def _level(score: str, errors: Mapping[tuple[str, int], Float[np.ndarray, "horizons stretches"]]) -> float:
     """The median over runs of the error over stretches; of motions the geometric mean over horizons."""
-    means = [np.nanmean(np.where(np.isfinite(each), each, np.nan), axis=1) for each in errors.values()]
+    masked = [np.ma.masked_invalid(each) for each in errors.values()]
+    means = [each.mean(axis=1).filled(np.nan) for each in masked]
     levels = means if score == "nlpd" else [np.log(np.maximum(each, np.finfo(float).tiny)) for each in means]
     return float(np.median([each.mean() for each in levels]))
 
