@@ -56,7 +56,7 @@ def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
         return
     before, after = (numbers_of(measured[when]) for when in ("before", "after"))
     spread = np.std(inputs.prepared.dataset.a, axis=0)
-    why = "where the spectrum shows the end of the motion" if inputs.automatic else "as asked for"
+    why = "`cutoff` auto" if inputs.automatic else "as asked for"
     if report is not inputs.prepared.report:
         why = "when this dataset was prepared"
     if np.isfinite(after).any():

@@ -128,7 +128,7 @@ class Auto(Import):
         table.add_column(style="bold", no_wrap=True)
         table.add_column(overflow="fold")
         for line in answer:
-            table.add_row(*line)
+            table.add_row(*map(Text, line))
         terminal.show(table)
         return content
 
@@ -244,7 +244,9 @@ def _findings(terminal: Terminal, findings: list[forcegp.checks.Finding]) -> Tab
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in findings:
-        table.add_row(Text(finding.severity, style="bold red"), f"{finding.subject}: {terminal.worded(finding.seen)}")
+        table.add_row(
+            Text(finding.severity, style="bold red"), Text(f"{finding.subject}: {terminal.worded(finding.seen)}")
+        )
         table.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
     return table
 

@@ -36,7 +36,7 @@ class Check(CutoffOptions, RobotOptions):
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to check (HDF5)."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Filter for the comparison of q, v, a and u. auto: where the spectrum shows that motion ends and noise begins."""
+    """Filter for the comparison of q, v, a and u. auto: near where the spectrum shows the end of the motion."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
     """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
     strict: bool = False

@@ -186,8 +186,8 @@ class CutoffOptions(Command):
     """What every command asks that filters a log."""
 
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
-    """Low-pass filter q and u without delay, and compute v and a anew. auto: where the spectrum shows that motion ends
-    and noise begins."""
+    """Low-pass filter q and u without delay, and compute v and a anew. auto: near where the spectrum shows
+    the end of the motion, as held-out torques decide."""
     differentiate: Annotated[Literal["q", "v"], arg(metavar="q|v")] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
 
