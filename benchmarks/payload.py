@@ -102,15 +102,7 @@ def answer(ur5: Any) -> dict[str, float]:
     text = " ".join(shown.getvalue().split())
     ANSWER.write_text("\n".join(line.rstrip() for line in shown.getvalue().splitlines()) + "\n", encoding="utf-8")
     print(shown.getvalue())
-    named = [
-        "unit of q",
-        "unit of time",
-        "velocity",
-        "torque sign",
-        "ms late",
-        "payload 0.7",
-        "steps up to",
-    ]  # "velocity": deg/s
+    named = ("q=deg", "time=ms", "v=deg/s", "sign u=1,1,-1,1,1,1", "ms late", "(20, 0, 50) mm of tool0", "steps up to")
     return {"auto_cpu_seconds": seconds, "auto_named": float(sum(words in text for words in named))}
 
 

@@ -123,9 +123,9 @@ def identify_payload(
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
 
-    Standard errors are those of residuals that are independent between stretches of time (sandwich estimator; White
-    1980, "A heteroskedasticity-consistent covariance matrix estimator"), so that errors of the friction law, which
-    last, count.
+    Standard errors come from leaving out each twentieth of the logs in turn (block jackknife; Kuensch 1989, "The
+    jackknife and the bootstrap for general stationary observations"), so that errors of the friction law, which last,
+    count.
     Raises InvalidInput for another robot, an unknown or unmoved link and a system in contact, and DatasetError for too
     few rows.
     """
@@ -185,7 +185,7 @@ def identify_payload(
     def numbers(x: np.ndarray) -> np.ndarray:
         return _numbers(bodies.pseudo_inertias(x[:split])[-1], offset)
 
-    covariance = _sandwich(fit, windows.lengths)
+    covariance = _jackknife(fit, windows.lengths)
     step = 1e-5 * np.eye(len(fit.x))[split - 10 : split]
     slopes = np.stack([(numbers(fit.x + d) - numbers(fit.x - d)) / 2e-5 for d in step], axis=1)
     errors = np.sqrt(np.diag(slopes @ covariance[split - 10 : split, split - 10 : split] @ slopes.T))
@@ -247,18 +247,18 @@ def _numbers(pseudo: np.ndarray, offset: np.ndarray) -> np.ndarray:
     return np.array([there[3, 3], *center, *(np.trace(second) - np.diag(second))])
 
 
-def _sandwich(fit: Fit, lengths: list[int]) -> np.ndarray:
-    """Covariance of the coordinates from the scatter of the gradient over stretches of time."""
-    rows, places = [], 0
-    for length in lengths:
-        rows += np.array_split(np.arange(places, places + length), STRETCHES)
-        places += length
-    scaled = fit.jacobian / fit.noise[:, None]
-    gradients = np.stack([np.einsum("nik,ni->k", scaled[at], (fit.residual / fit.noise)[at]) for at in rows])
-    gradients -= gradients.mean(axis=0)
-    curvature = np.linalg.inv(fit.information + fit.prior_information)
-    scatter = gradients.T @ gradients * STRETCHES / (STRETCHES - 1)
-    return curvature @ (scatter + fit.prior_information) @ curvature
+def _jackknife(fit: Fit, lengths: list[int]) -> np.ndarray:
+    """Covariance of the coordinates from leaving out one stretch of time after the other, by one step of the search."""
+    windows = np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1])
+    stretches = [np.concatenate(part) for part in zip(*(np.array_split(x, STRETCHES) for x in windows), strict=True)]
+    scaled, r = fit.jacobian / fit.noise[:, None], fit.residual / fit.noise
+    whole, moved = fit.information + fit.prior_information, []
+    for at in stretches:
+        own = scaled[at].reshape(-1, scaled.shape[-1])
+        moved.append(np.linalg.solve(whole - own.T @ own, own.T @ r[at].ravel()))
+    apart = np.stack(moved) - np.mean(moved, axis=0)
+    unseen = np.linalg.solve(whole, np.linalg.solve(whole, fit.prior_information).T)
+    return (STRETCHES - 1) / STRETCHES * apart.T @ apart + unseen
 
 
 def _carrying(robot: Robot, link: str, payload: np.ndarray) -> Robot:

@@ -1,6 +1,7 @@
 """`forcegp`: read the arguments, run one command, and turn every failure into one line and an exit code."""
 
 import contextlib
+import difflib
 import errno
 import io
 import os
@@ -81,6 +82,10 @@ def parse_arguments(words: Sequence[str]) -> Command:
     if words and words[0] in COMMANDS:
         kind, _ = COMMANDS[words[0]]
         return _parse(kind, words[1:], prog=f"forcegp {words[0]}")
+    if words and not words[0].startswith("-"):
+        close = difflib.get_close_matches(words[0], COMMANDS, n=1)
+        hint = f" Did you mean {close[0]}?" if close else ""
+        raise InvalidInput(f"there is no command {words[0]!r}.{hint} Available subcommands: {', '.join(COMMANDS)}.")
     kinds: Any = None
     for name, (kind, summary) in COMMANDS.items():
         kind = Annotated[kind, subcommand(name, description=summary, prefix_name=False)]
