@@ -75,7 +75,7 @@ def test_the_published_page_has_no_link_that_only_the_repository_can_follow(repo
     for rule in project(repository)["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]:
         text = re.sub(rule["pattern"], rule["replacement"], text)
     targets = re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", text)
-    assert len(relative) > 20
+    assert len(relative) > 10
     absolute = {target.partition("/v$HFPR_VERSION/")[2] for _, target in targets}
     assert set(relative) <= absolute
     for picture, target in targets:
