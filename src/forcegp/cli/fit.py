@@ -89,7 +89,7 @@ class Fit(ModelOptions):
         if self.motions is not None:
             posterior = refined_with_progress(terminal, posterior, recording, self.motions)
             posterior, intervals_note = calibrated_with_progress(terminal, posterior, recording)
-        summary = fit_summary(posterior, time.monotonic() - start)
+        summary = fit_summary(posterior, time.monotonic() - start) | {"payloads": payloads(posterior, dataset)}
         command._write(posterior)
         for note in (rows_note, prior_note, correlation_note, intervals_note):
             if note is not None:
@@ -202,6 +202,27 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
     }
 
 
+def payloads(posterior: Any, dataset: forcegp.Dataset) -> dict[str, str]:
+    """Mass and centre of mass of every `payload` prior, with standard deviations, by the name of its term."""
+    if not isinstance(posterior, forcegp.models.StructuredPosterior) or "Payload" not in repr(posterior.model.prior):
+        return {}
+    found = {}
+    for name, part in posterior.components(dataset.q[:1], dataset.v[:1], dataset.u[:1]).items():
+        if "mass" not in part.latent_names:
+            continue
+        assert part.latents.covariance is not None
+        mean, covariance = part.latents.mean[0], part.latents.covariance[0]
+        found[name] = f"{mean[0]:.3g} ± {covariance[0, 0].sqrt():.2g} kg"
+        if len(mean) == 4:
+            center = mean[1:] / mean[0]
+            slopes = mean.new_zeros(3, 4)  # of the centre in mass and moments (delta method)
+            slopes[:, 0], slopes[:, 1:] = -center / mean[0], mean.new_ones(3).diag() / mean[0]
+            errors = (slopes @ covariance @ slopes.mT).diagonal().sqrt()
+            each = (f"{1e3 * x:.3g} ± {1e3 * error:.2g}" for x, error in zip(center, errors, strict=True))
+            found[name] += f" at ({', '.join(each)}) mm"
+    return found
+
+
 def _points_used(summary: Mapping[str, Any]) -> str:
     """How many points were conditioned on, and where parameters were found on fewer of them, on how many."""
     points, learning = summary["points"], summary["learning_points"]
@@ -219,6 +240,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     table = facts(
         f"{run}: {summary['model']}, learned from {_points_used(summary)}",
         {
+            **summary.get("payloads", {}),
             **({"engine": summary["engine"]} if "engine" in summary else {}),
             "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",
             "negative log likelihood": f"{summary['nll']:.1f} nats",

@@ -58,8 +58,9 @@ class Payload(PreparationOptions, RobotOptions):
         """Prepare, estimate, write and show."""
         self.require_free(self.out)
         laws = friction_laws(self.friction)
-        system, rows = self._rows(terminal, self.data)
-        baseline = None if self.baseline is None else self._rows(terminal, self.baseline)[1]
+        notes: list[str] = []
+        system, rows = self._rows(terminal, self.data, notes)
+        baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
         with terminal.progress("identifying"):
             found = forcegp.analytical.identify_payload(rows, system, baseline=baseline, link=self.link, friction=laws)
         content = {"data": str(self.data), **found.to_dict()}
@@ -69,12 +70,16 @@ class Payload(PreparationOptions, RobotOptions):
                 write_json(folder / "payload.json", content)
                 write_text(folder / "loaded.urdf", found.system.robot.to_urdf())
                 write_text(folder / SYSTEM_FILE, found.system.to_json() + "\n")
+        for note in notes:
+            terminal.note(note)
         if not found.fit.settled:
             terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
         terminal.show(*_tables(found))
         return content
 
-    def _rows(self, terminal: Terminal, path: Path) -> tuple[forcegp.MechanicalSystem, forcegp.Dataset]:
+    def _rows(
+        self, terminal: Terminal, path: Path, notes: list[str]
+    ) -> tuple[forcegp.MechanicalSystem, forcegp.Dataset]:
         """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
         dataset = forcegp.Dataset.load(path)
         system = self.chosen_system(dataset, path)
@@ -82,9 +87,8 @@ class Payload(PreparationOptions, RobotOptions):
             return system, dataset
         with terminal.progress(f"preparing {path}"):
             prepared = self._preparation().apply(replace(dataset, system=system))
-        for name in ("cutoff", "delay"):
-            if name in prepared.report["why"]:
-                terminal.note(f"{path}: {name}: {prepared.report['why'][name]}")
+        why = prepared.report["why"]
+        notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
         return system, prepared.dataset
 
 

@@ -1,0 +1,85 @@
+"""`forcegp payload` and `fit --prior payload` report the payload itself."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from tests.analytical.test_payload import CENTER, MASS, TEXT, loaded, log
+
+from forcegp import Robot
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A log with the payload, and one without."""
+    place = tmp_path_factory.mktemp("payload")
+    log(loaded(), 1, noise=0.02).save(place / "loaded.h5")
+    log(TEXT, 2, noise=0.02).save(place / "empty.h5")
+    return place
+
+
+@pytest.mark.parametrize("baseline", [(), ("--baseline", "empty.h5")])
+def test_the_payload_is_printed_and_written(folder, forcegp, baseline):
+    words = ("payload", "loaded.h5", *baseline, "--cutoff", "none", "--delay", 0, "--out", f"held{len(baseline)}")
+    done = forcegp(*words, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    assert content["payload"]["mass"]["value"] == pytest.approx(MASS, rel=0.01)
+    low, high = content["payload"]["mass"]["interval_95"]
+    assert low < content["payload"]["mass"]["value"] < high
+    assert content["baseline"] == bool(baseline)
+    written = folder / f"held{len(baseline)}"
+    assert json.loads((written / "payload.json").read_text())["link"] == "tool0"
+    robot = Robot.from_urdf(written / "loaded.urdf")
+    assert robot.link("tool0").mass == pytest.approx(MASS, rel=0.01)
+    again = forcegp(*words, folder=folder)
+    assert again.returncode == 2  # the folder exists
+    checked = forcegp("check", "loaded.h5", "--identified", written, "--cutoff", "none", "--json", folder=folder)
+    assert "payload" not in {each["subject"] for each in json.loads(checked.stdout)["findings"]}
+
+
+def test_people_see_mass_and_millimetres(folder, forcegp):
+    shown = forcegp("payload", "loaded.h5", "--cutoff", "none", "--delay", 0, folder=folder)
+    assert shown.returncode == 0, shown.stderr
+    mass = re.search(r"mass\s+(\S+)\s+\S+\s+\S+ … \S+\s+kg", shown.stdout)
+    place = re.search(r"centre of mass z\s+(\S+)\s+\S+\s+\S+ … \S+\s+mm", shown.stdout)
+    assert float(mass[1]) == pytest.approx(MASS, rel=0.01)
+    assert float(place[1]) == pytest.approx(1e3 * CENTER[2], abs=2.0)
+
+
+def test_the_check_names_it(folder, forcegp):
+    found = json.loads(forcegp("check", "loaded.h5", "--cutoff", "none", "--json", folder=folder).stdout)["findings"]
+    (payload,) = [each for each in found if each["subject"] == "payload"]
+    assert payload["numbers"]["mass"] == pytest.approx(MASS, rel=0.02)
+    assert "forcegp payload" in payload["remedy"]
+
+
+def test_a_payload_prior_reports_mass_and_place(folder, forcegp):
+    forcegp("payload", "empty.h5", "--cutoff", "none", "--delay", 0, "--out", "empty", folder=folder)
+    words = ("--prior", "payload:frame=tool0", "--points", 60, "--restarts", 1, "--noise", "learned", "--no-checks")
+    done = forcegp(
+        *("fit", "loaded.h5", "--identified", "empty", *words, "--iterations", 60, "--out", "run", "--json"),
+        folder=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    mass, *center = map(float, re.findall(r"(-?[\d.]+) ±", json.loads(done.stdout)["payloads"]["payload"]))
+    assert mass == pytest.approx(MASS, rel=0.1)
+    np.testing.assert_allclose(center, 1e3 * CENTER, atol=15.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("payload nothing.h5", "nothing.h5 is not a file"),
+        ("payload loaded.h5 --link tool9", "tool9"),
+        ("payload loaded.h5 --baseline nothing.h5", "nothing.h5 is not a file"),
+        ("payload loaded.h5 --friction sticky", "sticky"),
+        ("payload loaded.h5 --cutoff high", "--cutoff is 'high'"),
+    ],
+)
+def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
+    refused = forcegp(*words.split(), folder=folder)
+    assert refused.returncode == 2
+    assert message in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1

@@ -1,0 +1,55 @@
+"""Corrections of a mapping, and mappings as words of a command line."""
+
+import pytest
+
+from forcegp.cli.main import parse_arguments
+from forcegp.recordings import ColumnMapping
+
+JOINTS = ("pan", "lift", "bend")
+COLUMNS = {"q": ["q1", "q2", "q3"], "u": ["a", "b", "c"]}
+
+
+def test_units_replace_and_signs_multiply():
+    mapping = ColumnMapping(q=("q{1..3}",), unit={"q": ("deg",), "time": ("ms",)}, sign={"u": (1.0, -1.0, 1.0)})
+    found = mapping.corrected_by(
+        {"unit": {"q": ("rad", "rad", "rad")}, "sign": {"u": (-1.0, -1.0, 1.0), "q": (1.0, 1.0, -1.0)}}, JOINTS, COLUMNS
+    )
+    assert found.unit == {"q": ("rad",), "time": ("ms",)}
+    assert found.sign == {"u": (-1.0, 1.0, 1.0), "q": (1.0, 1.0, -1.0)}
+    assert found.q == mapping.q
+
+
+def test_an_order_names_the_columns_that_were_read():
+    found = ColumnMapping().corrected_by({"order": {"u": (1, 0, 2), "v": (1, 0, 2)}}, JOINTS, COLUMNS)
+    assert found.u == ("b", "a", "c")
+    assert found.v is None  # which the log does not have
+
+
+def test_a_mapping_with_joints_of_its_own_order_keeps_it():
+    """The correction is in the order of the robot, columns and signs of the mapping in that of its joints."""
+    mapping = ColumnMapping(joints=("bend", "pan", "lift"), sign={"u": (1.0, 1.0, 1.0)})
+    found = mapping.corrected_by({"sign": {"u": (-1.0, 1.0, 1.0)}, "order": {"u": (0, 2, 1)}}, JOINTS, COLUMNS)
+    assert found.sign["u"] == (1.0, -1.0, 1.0)  # of pan
+    assert found.u == ("b", "a", "c")  # bend has the column of lift, pan its own, lift that of bend
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [
+        ColumnMapping(time="t", q=("pos{1..3}",), u=("tau{1..3}",)),
+        ColumnMapping(
+            step=0.004,
+            q=("q1", "q2", "q3"),
+            u=("0",),
+            joints=JOINTS,
+            unit={"q": ("deg", "deg", "rad"), "time": ("ms",)},
+            sign={"u": (1.0, -1.0, 1.0), "q": (-1.0,)},
+            scale={"u": (0.5,)},
+            offset={"q": (0.0, 1.5, 0.0)},
+        ),
+        ColumnMapping(time="file:c1", q=("a",), u=("b",), headerless=(1, 7), side_by_side=True, episode="number"),
+    ],
+)
+def test_flags_state_the_mapping(mapping):
+    command = parse_arguments(["import", "log.csv", *mapping.flags(), "--out", "log.h5"])
+    assert command._flags() == mapping
