@@ -28,6 +28,7 @@ from forcegp.cli.terminal import Terminal, number
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
+INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
 METHOD = "torque-all"
 NAMES = {"analytical": "the URDF", f"identified-{METHOD}": "identified", f"joint-friction@{METHOD}": "friction learned"}
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
@@ -270,6 +271,8 @@ def _answer(
     def each(field: str, pattern: str = "{:.3g}") -> str:
         return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in names)
 
+    units = [dataset.units[name] for name in ("q", "u")]
+    q, force = (unit if isinstance(unit, str) else " or ".join(dict.fromkeys(unit)) for unit in units)
     models = content["models"]
     scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
     best = content["recommended"]
@@ -281,11 +284,11 @@ def _answer(
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {len(names)} joints{jitter}"),
         ("corrected", mistakes),
         ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
-        ("dry friction", f"{each('coulomb')} Nm, near rest {each('breakaway')} more"),
-        ("viscous", f"{each('viscous')} Nms/rad"),
-        ("rotors", f"{each('armature')} kg m²"),
+        ("dry friction", f"{each('coulomb')} {force}, near rest {each('breakaway')} more"),
+        ("viscous", f"{each('viscous')} {force} per {q}/s"),
+        ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
         ("payload", held),
-        ("models", f"error of q after 1 s [rad] / nRMSE of the acceleration, on unseen time: {scores}"),
+        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
         ("trust", f"{NAMES.get(best, best)}{intervals}"),
         (
             "record next",
