@@ -8,6 +8,7 @@ import pytest
 
 from forcegp import Dataset, Robot, load_posterior
 from forcegp.analytical import motion_residuals
+from forcegp.cli.main import parse_arguments
 from forcegp.simulation.free_arms import FreeArmConfig, simulate_free_arm
 
 COLUMNS = (
@@ -98,6 +99,16 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     rows = Dataset.load(folder / "other" / "log.h5")
     assert np.abs(rows.q).max() < 4.0
     assert rows.time[-1] == pytest.approx(25.0, abs=0.01)
+
+
+def test_the_printed_command_keeps_every_option():
+    columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --delimiter ; --sign u=1,-1 --robot arm.urdf"
+    others = "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool --out here"
+    words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
+    command = parse_arguments(words)
+    mapping = command._flags()
+    again = parse_arguments(shlex.split(command._command(mapping))[1:])
+    assert again == command
 
 
 @pytest.mark.parametrize(

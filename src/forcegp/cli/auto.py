@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, cast
 
@@ -122,6 +122,7 @@ class Auto(Import):
         }
         answer = _answer(content, dataset, identified, why_not if payload is None else _held(payload))
         content |= {"answer": [": ".join(line) for line in answer], "cpu_seconds": time.process_time() - begin}
+        write_json(self.out / "payload.json", {} if payload is None else payload.to_dict())
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
         write_text(self.out / "identified.urdf", identified.system.robot.to_urdf())
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
@@ -178,8 +179,8 @@ class Auto(Import):
 
     def _command(self, mapping: forcegp.ColumnMapping) -> str:
         """The same command with the columns, units and signs of the mapping."""
-        stated = ("time", "step", "q", "v", "u", "a", "joints", "unit", "sign", "scale", "offset")
-        others = [name for name in self.options if name not in (*stated, "mapping", "logs", "robot", "out")]
+        stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "robot", "out"}
+        others = [name for name in self.options if name not in stated]
         words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), "--robot", str(self.robot)]
         return shlex.join([*words, *self.words(*(name for name in others if hasattr(type(self), name))),
                            "--out", str(self.out)])  # fmt: skip

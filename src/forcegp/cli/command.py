@@ -105,6 +105,8 @@ class Command(ABC):
             given, flag = getattr(self, name), f"--{name.replace('_', '-')}"
             if given is False and getattr(type(self), name):
                 words.append(f"--no-{flag[2:]}")
+            elif given is True and not getattr(type(self), name):
+                words.append(flag)
             elif given != getattr(type(self), name):
                 for each in given if isinstance(given, tuple) else (given,):
                     text = f"{each:g}" if isinstance(each, float) else str(each)

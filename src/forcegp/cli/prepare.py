@@ -44,12 +44,12 @@ class Prepare(PreparationOptions, RobotOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, save, draw if asked to, and show."""
+        if not self.words("cutoff", "delay", "lag", "every", "trim"):
+            raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --every or --trim.")
         require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
         self.require_free(self.plots)
 
         preparation = self._preparation()
-        if preparation.changes_nothing:
-            raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --every or --trim.")
         dataset = forcegp.Dataset.load(self.data)
         if self.robot is not None or self.identified is not None or dataset.system is not None:
             dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
