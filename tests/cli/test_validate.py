@@ -5,10 +5,14 @@ import json
 import re
 import shutil
 
+import numpy as np
 import pytest
 from tests.cli.one_line import assert_refused
 from tests.models.arm import URDF
 from tests.validation.moving_arm import moving_arm
+
+from forcegp import Dataset, load_posterior
+from forcegp.validation import recommended
 
 MODELS = ("analytical", "identified-acceleration", "joint-friction", "joint-friction@identified")
 SAME = ("--identification", "acceleration")
@@ -90,6 +94,16 @@ def test_the_page_says_what_was_done(found, folder):
     for name in ("errors", "calibration", "motions"):
         assert f"({name}.png)" in page
         assert (folder / "results" / f"{name}.png").stat().st_size > 5000
+
+
+def test_the_recommended_model_is_written_from_all_rows(found, folder):
+    model = load_posterior(folder / "results" / "model")
+    assert recommended(found) in MODELS
+    assert recommended({"winners": {"nrmse": {"model": "a"}, "motion": {"model": "b"}}}) == "b"
+    assert recommended({"winners": {}}) is None
+    rows = Dataset.load(folder / "log.h5")
+    error = np.abs(rows.a - model.predict(rows.q, rows.v, rows.u).mean.numpy()).mean()
+    assert error < 0.3 * np.abs(rows.a).mean()
 
 
 def test_the_same_command_goes_on_and_another_is_refused(forcegp, found, folder):
