@@ -17,14 +17,13 @@ from forcegp import (
     StructuredGP,
     ViscousJointFriction,
 )
+from forcegp.control.mujoco_forces import MujocoForces
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Actuation, RigidBodyBias
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
-from mujoco import rollout  # noqa: E402
-
-from forcegp.control.mujoco_forces import MujocoForces  # noqa: E402
+rollout = pytest.importorskip("mujoco.rollout")
 
 __all__ = ["posterior"]  # a fixture
 

@@ -67,14 +67,14 @@ class Auto(Import):
     """Low-pass filter. auto: of which the parameters predict held-out torques best."""
     delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
     """How much later than it acts u was logged, in s."""
-    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None  # type: ignore[assignment]
+    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        begin = time.process_time()
+        begin, preparation = time.process_time(), self._preparation()
         self._require_own_folder()
         system, mapping = self._system(), self._mapping(terminal)
         assert system is not None
@@ -99,7 +99,7 @@ class Auto(Import):
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing and identifying"):
-            rows, recording, settings = self._prepared_rows(dataset)
+            rows, recording, settings = self._prepared_rows(dataset, preparation)
             identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
             try:
                 payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
@@ -185,13 +185,15 @@ class Auto(Import):
         return shlex.join([*words, *self.words(*(name for name in others if hasattr(type(self), name))),
                            "--out", str(self.out)])  # fmt: skip
 
-    def _prepared_rows(self, raw: forcegp.Dataset) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
+    def _prepared_rows(
+        self, raw: forcegp.Dataset, wanted: forcegp.Preparation
+    ) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
         """Rows to learn from, the same at the full rate, and what was done."""
-        chosen = replace(self, every=1)._preparation().apply(raw)
+        chosen = replace(wanted, every=1).apply(raw)
         numbers = chosen.preparation
-        period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)
-        numbers = replace(numbers, trim=self.trim or period)
-        rows = replace(numbers, every=self.every or numbers.thinning(raw)).apply(raw)
+        period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
+        numbers = replace(numbers, trim=max(self.trim, period))
+        rows = replace(numbers, every=numbers.thinning(raw) if self.every is None else wanted.every).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.dataset.save(temporary)
         return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}

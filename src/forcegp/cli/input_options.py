@@ -210,7 +210,7 @@ class PreparationOptions(CutoffOptions):
     joints together, each: for each, which need the robot."""
     lag: Annotated[str, arg(metavar="S|auto|each")] = "0"
     """Time constant in s with which actuators of first order follow u: as for --delay."""
-    every: Annotated[int, arg(metavar="N")] = 1
+    every: Annotated[int | None, unless_given("N", "1", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0
     """Drop so many seconds at both ends of each episode, after the filter."""
@@ -225,4 +225,4 @@ class PreparationOptions(CutoffOptions):
                 each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in given.split(","))
                 given = each[0] if len(each) == 1 else each
             late[name] = given
-        return replace(super()._preparation(), every=self.every, trim=self.trim, **late)
+        return replace(super()._preparation(), every=1 if self.every is None else self.every, trim=self.trim, **late)

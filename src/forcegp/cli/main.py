@@ -94,7 +94,11 @@ def parse_arguments(words: Sequence[str]) -> Command:
 
 
 def _parse(kind: Any, words: Sequence[str], prog: str, description: str | None = None) -> Command:
-    complaint, shown, width = io.StringIO(), _Shown(), min(WIDEST, shutil.get_terminal_size().columns)
+    complaint, shown, width = (
+        io.StringIO(),
+        _Shown(io.BytesIO(), sys.stdout.encoding or "utf-8", "replace"),
+        min(WIDEST, shutil.get_terminal_size().columns),
+    )
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(width)  # which tyro reads
     try:
@@ -103,7 +107,7 @@ def _parse(kind: Any, words: Sequence[str], prog: str, description: str | None =
     except SystemExit as end:
         if not end.code:
             names = "{" + ",".join(COMMANDS) + "}"
-            print("\n".join(wrapped(shown.getvalue().replace(names, "COMMAND"), width)))
+            print("\n".join(wrapped(shown.text().replace(names, "COMMAND"), width)))
             raise
         raise InvalidInput(f"{one_line(complaint.getvalue())} See {prog} --help.") from None
     finally:
@@ -111,15 +115,17 @@ def _parse(kind: Any, words: Sequence[str], prog: str, description: str | None =
         os.environ |= {} if before is None else {"COLUMNS": before}
 
 
-class _Shown(io.StringIO):
-    """What would go to stdout: tyro draws boxes and colors that fit there."""
-
-    @property
-    def encoding(self) -> str:  # type: ignore[override]  # of texts it is None
-        return "utf-8" if sys.__stdout__ is None else sys.__stdout__.encoding
+class _Shown(io.TextIOWrapper):
+    """What would go to stdout: tyro draws the boxes and colors that fit there."""
 
     def isatty(self) -> bool:
         return sys.__stdout__ is not None and sys.__stdout__.isatty()
+
+    def text(self) -> str:
+        """All of it so far."""
+        self.flush()
+        self.seek(0)
+        return self.read()
 
 
 WIDEST = 100

@@ -62,7 +62,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,coulomb"
     """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, offset and direction; or
     none."""
-    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None  # type: ignore[assignment]
+    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
     points: Annotated[int, arg(metavar="N")] = 100
     """Rows that models learn from: those that lie farthest apart among two thirds of the training rows. Friction of the
@@ -137,7 +137,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         raw = forcegp.Dataset.load(self.data)
         system = self.chosen_system(raw, self.data)
         raw = replace(raw, system=system)
-        preparation = replace(self, every=self.every or 1)._preparation()
+        preparation = self._preparation()
         if preparation.changes_nothing:
             rows = recording = raw
         else:

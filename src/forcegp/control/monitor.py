@@ -70,7 +70,7 @@ class ContactMonitor(Summary):
     a threshold that free motion reaches as often as stated.
 
     * model: `posterior.predictor()`, or a `MechanicalSystem` without anything learned.
-    * covariance: "noise" is S; "noise and posterior" adds what the predictor does not know of the forces there, which
+    * covariance: "noise" is S; "noise and posterior" adds the spread of the learned forces there, which
       spares false alarms where the model has not been. None is the latter where the model has a covariance.
 
     Raises InvalidInput for arguments that do not fit and a monitor that was not calibrated, DatasetError for free

@@ -53,7 +53,7 @@ class MujocoForces(Summary):
     """What was learned of a robot's forces, as MuJoCo's passive force: `with MujocoForces(predictor, model): ...`.
 
     Within the context every `mj_step`, `mj_forward` and `mujoco.rollout` of this process adds them, on any number of
-    threads; there is one such force at a time. With it `qacc` is what `posterior.predict` says.
+    threads; there is one such force at a time. With it `qacc` is what `posterior.predict` returns.
 
     * predictor: `posterior.predictor()` without contacts, since those are MuJoCo's; its forces may depend on q and v.
     * model: an `MjModel` with the joints of the robot, by their names, and its inertias and gravity. Damping and

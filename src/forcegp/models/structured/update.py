@@ -54,9 +54,9 @@ def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, ke
                 kept = keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
     likelihood = replace(more, training=replace(training, reference=reference))
-    told = {"points": len(latent.system.alpha), "budget": budget}
-    told["rows_added"] = posterior.settings.get("rows_added", 0) + len(rows)
-    return replace(posterior, likelihood=likelihood, latent=latent).with_settings(**told)
+    changes = {"points": len(latent.system.alpha), "budget": budget}
+    changes["rows_added"] = posterior.settings.get("rows_added", 0) + len(rows)
+    return replace(posterior, likelihood=likelihood, latent=latent).with_settings(**changes)
 
 
 def learn_and_forget(
@@ -78,9 +78,9 @@ def learn_and_forget(
             latent = InducingPosterior.condition(kernels, terms(posterior.parameters), points=100, tolerance=ENOUGH)
         latent = replace(latent, space=latent.space.learned(kept, more.terms(posterior.parameters)))
     engine = InducingWeights(tuple(len(z) for z in latent.features))
-    told = {"engine": engine.to_dict(), "learned_until": until}
-    told["rows_added"] = settings.get("rows_added", 0) + len(rows)
-    return replace(posterior, latent=latent, engine=engine).with_settings(**told)
+    changes = {"engine": engine.to_dict(), "learned_until": until}
+    changes["rows_added"] = settings.get("rows_added", 0) + len(rows)
+    return replace(posterior, latent=latent, engine=engine).with_settings(**changes)
 
 
 def _parts_kept(horizon: float | Mapping[str, float], seconds: float, prior: ForcePrior, robot: Robot) -> list[float]:
