@@ -14,6 +14,7 @@ from .plots.prediction import (
     likelihood_figure as likelihood_figure, normal_force_figure as normal_force_figure, prediction_figure as
     prediction_figure,
 )
+from .plots.motion_bands import motion_bands_figure as motion_bands_figure
 from .plots.contacts import contacts_figure as contacts_figure
 from .plots.rollout import rollout_figure as rollout_figure
 from .plots.style import save_figure as save_figure

@@ -1,4 +1,4 @@
-"""Plot: the friction curves that a model learned, one panel each, over velocity, and the truth where it is known."""
+"""Plot: the friction curves of a model, laws and learned part together, over velocity, and the truth where known."""
 
 import math
 from collections.abc import Sequence
@@ -15,16 +15,30 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation.force_errors import true_names
 from forcegp.evaluation.plots import style
-from forcegp.mechanics import ConstrainedDynamics
+from forcegp.mechanics import (
+    Actuation,
+    Armature,
+    ConstantJointForce,
+    ConstrainedDynamics,
+    LoadJointFriction,
+    MechanicalSystem,
+    RigidBodyBias,
+    RotorInertia,
+)
+from forcegp.mechanics.gauss_principle import State
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.components import Curve, term_slices
-from forcegp.priors import ContactFriction, ForcePrior, ToolForces
+from forcegp.priors import ContactFriction, ForcePrior, JointFriction, NoForces, ToolForces
 
 LARGEST_GRID = 12
 BEYOND = 0.18
 """Part of the visited range that is drawn on either side of it."""
 POINTS = 241
+NOT_OF_VELOCITY = (Actuation, RigidBodyBias, Armature, RotorInertia, ConstantJointForce, LoadJointFriction)
+"""Known forces that are no curve over the velocity of one joint."""
+LAWS = "friction laws"
+"""What the panels of a model without processes are called."""
 TRUE_POINTS = 200
 TRUE_DOTS = "#A8A8A8"
 ALONG = 0.15
@@ -33,7 +47,11 @@ ALONG = 0.15
 
 @dataclass(frozen=True, eq=False)
 class CurvePanel:
-    """One process over one velocity: which one, its own number in its term, and which feature runs along the axis."""
+    """One process over one velocity: which one, its own number in its term, and which feature runs along the axis.
+
+    `joint` is the joint whose friction it is, by number: the laws of the system are added to it. The `component` of a
+    joint with laws alone is LAWS.
+    """
 
     latent: str
     component: str
@@ -42,10 +60,14 @@ class CurvePanel:
     feature: int
     resisting: float
     """-1 where the process is a force along its axis instead of the force that resists the motion, else 1."""
+    joint: int | None = None
 
 
 def curve_panels(posterior: Posterior) -> list[CurvePanel]:
-    """All processes of a model that are curves: those of one feature, and tool forces along their own velocity."""
+    """All processes of a model that are curves: those of one feature, and tool forces along their own velocity.
+
+    Where there are none, the friction laws of the joints.
+    """
     if not isinstance(posterior, StructuredPosterior):
         return []
     robot = posterior.model.system.robot
@@ -56,10 +78,29 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
         for index, place in enumerate(range(which.start, which.stop)):
             along = _velocity_along(term, term.latent_names(robot)[index], index) if widths[place] > 1 else None
             if widths[place] == 1:
-                panels.append(CurvePanel(names[place], component, term, index, 0, 1.0))
+                joint = robot.joint_names.index(term.latent_names(robot)[index]) if _of_joints(term) else None
+                panels.append(CurvePanel(names[place], component, term, index, 0, 1.0, joint))
             elif along is not None:
                 panels.append(CurvePanel(names[place], component, term, index, along, -1.0))
-    return panels
+    if panels:
+        return panels
+    with_law = [joint for joint in range(robot.nv) if law_forces(posterior.system, joint, np.ones(1)).any()]
+    return [CurvePanel(robot.joint_names[joint], LAWS, NoForces(), joint, 0, 1.0, joint) for joint in with_law]
+
+
+def _of_joints(term: ForcePrior) -> bool:
+    """Whether the processes of a term are friction of single joints over their velocity."""
+    return isinstance(term, JointFriction)
+
+
+def law_forces(system: MechanicalSystem, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """What the friction laws of the system resist with, in Nm or N, where this joint moves alone; 0 without laws."""
+    robot = system.robot
+    v = torch.zeros(len(velocities), robot.nv, dtype=torch.float64, device=robot.device)
+    v[:, joint] = torch.tensor(velocities, dtype=v.dtype, device=v.device)
+    state = State.of(robot, torch.zeros_like(v), v, torch.zeros_like(v))
+    laws = [force for force in system.known_forces if not isinstance(force, NOT_OF_VELOCITY)]
+    return -sum((law.force(state).expand_as(v) for law in laws), torch.zeros_like(v))[:, joint].detach().cpu().numpy()
 
 
 def friction_curves_figure(
@@ -68,9 +109,11 @@ def friction_curves_figure(
     """Every curve with its 95 % band over the velocities that were visited in training, and a little beyond.
 
     Shown are processes of one feature, and of tool forces the force along each axis over the velocity along it, at
-    rest along the others, as the force that resists. Where `dataset` holds the true parts of the unknown force, dots
-    show them at its rows (of tool forces: at rows that move nearly along that axis). `latents` chooses among the
-    names of `posterior.latent_names`; None takes the first LARGEST_GRID. Raises InvalidInput if there is no curve.
+    rest along the others, as the force that resists. To the friction of a joint, the friction laws of the system are
+    added, so that the whole friction is seen; a line shows them alone. Where `dataset` holds the true parts of the
+    unknown force, dots show them at its rows (of tool forces: at rows that move nearly along that axis). `latents`
+    chooses among the names of `posterior.latent_names`, and of joints that have laws alone; None takes the first
+    LARGEST_GRID. Raises InvalidInput if there is no curve.
     """
     panels = curve_panels(posterior)
     if not isinstance(posterior, StructuredPosterior) or not panels:
@@ -89,17 +132,18 @@ def friction_curves_figure(
     titles = _titles(chosen, posterior)
     truth = {} if dataset is None else _truth(posterior, dataset, chosen)
     for number, (axes, panel) in enumerate(zip(grid, chosen, strict=False)):
-        curve = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
-        what = {"Nm": "torque in Nm", "": "force / normal force"}.get(curve.unit, f"force in {curve.unit}")
+        feature, unit = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
+        what = {"Nm": "torque in Nm", "": "force / normal force"}.get(unit, f"force in {unit}")
         what = f"resisting {what}" if panel.resisting < 0 else what
-        style.quiet(axes, title=titles[number], x=_label(curve.feature_names[panel.feature]), y=what)
+        style.quiet(axes, title=titles[number], x=_label(feature), y=what)
     for axes in grid[len(chosen) :]:
         axes.set_visible(False)
     below = {"columns": 5 if columns > 2 else 3, "size": style.NORMAL, "markerscale": 2}
     style.legend_below(figure, *grid[: len(chosen)], **below)
     what = "Friction" if all("friction" in panel.component for panel in chosen) else "Forces"
+    how = "learned" if any(panel.component != LAWS for panel in chosen) else "by the laws of a model"
     shown = f" ({len(chosen)} of {len(panels)} curves)" if len(chosen) < len(panels) else ""
-    style.heading(figure, f"{what} learned from {len(posterior.training)} points{shown}")
+    style.heading(figure, f"{what} {how} from {len(posterior.training)} points{shown}")
     return figure
 
 
@@ -116,7 +160,7 @@ def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> lis
     several = len({panel.component for panel in panels}) > 1
     titles = []
     for panel in panels:
-        own = panel.term.latent_names(robot)[panel.index]
+        own = panel.latent if panel.component == LAWS else panel.term.latent_names(robot)[panel.index]
         own = short.get(own, own).replace("force-", "force along ")
         titles.append(f"{panel.component}: {own}" if several else own)
     return titles
@@ -131,26 +175,32 @@ def _label(feature: str) -> str:
 
 def _draw_curve(
     axes: Axes, posterior: StructuredPosterior, panel: CurvePanel, truth: tuple[np.ndarray, np.ndarray] | None
-) -> Curve:
-    """Mean and band, solid where the training data were; training velocities as ticks; the truth as dots."""
+) -> tuple[str, str]:
+    """Mean and band, solid where the training data were; training velocities as ticks; the truth as dots.
+
+    Returns the feature along the axis and the unit of the force.
+    """
     visited = _visited(posterior, panel)
     low, high = float(visited.min()), float(visited.max())
     margin = BEYOND * (high - low)
     start = max(0.0, low - margin) if low >= 0.0 else low - margin  # a speed is never negative
     at = np.linspace(start, high + margin, POINTS)
-    width = len(posterior.likelihood.standardization.shift[posterior.latent_names.index(panel.latent)])
-    features = np.zeros((POINTS, width))
-    features[:, panel.feature] = at
-    curve = posterior.curve(panel.latent, features)
-    mean = panel.resisting * curve.mean.cpu().numpy()
-    spread = style.QUANTILE * curve.std.cpu().numpy()
+    curve = None if panel.component == LAWS else _curve(posterior, panel, at)
+    mean = np.zeros(POINTS) if curve is None else panel.resisting * curve.mean.cpu().numpy()
+    spread = np.zeros(POINTS) if curve is None else style.QUANTILE * curve.std.cpu().numpy()
+    laws = np.zeros(POINTS) if panel.joint is None else law_forces(posterior.system, panel.joint, at)
+    mean = mean + laws
     inside = (at >= low) & (at <= high)
     axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
     if start < 0.0:
         axes.axvline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
-    style.draw_line(axes, at[inside], mean[inside], style.PREDICTION, 1.5, "learned")
-    style.draw_band(axes, at, mean, spread, alpha=0.28, where=inside.tolist(), label="95 % band")
-    style.draw_band(axes, at, mean, spread, alpha=0.12)
+    both = "laws and learned part" if curve is not None and laws.any() else "learned" if curve is not None else "laws"
+    style.draw_line(axes, at[inside], mean[inside], style.PREDICTION, 1.5, both)
+    if curve is not None:
+        style.draw_band(axes, at, mean, spread, alpha=0.28, where=inside.tolist(), label="95 % band")
+        style.draw_band(axes, at, mean, spread, alpha=0.12)
+        if laws.any():
+            style.draw_line(axes, at, laws, style.KNOWN_PHYSICS, 1.0, "laws alone", linestyle=style.DASHED)
     dashes = {"label": "beyond the training data", "linestyle": (0, (3, 2)), "zorder": 1.9}
     style.draw_line(axes, at, mean, style.PREDICTION, 1.2, **dashes)
     ticks = {"markersize": 5, "markeredgewidth": 0.6, "transform": axes.get_xaxis_transform()}
@@ -167,11 +217,24 @@ def _draw_curve(
     room = 0.12 * max(float(values.max() - values.min()), 1e-12)
     axes.set_ylim(float(values.min()) - 1.6 * room, float(values.max()) + room)
     axes.set_xlim(at[0], at[-1])
-    return curve
+    if curve is not None:
+        return curve.feature_names[panel.feature], curve.unit
+    slides = posterior.system.robot.joints[panel.index].type == "prismatic"
+    return ("velocity [m/s]", "N") if slides else ("velocity [rad/s]", "Nm")
+
+
+def _curve(posterior: StructuredPosterior, panel: CurvePanel, at: Float[np.ndarray, " n"]) -> Curve:
+    """The process of a panel, at rest along its other features."""
+    width = len(posterior.likelihood.standardization.shift[posterior.latent_names.index(panel.latent)])
+    features = np.zeros((len(at), width))
+    features[:, panel.feature] = at
+    return posterior.curve(panel.latent, features)
 
 
 def _visited(posterior: StructuredPosterior, panel: CurvePanel) -> Float[np.ndarray, " N"]:
     """The feature of a panel at the training points."""
+    if panel.component == LAWS:
+        return posterior.training.v[:, panel.index].cpu().numpy()
     with torch.no_grad():
         features = panel.term.features(posterior.likelihood.dynamics(posterior.parameters))
     return features[panel.index][:, panel.feature].cpu().numpy()
@@ -198,6 +261,8 @@ def _truth(
             own = features[:, panel.feature]
             others = torch.cat([features[:, : panel.feature], features[:, panel.feature + 1 :]], dim=-1)
             latent = panel.resisting * values[:, panel.index]
+            if panel.joint is not None:  # the truth is what the system of the dataset lacks
+                latent = latent + torch.tensor(law_forces(system, panel.joint, rows.v[:, panel.joint]))
             kept = (torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()) & torch.isfinite(latent)
             found[panel.latent] = (own[kept].numpy(), latent[kept].numpy())
     return found

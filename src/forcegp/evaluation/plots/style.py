@@ -109,10 +109,10 @@ def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, si
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a PNG. Raises InvalidInput if the folder does not exist."""
     with atomic_file(path) as temporary:
-        _render(figure).save(temporary, format="png", optimize=True)
+        rendered(figure).save(temporary, format="png", optimize=True)
 
 
-def _render(figure: Figure) -> Image.Image:
+def rendered(figure: Figure) -> Image.Image:
     """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
     canvas = figure.canvas
     canvas.draw()

@@ -1,0 +1,21 @@
+"""Pages of Markdown from Jinja templates, which lie beside the modules that have their numbers."""
+
+import re
+from typing import Any
+
+from forcegp.evaluation.metrics import formatted, markdown_table, number
+
+
+def rendered(template: str, **values: Any) -> str:
+    """The text of a template, `validation/report.md.jinja` in the package; one blank line between paragraphs.
+
+    Templates have the filters `formatted`, `number` and `table` (header and rows) beside Jinja's own. What a template
+    asks for and is not given raises jinja2.UndefinedError.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    pages = Environment(
+        loader=PackageLoader("forcegp", ""), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    pages.filters |= {"formatted": formatted, "number": number, "table": lambda rows, head: markdown_table(head, rows)}
+    return re.sub(r"\n{3,}", "\n\n", pages.get_template(template).render(values)).strip() + "\n"

@@ -1,0 +1,12 @@
+from .motion import Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene
+from .page import (
+    Finding as Finding, Page as Page, Picture as Picture, Table as Table, is_page as is_page, write_page as write_page,
+)
+from .rerun_log import write_rerun as write_rerun
+from .results import (
+    scene_notes as scene_notes,
+    evaluation_sentence as evaluation_sentence, evaluation_table as evaluation_table, model_page as model_page,
+    validation_pictures as validation_pictures, validation_table as validation_table,
+)
+from .scene import recording as recording
+from .viewer import serve as serve

@@ -1,0 +1,209 @@
+"""A recorded motion of a robot as a scene: poses of its links, and the forces that a model learned as arrows."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.evaluation.plots import style
+from forcegp.mechanics import (
+    Actuation,
+    Armature,
+    ConstrainedDynamics,
+    MechanicalSystem,
+    RigidBodyBias,
+    RotorInertia,
+)
+from forcegp.models import StructuredPosterior
+from forcegp.models.protocol import Posterior
+from forcegp.models.structured.components import term_slices
+from forcegp.priors import ForcePrior
+from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
+from forcegp.robots import Robot
+
+FRAMES_PER_SECOND = 30.0
+MOST_FRAMES = 450
+LONGEST_ARROW = 0.4
+"""Of the reach of the robot, for a force that is large in its group."""
+LARGE = 98.0
+"""Percentile of the largest force of each row: peaks do not make all other arrows short."""
+NOT_SHOWN = (Actuation, RigidBodyBias, Armature, RotorInertia)
+"""Known forces that are no finding: what the motors do, and inertia."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """Forces over time as arrows: `start` (rows, k, 3) in m and unit vectors `direction` (rows, k, 3), world axes.
+
+    `mean` and `half` (rows, k) are the force along the direction and half its 95 % interval, in `unit`; `names` has k
+    entries. A torque of a joint is drawn along its axis.
+    """
+
+    title: str
+    unit: str
+    names: tuple[str, ...]
+    start: Float[np.ndarray, "rows k 3"]
+    direction: Float[np.ndarray, "rows k 3"]
+    mean: Float[np.ndarray, "rows k"]
+    half: Float[np.ndarray, "rows k"]
+
+    @property
+    def largest(self) -> float:
+        """A large force of the group in `unit`, for the scale: what the largest of a row stays below nearly always."""
+        return float(np.percentile(np.abs(self.mean).max(axis=1), LARGE)) if self.mean.size else 0.0
+
+    def tips(self, row: int, length: float) -> tuple[np.ndarray, np.ndarray]:
+        """Arrows (k, 2, 3) of the mean, and to the end of the interval; a large force is `length` m long."""
+        scale = length / max(self.largest, np.finfo(float).tiny)
+        mean, away = self.mean[row][:, None], np.where(self.mean[row] < 0.0, -1.0, 1.0)[:, None]
+        start, direction = self.start[row], self.direction[row]
+        tip = start + scale * mean * direction
+        end = tip + scale * away * self.half[row][:, None] * direction
+        return np.stack([start, tip], axis=1), np.stack([start, end], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedScene:
+    """Rows of a recording, ready to be drawn.
+
+    `time` (rows,) in s from the first; `q` (rows, nv); `poses` (rows, links, 4, 4) of `shapes` in the world; `arrows`;
+    `paths` (contacts, rows, 3) of the contact points in m; `size` the reach of the robot in m; `doubts` what could not
+    be drawn.
+    """
+
+    robot: Robot
+    time: Float[np.ndarray, " rows"]
+    q: Float[np.ndarray, "rows nv"]
+    shapes: list[LinkShape]
+    poses: Float[np.ndarray, "rows links 4 4"]
+    arrows: list[Arrows]
+    paths: list[Float[np.ndarray, "rows 3"]]
+    size: float
+    doubts: list[str] = field(default_factory=list)
+
+    @property
+    def arrow_length(self) -> float:
+        """Length of the longest arrow in m."""
+        return LONGEST_ARROW * self.size
+
+
+def recorded_scene(
+    dataset: Dataset,
+    posterior: Posterior | None = None,
+    *,
+    start: float = 0.0,
+    seconds: float = 10.0,
+    shapes: str | Path | None = None,
+) -> RecordedScene:
+    """The motion of the first episode from `start` s on for `seconds`, at no more than 30 frames per second.
+
+    Forces are those of the posterior: each of its priors by itself, and the friction laws of its system. Without one,
+    the recorded u. `shapes` is a URDF with visual elements (`link_shapes`).
+
+    Raises InvalidInput for a Dataset and posterior without system or rows in that time, MissingExtra without trimesh.
+    """
+    system = dataset.system if posterior is None else posterior.system
+    if system is None:
+        raise InvalidInput("the dataset holds no robot; import it with one, or give a fitted model, too.")
+    rows = style.window(dataset, start, seconds)
+    rows = rows.rows(_evenly(rows.time))
+    q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
+    drawn, doubts = link_shapes(system.robot, shapes)
+    with torch.no_grad():
+        if isinstance(posterior, StructuredPosterior):
+            dynamics = posterior.dynamics(q, v, u)
+            arrows = learned_forces(posterior, dynamics)
+        else:
+            dynamics = system.dynamics(q, v, u)
+            arrows = [_at_joints(system.robot, dynamics, "recorded u", dynamics.state.u, None)]
+        paths = [contact.position(dynamics.state.kinematics).cpu().numpy() for contact in dynamics.contacts]
+    poses = poses_of_links(system.robot, q, [shape.link for shape in drawn])
+    time = rows.time - rows.time[0]
+    return RecordedScene(system.robot, time, rows.q, drawn, poses, arrows, paths, reach(system.robot), doubts)
+
+
+def _evenly(time: np.ndarray) -> np.ndarray:
+    """Rows nearest to an even grid of frames."""
+    duration = float(time[-1] - time[0])
+    count = int(np.clip(duration * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(time) - 1) or 1)) + 1
+    grid = np.linspace(time[0], time[-1], count)
+    return np.unique(np.searchsorted(time, grid - 1e-9).clip(0, len(time) - 1))
+
+
+def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
+    """What the model found at these states: joint forces, with the laws of its system, point and contact forces."""
+    prior, robot = posterior.model.prior, posterior.system.robot
+    B, latents = prior.mixing(dynamics), posterior.latents(dynamics, True)
+    of_joints = torch.zeros(B.shape[-1], dtype=torch.bool)
+    groups = []
+    for name, term, which in term_slices(prior, robot):
+        point = term.point_force(dynamics)
+        if point is None:
+            of_joints[which] = True
+        else:
+            force = latents.part(which).through(point)
+            groups.append(_at_point(name, _place(term, dynamics), force.mean, force.covariance))
+    laws = _laws(posterior.system, dynamics)
+    if bool(of_joints.any()) or laws is not None:
+        own = latents.through(B * of_joints)
+        mean = own.mean if laws is None else own.mean + laws
+        title = "learned joint forces" if posterior.carries_known_forces else "friction and other joint forces"
+        groups.append(_at_joints(robot, dynamics, title, mean, own.std))
+    if dynamics.contacts and posterior.predicts_forces:
+        known = not posterior.carries_known_forces
+        map_ = dynamics.contact_force_map(known)
+        force = latents.through(map_.matrix @ B, map_.offset)
+        for index, contact in enumerate(dynamics.contacts):
+            which = slice(3 * index, 3 * index + 3)
+            covariance = None if force.covariance is None else force.covariance[..., which, which]
+            place = contact.position(dynamics.state.kinematics)
+            groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean[..., which], covariance))
+    return groups
+
+
+def _laws(system: MechanicalSystem, dynamics: ConstrainedDynamics) -> torch.Tensor | None:
+    """The sum (rows, nv) of the known forces that are friction, springs or offsets; None where there are none."""
+    forces = [force.force(dynamics.state) for force in system.known_forces if not isinstance(force, NOT_SHOWN)]
+    return torch.stack([force.expand_as(dynamics.state.q) for force in forces]).sum(0) if forces else None
+
+
+def _place(term: ForcePrior, dynamics: ConstrainedDynamics) -> torch.Tensor:
+    """World position (rows, 3) of the point at which a prior's force acts."""
+    frame = getattr(term, "frame", None)
+    if frame is None:
+        return dynamics.contacts[getattr(term, "contact", 0)].position(dynamics.state.kinematics)
+    pose = dynamics.state.kinematics.frame_pose(frame)
+    local = torch.tensor(getattr(term, "point", (0.0, 0.0, 0.0)), dtype=pose.dtype, device=pose.device)
+    return pose[..., :3, :3] @ local + pose[..., :3, 3]
+
+
+def _at_joints(
+    robot: Robot, dynamics: ConstrainedDynamics, title: str, mean: torch.Tensor, std: torch.Tensor | None
+) -> Arrows:
+    """Forces of joints along their axes, from their origins."""
+    starts, axes = [], []
+    for joint in robot.joints:
+        pose = dynamics.state.kinematics.frame_pose(joint.child)
+        axis = torch.tensor(joint.axis, dtype=pose.dtype, device=pose.device)
+        starts.append(pose[..., :3, 3].expand(len(mean), 3))
+        axes.append((pose[..., :3, :3] @ axis).expand(len(mean), 3))
+    spread = torch.zeros_like(mean) if std is None else style.QUANTILE * std
+    kinds = {"N" if joint.type == "prismatic" else "Nm" for joint in robot.joints}
+    numbers = (torch.stack(starts, 1), torch.stack(axes, 1), mean, spread)
+    return Arrows(title, " or ".join(sorted(kinds)), robot.joint_names, *(x.cpu().numpy() for x in numbers))
+
+
+def _at_point(name: str, place: torch.Tensor, mean: torch.Tensor, covariance: torch.Tensor | None) -> Arrows:
+    """A force in space as one arrow along its mean, with the standard deviation in that direction."""
+    size = torch.linalg.vector_norm(mean, dim=-1, keepdim=True)
+    direction = torch.where(size > 0.0, mean / size.clamp_min(torch.finfo(mean.dtype).tiny), torch.eye(3)[2].to(mean))
+    half = torch.zeros_like(size[..., 0])
+    if covariance is not None:
+        variance = (direction[..., None, :] @ covariance @ direction[..., None])[..., 0, 0]
+        half = style.QUANTILE * variance.clamp_min(0.0).sqrt()
+    numbers = (place[:, None], direction[:, None], size, half[:, None])
+    return Arrows(name, "N", (name,), *(x.detach().cpu().numpy() for x in numbers))

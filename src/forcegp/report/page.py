@@ -1,0 +1,92 @@
+"""One self-contained HTML page: what was found, the robot in motion, pictures, tables, and how it was made."""
+
+import base64
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from matplotlib.figure import Figure
+
+from forcegp import __version__
+from forcegp.atomic_files import atomic_file
+from forcegp.evaluation.plots import style
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the answer: its subject and what was found."""
+
+    subject: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A figure, with a caption that says what is to be seen and `alt` for those who cannot see it."""
+
+    caption: str
+    figure: Figure
+    alt: str = ""
+
+    @property
+    def data(self) -> str:
+        """The PNG as base64."""
+        stream = io.BytesIO()
+        style.rendered(self.figure).save(stream, format="png", optimize=True)
+        return base64.b64encode(stream.getvalue()).decode()
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a header."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """What a page shows, from top to bottom. What is empty is left out."""
+
+    title: str
+    best: str
+    """The one sentence to remember."""
+    findings: Sequence[Finding] = ()
+    scene: str = ""
+    """An HTML document with the robot (`scene.recording`)."""
+    scene_notes: Sequence[str] = ()
+    """What the arrows are; or why there is no robot."""
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    next_steps: Sequence[Finding] = ()
+    """What to do next, and the command for it."""
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """The resolved configuration, for those who want to repeat it."""
+
+
+MARK = "Written by forcegp"
+
+
+def is_page(path: Path) -> bool:
+    """Whether the file was written by `write_page`."""
+    return MARK in path.read_text(encoding="utf-8", errors="replace")
+
+
+def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
+    """Write the page to a temporary name and rename it.
+
+    Raises InvalidInput if the folder does not exist, or the file does and may not be replaced.
+    """
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(files("forcegp.report").joinpath("page.html").read_text(encoding="utf-8"))
+    details = json.dumps(page.details, indent=1, default=str) if page.details else ""
+    with atomic_file(path, overwrite=overwrite) as temporary:
+        temporary.write_text(
+            template.render(page=page, details=details, version=__version__, mark=MARK) + "\n", encoding="utf-8"
+        )

@@ -1,0 +1,97 @@
+"""Scenes of recordings: poses against Pinocchio, arrows against the components of the posterior."""
+
+import numpy as np
+import pinocchio
+import pytest
+import torch
+
+from forcegp import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.report import recorded_scene, scene_notes
+from forcegp.report.motion import LONGEST_ARROW
+
+
+def test_poses_are_pinocchios(swinging):
+    scene = recorded_scene(swinging, seconds=1.0)
+    model = pinocchio.buildModelFromXML(swinging.system.robot.urdf_text)
+    data = model.createData()
+    for row in (0, len(scene.time) - 1):
+        pinocchio.forwardKinematics(model, data, scene.q[row])
+        pinocchio.updateFramePlacements(model, data)
+        for place, shape in enumerate(scene.shapes):
+            pose = data.oMf[model.getFrameId(shape.link)].homogeneous
+            np.testing.assert_allclose(scene.poses[row, place], pose, atol=1e-12)
+
+
+def test_frames_are_even_in_time_and_not_more_than_thirty_a_second(swinging):
+    scene = recorded_scene(swinging, start=1.0, seconds=2.0)
+    assert 58 <= len(scene.time) <= 61
+    assert scene.time[0] == 0.0
+    assert scene.time[-1] == pytest.approx(2.0, abs=0.01)
+    first = np.searchsorted(swinging.time - swinging.time[0], 1.0 - 1e-9)
+    np.testing.assert_array_equal(scene.q[0], swinging.q[first])
+
+
+def test_without_a_model_the_recorded_torques_are_shown(swinging):
+    (arrows,) = recorded_scene(swinging, seconds=0.5).arrows
+    assert (arrows.title, arrows.unit, arrows.names) == ("recorded u", "Nm", swinging.joint_names)
+    assert not arrows.half.any()
+
+
+def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):
+    scene = recorded_scene(swinging, friction, seconds=1.0)
+    (arrows,) = scene.arrows
+    rows = [int(np.flatnonzero((swinging.q == q).all(1))[0]) for q in scene.q]
+    q, v, u = (torch.tensor(x[rows]) for x in (swinging.q, swinging.v, swinging.u))
+    total = friction.components(q, v, u).total
+    np.testing.assert_allclose(arrows.mean, (total.mean - 0.1 * v).numpy(), atol=1e-10)
+    np.testing.assert_allclose(arrows.half, 1.959963984540054 * total.std.numpy(), rtol=1e-9)
+    robot = swinging.system.robot
+    pose = robot.frame_pose(q, robot.joints[1].child).numpy()
+    np.testing.assert_allclose(arrows.start[:, 1], pose[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(arrows.direction[:, 1], pose[:, :3, :3] @ robot.joints[1].axis, atol=1e-12)
+
+
+def test_contact_arrows_are_the_predicted_force(on_plane):
+    q, v, u = (on_plane.training.q[:4], on_plane.training.v[:4], on_plane.training.u[:4])
+    data = Dataset(q=q, v=v, u=u, a=np.zeros((4, 3)), time=0.01 * np.arange(4), system=on_plane.system)
+    scene = recorded_scene(data, on_plane)
+    contact = next(arrows for arrows in scene.arrows if arrows.title.startswith("contact force"))
+    chosen = [int(np.flatnonzero((q.numpy() == row).all(1))[0]) for row in scene.q]
+    predicted = on_plane.predict(q, v, u).contact_force
+    np.testing.assert_allclose(
+        contact.mean[:, :1] * contact.direction[:, 0], predicted.mean.numpy()[chosen], rtol=1e-9, atol=1e-9
+    )
+    d = torch.tensor(contact.direction[:, 0])
+    std = (d[:, None, :] @ predicted.covariance[chosen] @ d[..., None])[:, 0, 0].sqrt()
+    np.testing.assert_allclose(contact.half[:, 0], 1.959963984540054 * std.numpy(), rtol=1e-6)
+    position = on_plane.system.contacts[0].position(on_plane.system.robot.kinematics(q[chosen])).numpy()
+    np.testing.assert_allclose(contact.start[:, 0], position, atol=1e-12)
+    np.testing.assert_allclose(scene.paths[0], position, atol=1e-12)
+
+
+def test_arrows_are_drawn_to_scale(swinging, friction):
+    scene = recorded_scene(swinging, friction, seconds=1.0)
+    (arrows,) = scene.arrows
+    mean, interval = arrows.tips(5, scene.arrow_length)
+    lengths = np.linalg.norm(mean[:, 1] - mean[:, 0], axis=1)
+    np.testing.assert_allclose(lengths / scene.arrow_length, np.abs(arrows.mean[5]) / arrows.largest, rtol=1e-9)
+    farther = np.linalg.norm(interval[:, 1] - interval[:, 0], axis=1)
+    expected = (np.abs(arrows.mean[5]) + arrows.half[5]) / arrows.largest
+    np.testing.assert_allclose(farther / scene.arrow_length, expected, rtol=1e-9)
+    assert scene.arrow_length == LONGEST_ARROW * scene.size
+    assert f"{arrows.largest:.3g} Nm would be" in scene_notes(scene)[0]
+
+
+def test_a_dataset_without_robot_is_refused(swinging):
+    bare = Dataset(
+        q=swinging.q,
+        v=swinging.v,
+        u=swinging.u,
+        a=swinging.a,
+        time=swinging.time,
+        joint_names=swinging.joint_names,
+        units=swinging.units,
+    )
+    with pytest.raises(InvalidInput, match="holds no robot"):
+        recorded_scene(bare)

@@ -1,0 +1,147 @@
+"""The page: self-contained, small, escaped, and what cannot be drawn is named on it."""
+
+import base64
+import io
+import re
+import urllib.request
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from forcegp import Dataset, evaluate
+from forcegp.errors import InvalidInput
+from forcegp.report import (
+    Finding,
+    Page,
+    Table,
+    evaluation_sentence,
+    evaluation_table,
+    is_page,
+    model_page,
+    recorded_scene,
+    serve,
+    write_page,
+    write_rerun,
+)
+
+
+@pytest.fixture(scope="module")
+def page(swinging, friction):
+    evaluation = evaluate(friction, swinging)
+    best = evaluation_sentence(evaluation, "rad/s²")
+    return model_page(friction, swinging, title="pendulum", best=best, tables=[evaluation_table(evaluation)])
+
+
+def test_a_page_needs_no_network_and_is_small(page, tmp_path):
+    write_page(tmp_path / "report.html", page)
+    text = (tmp_path / "report.html").read_text()
+    assert len(text.encode()) < 5e6
+    own, player = text.replace(page.scene, ""), page.scene
+    assert not re.findall(r'(?:src|href)="(?!data:)[^"]*"', own.split("srcdoc")[0] + own.split("</iframe>")[1])
+    assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', player)
+    assert page.best in text
+
+
+def test_a_page_shows_every_picture_and_number(page, tmp_path):
+    write_page(tmp_path / "report.html", page)
+    text = (tmp_path / "report.html").read_text()
+    pictures = re.findall(r'<img src="data:image/png;base64,([^"]+)"', text)
+    assert len(pictures) == len(page.pictures) == 3  # friction curves, motions ahead, accelerations
+    for picture in pictures:
+        assert Image.open(io.BytesIO(base64.b64decode(picture))).width > 500
+    (table,) = page.tables
+    for cell in (cell for row in table.rows for cell in row):
+        assert f"<td>{cell}</td>" in text
+    assert any("Arrows are forces" in note for note in page.scene_notes)
+
+
+def test_text_is_escaped(tmp_path):
+    evil = "<script>alert(1)</script>"
+    page = Page(evil, evil, [Finding(evil, evil)], tables=[Table(evil, [evil], [[evil]])], details={"x": evil})
+    write_page(tmp_path / "report.html", page)
+    text = (tmp_path / "report.html").read_text()
+    assert "<script>" not in text
+    assert text.count("&lt;script&gt;") == 9
+
+
+def test_own_pages_are_recognised_and_kept(page, tmp_path):
+    path = tmp_path / "report.html"
+    write_page(path, Page("t", "b"))
+    assert is_page(path)
+    with pytest.raises(InvalidInput, match="exists already"):
+        write_page(path, Page("t", "other"), overwrite=False)
+    assert "other" not in path.read_text()
+    (tmp_path / "mine.html").write_text("<html>mine</html>")
+    assert not is_page(tmp_path / "mine.html")
+
+
+def test_what_cannot_be_drawn_is_named(swinging, friction):
+    keep = np.sort(np.random.default_rng(0).choice(len(swinging), 300, replace=False))
+    uneven = swinging.rows(keep)
+    page = model_page(friction, uneven, title="t", best="b")
+    assert len(page.pictures) == 2
+    assert any(note.startswith("motions ahead: not drawn, because") for note in page.scene_notes)
+
+
+def test_the_sentence_is_true(swinging, friction):
+    evaluation = evaluate(friction, swinging)
+    sentence = evaluation_sentence(evaluation, "rad/s²")
+    assert f"to {evaluation.mae:.3g} rad/s² on average" in sentence
+    assert f"{evaluation.known_physics_mae / evaluation.mae:.3g} times less" in sentence
+
+
+def test_the_viewer_serves_and_moves(swinging, friction):
+    recorded, ready, stop, urls = recorded_scene(swinging, friction, seconds=1.0), Event(), Event(), []
+
+    def opened(url):
+        urls.append(url)
+        ready.set()
+
+    thread = Thread(target=serve, args=(recorded,), kwargs={"ready": opened, "until": stop.is_set})
+    thread.start()
+    assert ready.wait(30)
+    try:
+        with urllib.request.urlopen(urls[0], timeout=10) as answer:
+            assert b"<html" in answer.read().lower()
+    finally:
+        stop.set()
+        thread.join(30)
+    assert not thread.is_alive()
+
+
+def test_controls_show_the_row_of_the_time(swinging, friction):
+    from forcegp.report.scene import viser_server
+    from forcegp.report.viewer import Controls
+
+    recorded = recorded_scene(swinging, friction, seconds=1.0)
+    with viser_server() as server:
+        controls = Controls(server, recorded)
+        controls.at(0.5)
+        assert recorded.time[controls.row] == pytest.approx(0.5, abs=0.04)
+        pose = recorded.poses[controls.row, -1]
+        np.testing.assert_allclose(controls.nodes.links[-1].position, pose[:3, 3], atol=1e-6)
+        controls.time.value = float(recorded.time[-1])
+        controls.tick(0.1)
+        assert controls.time.value == 0.0  # it begins again
+        controls.nodes.show_group(0, False, controls.row)
+        assert not controls.nodes.arrows[0][0].visible
+
+
+def test_a_log_for_rerun_grows_with_the_motion(swinging, friction, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    sizes = []
+    for seconds in (0.5, 2.0):
+        path = tmp_path / f"{seconds}.rrd"
+        write_rerun(path, recorded_scene(swinging, friction, seconds=seconds))
+        assert path.read_bytes().startswith(b"RRF")  # its mark
+        sizes.append(path.stat().st_size)
+    assert sizes[1] > 1.2 * sizes[0]
+    with pytest.raises(InvalidInput, match="exists already"):
+        write_rerun(path, recorded_scene(swinging, seconds=0.5))
+
+
+def test_a_dataset_alone_has_a_page(swinging):
+    bare = Dataset(q=swinging.q, v=swinging.v, u=swinging.u, a=swinging.a, system=swinging.system, time=swinging.time)
+    assert recorded_scene(bare, seconds=0.2).arrows[0].title == "recorded u"
