@@ -1,4 +1,4 @@
-"""Run every benchmark, print, and write `results.json`, the table of `README.md` and docs/performance.md.
+"""Run every benchmark, print, and write `results.json`, the table of `README.md` and docs/benchmarks/performance.md.
 
 All in one process on one thread, but for those that need processes of their own.
 

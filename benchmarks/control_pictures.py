@@ -1,4 +1,4 @@
-"""The pictures of docs/control.md, of one seed: `tracking` over time and as a film, contacts, and an excitation.
+"""The pictures of docs/how-to/control.md, of one seed: `tracking` over time and as a film, contacts, and an excitation.
 
 python -m benchmarks.control_pictures
 """
@@ -20,7 +20,7 @@ from forcegp import MechanicalSystem, PDGravity, Robot
 from forcegp.evaluation import contacts_figure, excitation_figure
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SERIES, SMALL, TRUTH, new_figure, quiet, save_figure
 
-FOLDER = Path(__file__).resolve().parent.parent / "docs" / "control"
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
 SEED, SECONDS, FRAMES_PER_SECOND = 1, 10.0, 12
 SHOWN = ("URDF", "learned")
 

@@ -1,6 +1,6 @@
-"""The pictures of docs/forces.md: what every prior on the unknown force learns from few points, beside the truth.
+"""The pictures of docs/how-to/forces.md: what every prior learns from few points, beside the truth.
 
-python -m benchmarks.force_pictures                          all of them, into docs/forces
+python -m benchmarks.force_pictures                          all of them, into docs/how-to/forces
 python -m benchmarks.force_pictures payload joint-ripple     these
 python -m benchmarks.force_pictures --out elsewhere
 
@@ -331,7 +331,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("pictures", nargs="*", metavar="PICTURE", help=f"of {', '.join(PICTURES)}; default: all")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs" / "forces")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs" / "how-to" / "forces")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     for name in given.pictures or PICTURES:

@@ -1,4 +1,4 @@
-"""Recordings with forces of which the truth is known, and what models of them say (pictures of docs/forces.md)."""
+"""Recordings with known true forces, and what models of them predict (pictures of docs/how-to/forces.md)."""
 
 from __future__ import annotations
 

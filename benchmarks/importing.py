@@ -123,7 +123,7 @@ def imported(kind: str, size: int) -> dict[str, float]:
     KEPT.mkdir(parents=True, exist_ok=True)
     path, flags = LOGS[kind](size)
     out = KEPT / "imported.h5"
-    command = [sys.executable, "-m", "forcegp.cli", "import", path, *flags, "--joints", ",".join(JOINTS), "--json"]
+    command = [sys.executable, "-m", "forcegp", "import", path, *flags, "--joints", ",".join(JOINTS), "--json"]
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     with path.open("rb") as file:  # into the cache of the disk, whose speed is not what is asked
         while file.read(2**20):

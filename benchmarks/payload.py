@@ -31,7 +31,7 @@ from forcegp.analytical import identify_payload
 from forcegp.cli.main import main
 
 SEEDS, SECONDS = range(1, 21), 60.0
-ANSWER = Path(__file__).resolve().parent.parent / "docs" / "auto" / "answer.txt"
+ANSWER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "auto" / "answer.txt"
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "ur5_log.py"
 
 

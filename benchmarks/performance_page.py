@@ -1,4 +1,4 @@
-"""docs/performance.md from results.json: every key with its bound and whether it is kept. A test keeps both equal."""
+"""docs/benchmarks/performance.md from results.json: every key, its bound, and whether it is kept; tested."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 
 from benchmarks.questions import MEANINGS, TITLES
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = Path(__file__).resolve().parent.parent / "docs" / "benchmarks"
 PAGE = DOCS / "performance.md"
 SCALING = DOCS / "performance" / "scaling.json"
 
 INTRODUCTION = """# Performance
 
-Measured, never estimated: this page is written by `make bench` from [benchmarks/results.json](../benchmarks/results.json),
+Measured, never estimated: this page is written by `make bench` from [benchmarks/results.json](../../benchmarks/results.json),
 and never by hand. Every table can be had again by its command. Times are CPU seconds and medians unless it says otherwise;
 ratios compare both sides in the same process on one thread.
 
-What the engines are: [large-data.md](large-data.md); predictors: [control-rate.md](control-rate.md); compiled dynamics:
-[compiled-dynamics.md](compiled-dynamics.md); updates: [incremental.md](incremental.md);
-solvers that were tried and not taken: [solvers.md](solvers.md). No GPU has been measured yet: [gpu.md](gpu.md).
+What the engines are: [large-data.md](../how-to/large-data.md); predictors: [control-rate.md](../how-to/control-rate.md); compiled dynamics:
+[compiled-dynamics.md](../explanation/compiled-dynamics.md); updates: [incremental.md](../how-to/incremental.md);
+solvers that were tried and not taken: [solvers.md](../explanation/solvers.md). No GPU has been measured yet: [gpu.md](../how-to/gpu.md).
 """  # noqa: E501  # one line of the page each
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge}

@@ -25,7 +25,7 @@ TITLES = {
     "backends": "Restarts in several processes",
     "importing": "Importing logs",
 }
-"""The questions in the order in which they are asked, and their headings in docs/performance.md."""
+"""The questions in the order in which they are asked, and their headings in docs/benchmarks/performance.md."""
 
 MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
     "likelihood": {

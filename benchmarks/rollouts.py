@@ -1,6 +1,6 @@
 """How far do rollouts of one fitted model go astray, per integrator, and what do they cost?
 
-Prints the table of docs/rollouts.md: motions of a test trajectory under recorded torques, and one row of samples.
+Prints the table of docs/how-to/rollouts.md: a test trajectory under recorded torques, and one row of samples.
 
     python benchmarks/rollouts.py
 """

@@ -4,7 +4,7 @@ Viscous friction at the tool of `kuka-surface`, hyper-parameters from 250 rows: 
 features) for the exact engine, the prior tool-friction (2 processes on 2) for
 inducing points. Rows are spread evenly over one recording. Every case runs in a process of its own on one thread:
 conditioning and the mean at 100 states; CPU seconds and the rise of peak memory. The slope is that of the last three
-points of log time over log N. Writes docs/performance/scaling.png and scaling.json.
+points of log time over log N. Writes docs/benchmarks/performance/scaling.png and scaling.json.
 
     python -m benchmarks scaling
     python -m benchmarks.scaling exact 400           one case
@@ -29,7 +29,7 @@ from forcegp.data import farthest_rows
 from forcegp.inference import ENGINES, Inducing
 from forcegp.models.structured.refinement import on_all_rows
 
-FOLDER = Path(__file__).resolve().parent.parent / "docs" / "performance"
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "benchmarks" / "performance"
 SEED, SECONDS = 903, 420.0
 CASES: dict[str, tuple[int, ...]] = {
     "exact": (100, 200, 400, 800, 1500, 2500),

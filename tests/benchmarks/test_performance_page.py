@@ -1,4 +1,4 @@
-"""docs/performance.md is what its JSON says, and every number on it has a meaning and a question that measures it."""
+"""docs/benchmarks/performance.md equals its JSON; each number has a meaning and a question that measures it."""
 
 import json
 from importlib.util import find_spec

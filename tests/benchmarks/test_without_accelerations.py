@@ -52,7 +52,7 @@ def test_a_folder_that_is_not_there_is_one_line(repository, tmp_path):
 
 
 def test_the_commands_of_the_page_parse(repository):
-    page = (repository / "docs" / "without-accelerations.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "without-accelerations.md").read_text(encoding="utf-8")
     commands = re.findall(r"^forcegp (.*)$", page, re.MULTILINE)
     assert commands
     for command in commands:

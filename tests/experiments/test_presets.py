@@ -1,21 +1,16 @@
 """The presets, and the page that the documentation shows."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range, number
-from forcegp.experiments.force_experiment import SCENARIOS, ForceExperiment, Trial
-from forcegp.experiments.reproduction import PRESETS, TRIAL_PRESETS, as_csv, experiments_of, page_of, report
+from forcegp.experiments.reproduction import PAPER_PAGE, PRESETS, as_csv, experiments_of, report
 from forcegp.jobs import Job
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-COMMITTED = [
-    preset for preset in PRESETS if preset not in TRIAL_PRESETS and (DOCS / f"{page_of(preset).name}.md").exists()
-]
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "paper"
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -50,49 +45,17 @@ def test_unknown_names_list_the_known():
         experiments_of("papers", "all")
 
 
-@pytest.mark.parametrize("preset", COMMITTED)
-def test_the_committed_page_is_made_of_the_committed_numbers(preset):
-    name = page_of(preset).name
-    folder, experiments = DOCS / name, PRESETS[preset]
+def test_the_committed_page_is_made_of_the_committed_numbers():
+    folder, experiments = DOCS / PAPER_PAGE.name, PRESETS["paper"]
     documents = {
         experiment.name: json.loads((folder / f"{experiment.name}.json").read_text()) for experiment in experiments
     }
-    assert {document["preset"] for document in documents.values()} == {preset}
-    assert (DOCS / f"{name}.md").read_text() == report(experiments, documents)
+    assert {document["preset"] for document in documents.values()} == {"paper"}
+    assert (DOCS / f"{PAPER_PAGE.name}.md").read_text() == report(experiments, documents)
     for experiment in experiments:
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
         assert all((folder / f"{name}.png").exists() for name in document["figures"])
-
-
-def test_the_page_of_the_paper_is_committed():
-    assert "paper" in COMMITTED
-
-
-@pytest.mark.parametrize("preset", ["forces", "forces-smoke"])
-def test_trials_are_told_apart_by_their_names(preset):
-    """One name is one model on one scenario, in all experiments: they share jobs, and no job is of two trials."""
-    known: dict[str, Trial] = {}
-    for experiment in PRESETS[preset]:
-        assert isinstance(experiment, ForceExperiment)
-        trials = experiment.trials()
-        assert len({trial.name for trial in trials}) == len(trials)
-        for trial in trials:
-            first = known.setdefault(trial.name, trial)
-            assert replace(trial, label="") == replace(first, label="")
-            assert {trial.scenario, *trial.tests.values()} <= set(SCENARIOS)
-    assert len({repr(replace(trial, label="")) for trial in known.values()}) == len(known)
-
-
-@pytest.mark.parametrize(
-    "change", [{"points": 3}, {"prior": "joint:inputs=q"}, {"mean": "zero"}, {"region": True}, {"scenario": "tilted"}]
-)
-def test_what_differs_between_trials_shows_in_their_names(change):
-    trial = Trial("one", "viscous", "joint", 10, {"there": "sphere"})
-    assert replace(trial, **change).name != trial.name
-    assert replace(trial, label="other").name == trial.name
-    assert replace(trial, tests={"there": "tilted"}).name != trial.name
-    assert "/" not in replace(trial, prior="joint:inputs=q/v").name.split("/")[1]
 
 
 def test_spreads_and_tables():

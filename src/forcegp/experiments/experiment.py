@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,9 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.metrics import markdown_table
 from forcegp.experiments.data import data_job
-from forcegp.experiments.fits import MODELS
 from forcegp.jobs import Job, JobStore
 
 Row = dict[str, str | int | float | None]
@@ -82,7 +80,7 @@ class Experiment(ABC):
 
     @abstractmethod
     def section(self, summary: Mapping[str, Any]) -> str:
-        """Markdown for docs/reproduction.md, without title and pictures; every number comes from the summary."""
+        """Markdown for docs/paper/reproduction.md, without title and pictures; every number comes from the summary."""
 
     def config(self) -> dict[str, Any]:
         """The configuration as plain JSON values."""
@@ -93,20 +91,3 @@ def stored_arrays(results: JobStore, job: str, file: str) -> dict[str, np.ndarra
     """The arrays that a job kept in an npz file."""
     with np.load(results.place(job) / file) as stored:
         return dict(stored)
-
-
-def heading(label: str) -> str:
-    """In bold, with a capital letter."""
-    return f"**{label[0].upper()}{label[1:]}**"
-
-
-def model_rows(cells: Mapping[str, Sequence[str]], suffix: str = "") -> list[list[str]]:
-    """Model -> cells as rows of a table that begin with the model's label."""
-    return [[f"{MODELS[model].label}{suffix}", *each] for model, each in cells.items()]
-
-
-def model_table(
-    header: Iterable[str], cells: Mapping[str, Sequence[str]], further: Iterable[Sequence[str]] = ()
-) -> str:
-    """A row for every model, then further ones."""
-    return markdown_table(["model", *header], [*model_rows(cells), *further])

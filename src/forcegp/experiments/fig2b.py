@@ -7,9 +7,10 @@ from typing import Any
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, medians
+from forcegp.evaluation.metrics import formatted, in_columns, medians
+from forcegp.evaluation.pages import rendered
 from forcegp.experiments import published
-from forcegp.experiments.experiment import Experiment, Row, model_table
+from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.figures import learning_curves_figure
 from forcegp.experiments.fits import (
     ANALYTICAL,
@@ -99,17 +100,7 @@ class Fig2b(Experiment):
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        by_points = {count: self.settings.of(count) for count in self.points}
-        searches = (
-            f"N = {n}: {each['restarts']} starts, tolerance {each['tolerance']:g}" for n, each in by_points.items()
-        )
-        parts = [
-            f"Medians over seeds (least–largest), {len(self.seeds)} seeds up to N = {self.few_points}, "
-            f"{len(self.seeds_many_points)} above. Training and test rows come from different trajectories. The floor "
-            f"of the MAE against noisy accelerations is {summary['noise_floor']:.4f}. Searches: "
-            + "; ".join(searches)
-            + ". From the second number of points on, the first start is where the fit to fewer points ended."
-        ]
+        tables = []
         for score, heading in SCORES.items():
             rows = []
             for model, curve in summary["curves"].items():
@@ -118,24 +109,26 @@ class Fig2b(Experiment):
                     rows.append([f"{MODELS[model].label}, paper", *cells])
                 label = f"**{MODELS[model].label}, ours**" if score == "mae" else MODELS[model].label
                 rows.append([label, *(formatted(scores[score], DIGITS.get(score, 4)) for scores in curve.values())])
-            parts += [f"**{heading}**", markdown_table(["N", *map(str, self.points)], rows)]
+            tables.append((heading, rows))
         unconverged = [
             f"{MODELS[model].label} N = {count}: {scores['converged']} of {scores['seeds']}"
             for model, curve in summary["curves"].items()
             for count, scores in curve.items()
             if scores["converged"] < scores["seeds"]
         ]
-        many = {
-            model: [formatted(published.MAE_10000.get(model), 2)]
+        many = [
+            [MODELS[model].label, formatted(published.MAE_10000.get(model), 2)]
             + [formatted(scores[name], DIGITS.get(name, 4)) for name in OF_ALL_ROWS]
             for model, scores in summary["all_rows"]["models"].items()
-        }
-        parts += [
-            f"**Models of {summary['all_rows']['rows']} points** (the analytical model has the true parameters; "
-            "fitted, the tool's mass and centre of mass and a viscous friction of every joint are estimated by maximum "
-            "likelihood, but no friction of joints is a friction of the tool)",
-            model_table(("MAE, paper", "MAE", "noise-free", "\\|A a − b\\|", "NLPD", "coverage"), many),
-            "Searches that met their tolerance before the limit of iterations: "
-            + (f"all but ({'; '.join(unconverged)})." if unconverged else "all."),
         ]
-        return "\n\n".join(parts)
+        return rendered(
+            "experiments/fig2b.md.jinja",
+            **summary,
+            seeds=len(self.seeds),
+            few_points=self.few_points,
+            seeds_many_points=len(self.seeds_many_points),
+            searches={count: self.settings.of(count) for count in self.points},
+            tables=tables,
+            many=many,
+            unconverged=unconverged,
+        )

@@ -7,7 +7,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range, number
+from forcegp.evaluation.metrics import formatted, median_and_range, number
+from forcegp.evaluation.pages import rendered
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
 from forcegp.experiments.figures import estimation_figure
@@ -85,43 +86,30 @@ class Fig2c(Experiment):
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        rows = []
+        rows, verdicts = [], []
         for model, means in summary["traces"].items():
             for mean, trace in means.items():
                 last = [number(trace[name][-1]) for name in ERRORS]
                 found = "never" if trace["found_at"] is None else str(trace["found_at"])
                 std = [formatted(trace["std"]["mass"]), " ".join(formatted(trace["std"][axis]) for axis in AXES)]
                 iterations = f"{len(trace['mass_error']) - 1}{'' if trace['converged'] else ' (limit)'}"
-                rows.append([f"{MODELS[model]}, {MEANS[mean]}", iterations, found, *last[:2], *std, last[2]])
-        found = f"within {MASS_BOUND} kg and {1000 * CENTER_BOUND:g} mm from"
-        ends = ["mass error at the end [kg]", "centre error at the end [m]", "standard error of the mass [kg]"]
-        header = ["model", "iterations", found, *ends, "of the centre, x y z [m]", "MAE [rad/s²]"]
+                label = f"{MODELS[model]}, {MEANS[mean]}"
+                rows.append([label, iterations, found, *last[:2], *std, last[2]])
+                verdicts.append((label, trace["verdict"]))
         intervals = [
             [name, formatted(entry["error"]), formatted(entry["std"]), f"{entry['inside']} of {summary['seeds']}"]
             for name, entry in summary["intervals"].items()
         ]
-        start = summary["traces"]["s-gp"]["analytical"]
-        first = ", ".join(f"{value:+.3f}" for value in start["start_center"])
-        parts = [
-            f"From a tool {start['start_mass']:+.2f} kg too heavy and a centre of mass off by ({first}) m, with all "
-            f"kernel hyper-parameters, N = {summary['points']}. The contact point is kinematic: no parameter moves it. "
-            "“With Q_K” the mean holds gravity, Coriolis forces and actuation, and the first iterations are "
-            "Gauss-Newton steps on inverse dynamics. “Without”, no force is known: the Gaussian processes carry them "
-            "all, so that the scale of forces is free, and the tool shows only in M, through H and M⁻¹ Q_b. (The text "
-            "of the paper says Q_K = 0, the legend of its figure “S-GP + analytical mean”.) Standard errors are those "
-            "of the curvature; a dash is an infinite one.",
-            markdown_table(header, rows),
-            *(
-                f"{MODELS[model]}, {MEANS[mean]}: {trace['verdict']}"
-                for model, means in summary["traces"].items()
-                for mean, trace in means.items()
-            ),
-            f"**Are the standard errors right?** S-GP with Q_K on {summary['seeds']} seeds, "
-            f"N = {self.points_interval}; how often the 95 % interval (1.96 standard errors) holds the truth (an "
-            f"infinite one counts as holding it). {summary['converged']} of the searches met their tolerance.",
-            markdown_table(["parameter", "\\|error\\|", "standard error", "truth inside"], intervals),
-        ]
-        return "\n\n".join(parts)
+        return rendered(
+            "experiments/fig2c.md.jinja",
+            **summary,
+            points_interval=self.points_interval,
+            start=summary["traces"]["s-gp"]["analytical"],
+            found=f"within {MASS_BOUND} kg and {1000 * CENTER_BOUND:g} mm from",
+            rows=rows,
+            verdicts=verdicts,
+            estimates=intervals,
+        )
 
 
 def _inside(error: float, std: float | None) -> bool:

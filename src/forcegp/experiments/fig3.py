@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.metrics import interval_coverage, number
+from forcegp.evaluation.metrics import interval_coverage, markdown_table, number
 from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import Experiment, Row, model_table, stored_arrays
+from forcegp.experiments.experiment import Experiment, Row, stored_arrays
 from forcegp.experiments.figures import prediction_window_figure
 from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
@@ -67,14 +67,14 @@ class Fig3(Experiment):
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
         digits = {"mae_noise_free": 4, "mean_std": 4, "coverage_95_noise_free": 3, "coverage_95": 3}
-        cells = {
-            model: [number(scores[name], each) for name, each in digits.items()]
+        header = ("model", "MAE, noise-free", "mean std of the prediction", "truth inside 95 %", "measured inside 95 %")
+        rows = [
+            [MODELS[model].label, *(number(scores[name], each) for name, each in digits.items())]
             for model, scores in summary["models"].items()
-        }
-        header = ("MAE, noise-free", "mean std of the prediction", "truth inside 95 %", "measured inside 95 %")
+        ]
         return (
             f"{summary['points']} training points, seed {summary['seed']}, {self.seconds:g} s of its test trajectory "
-            f"(all joints in the table, three in the figure); rad/s².\n\n{model_table(header, cells)}"
+            f"(all joints in the table, three in the figure); rad/s².\n\n{markdown_table(header, rows)}"
         )
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.metrics import in_columns, markdown_table, median_and_range, number
-from forcegp.experiments.experiment import Experiment, Row, heading, stored_arrays
+from forcegp.evaluation.metrics import in_columns, median_and_range, number
+from forcegp.evaluation.pages import rendered
+from forcegp.experiments.experiment import Experiment, Row, stored_arrays
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.figures import rollouts_figure
 from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series, fit_to_all
@@ -127,51 +128,41 @@ class Fig4(Experiment):
 
     @override
     def section(self, summary: Mapping[str, Any]) -> str:
-        recorded = summary["recorded_constraint"]
         count = self.starts * len(self.seeds)
         seconds = [f"{second:g}" for second in self.seconds]
-        parts = [
-            f"{count} initial states ({self.starts} from the test trajectory of each of {len(self.seeds)} seeds), the "
-            f"recorded torques, symplectic Euler with the recorded step (or the projecting integrator), mean of the "
-            f"posterior; Gaussian processes of {summary['points']} points, the network of all {self.data.rows} "
-            "training rows. Joint error: mean over the joints of |q − q recorded|, median over "
-            "the motions (least–largest). The recorded motion itself is off the surface by "
-            f"{number(recorded['median'])} m in the median and by {number(recorded['largest'])} m at most.",
-            "**How long can an open loop be compared?** The recording comes from a stiff controller; its torques alone "
-            "do not hold the arm. The true dynamics, friction included, under the recorded torques, from the recorded "
-            "states with a tiny random change of the positions:",
-            markdown_table(
-                ["change [rad]", *(f"joint error after {second} s [rad]" for second in seconds)],
-                [[size, *(_error(errors[second]) for second in seconds)] for size, errors in summary["truth"].items()],
-            ),
-            "So the open loop, which the paper shows for 1 s, tests a model only while its own errors have not "
-            f"grown so. “With feedback” adds M(q recorded) (ω² (q recorded − q) + 2 ω (v recorded − v)) with ω = "
-            f"{FREQUENCY:g} rad/s to the recorded torques, the same for every model.",
-        ]
         columns: dict[tuple[str, str], Callable[[Mapping[str, Any]], str]] = {
             ("joint error", "rad"): lambda score: _error(score["joint_error"]),
             ("median \\|c(q)\\|", "m"): lambda score: number(score["constraint"]["median"]),
             ("largest", "m"): lambda score: number(score["constraint_largest"]),
         }
+        tables = []
         for control, title in CONTROLS.items():
             rows = []
             for variant, model, scores in _each(summary["motions"][control]):
                 cells = [cell(scores[second]) for cell in columns.values() for second in seconds]
                 label = f"{MODELS[model].label}, {VARIANTS[variant]}"
                 rows.append([label, *cells, f"{scores['diverged']} of {count}"])
-            header = [f"{name}, {second} s [{unit}]" for name, unit in columns for second in seconds]
-            parts += [heading(title), markdown_table(["model", *header, "diverged"], rows)]
-        parts.append(
-            "A motion that diverges (a joint beyond 100 rad/s) counts as infinitely wrong from there on, and its |c| "
-            "up to there."
+            tables.append((title, rows))
+        twins = {
+            "head": ["change [rad]", *(f"joint error after {second} s [rad]" for second in seconds)],
+            "rows": [[size, *(_error(errors[s]) for s in seconds)] for size, errors in summary["truth"].items()],
+        }
+        header = (f"{name}, {second} s [{unit}]" for name, unit in columns for second in seconds)
+        return rendered(
+            "experiments/fig4.md.jinja",
+            **summary,
+            count=count,
+            starts=self.starts,
+            seeds=len(self.seeds),
+            training_rows=self.data.rows,
+            twins=twins,
+            frequency=FREQUENCY,
+            head=["model", *header, "diverged"],
+            tables=tables,
+            gp=self._first_median(summary, "gp"),
+            mean=self._first_median(summary, "s-gp-mean"),
+            first_second=seconds[0],
         )
-        gp, mean = (self._first_median(summary, model) for model in ("gp", "s-gp-mean"))
-        if gp and mean:
-            parts.append(
-                f"After {seconds[0]} s of open loop the median joint error of S-GP + analytical mean (Baumgarte) is "
-                f"{mean / gp:.3f} of the GP's."
-            )
-        return "\n\n".join(parts)
 
 
 def variants_of(model: str) -> tuple[str, ...]:

@@ -19,14 +19,6 @@ from forcegp.experiments.fig2c import Fig2c
 from forcegp.experiments.fig3 import Fig3
 from forcegp.experiments.fig4 import Fig4
 from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.force_priors import (
-    DataEfficiency,
-    DeepKernel,
-    Friction,
-    OtherLaws,
-    Transfer,
-    UnilateralContact,
-)
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
 
@@ -39,18 +31,11 @@ SMOKE_SEARCH = FitSettings(restarts={"0": 1}, iterations=15, tolerance={"0": 1e-
 # Seeds that served no choice made elsewhere in this project.
 PAPER_SEEDS = (101, 102, 103, 104, 105)
 
-# Seeds that served no choice of a prior or kernel.
-FORCE_SEEDS = (301, 302, 303, 304, 305)
-FORCE_DATA = DataSettings(train_seconds=60.0, rows=400, test_seconds=60.0, every=4)
-FORCE_SMOKE_DATA = DataSettings(train_seconds=5.0, rows=200, test_seconds=5.0, every=12)
-
 PAPER_POINTS = (100, 200, 400, 600, 800, 1000)
 SMOKE_POINTS = (20, 40)
 
 PAPER: dict[str, Any] = {"data": PAPER_DATA, "settings": PAPER_SEARCH}
 SMOKE: dict[str, Any] = {"data": SMOKE_DATA, "settings": SMOKE_SEARCH, "seeds": (101,)}
-FORCES: dict[str, Any] = {"data": FORCE_DATA, "settings": PAPER_SEARCH, "seeds": FORCE_SEEDS}
-FORCES_SMOKE: dict[str, Any] = {"data": FORCE_SMOKE_DATA, "settings": SMOKE_SEARCH, "seeds": (201,)}
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "paper": (
@@ -65,33 +50,23 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
         Fig3(SMOKE_DATA, SMOKE_POINTS, 101, start=1.0, seconds=1.0, settings=SMOKE_SEARCH),
         Fig4(points=SMOKE_POINTS, starts=2, seconds=(0.1, 0.2), **SMOKE),
     ),
-    "forces": (
-        DataEfficiency(points=(10, 20, 50, 100), **FORCES),
-        Friction(points=(200,), **FORCES),
-        OtherLaws(points=(200,), **{**FORCES, "seeds": FORCE_SEEDS[:3]}),
-        Transfer(points=(100,), **FORCES),
-        UnilateralContact(points=(200,), **FORCES),
-        DeepKernel(points=(200,), **FORCES),
-    ),
-    "forces-smoke": (
-        DataEfficiency(points=(10, 20), region_points=SMOKE_POINTS[0], **FORCES_SMOKE),
-        *(
-            kind(points=(20,), **FORCES_SMOKE)
-            for kind in (Friction, OtherLaws, Transfer, UnilateralContact, DeepKernel)
-        ),
-    ),
 }
 
 ALL = "all"
 
 
-def experiments_of(preset: str, figure: str) -> tuple[Experiment, ...]:
-    """One experiment by name, or all. Raises InvalidInput for names that do not exist."""
-    require_known("preset", preset, "forcegp reproduce", PRESETS)
-    experiments = {experiment.name: experiment for experiment in PRESETS[preset]}
+def experiments_of(
+    preset: str,
+    figure: str,
+    presets: Mapping[str, tuple[Experiment, ...]] = PRESETS,
+    program: str = "forcegp reproduce",
+) -> tuple[Experiment, ...]:
+    """One experiment of a preset by name, or all. Raises InvalidInput, with the program's name, for unknown names."""
+    require_known("preset", preset, program, presets)
+    experiments = {experiment.name: experiment for experiment in presets[preset]}
     if figure == ALL:
         return tuple(experiments.values())
-    require_known("figure", figure, "forcegp reproduce", [*experiments, ALL])
+    require_known("figure", figure, program, [*experiments, ALL])
     return (experiments[figure],)
 
 
@@ -104,49 +79,41 @@ figures are written by
 and never by hand; the numbers lie beside it as JSON and CSV. Every pair of training and test trajectory has its own \
 way-points and noise, so no test row is a training row. Medians over seeds come with the least and the largest value."""
 
-FORCES_INTRODUCTION = """What priors on forces are worth: data efficiency, friction as it is, other \
-contacts, and the parts of the posterior. [forces.md](forces.md) explains the priors. This page, its tables and its \
-figures are written by
-
-    {command}
-
-and never by hand; the numbers lie beside it as JSON and CSV. One experiment by its name: `forcegp reproduce NAME \
---preset forces`. Every training and every test trajectory has its own way-points and noise, the noise of the \
-acceleration is 0.1 rad/s², “noise-free” errors are against the acceleration without it. Medians over seeds come with \
-the least and the largest value."""
-
 
 @dataclass(frozen=True)
 class Page:
-    """`name` is that of the file and of the folder beside it; `introduction` holds `{command}`."""
+    """What experiments are published on: the command that writes it, for messages, and what stands at its top.
 
+    `name` is that of the file and of the folder beside it; `introduction` holds `{command}`.
+    """
+
+    program: str
     name: str
     title: str
     introduction: str
 
-
-PAPER_PAGE = Page("reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
-FORCES_PAGE = Page("force-priors", "Force priors: results", FORCES_INTRODUCTION)
-TRIAL_PRESETS = ("smoke", "forces-smoke")  # presets that test the machinery; their numbers mean nothing for the models
-
-
-def page_of(preset: str) -> Page:
-    """The page of the results of that preset."""
-    return FORCES_PAGE if preset.startswith("forces") else PAPER_PAGE
+    def file(self, experiments: Sequence[Experiment]) -> str:
+        """`reproduction.md` for all experiments, `fig3.md` for one: a part does not take the place of the whole."""
+        return f"{experiments[0].name}.md" if len(experiments) == 1 else f"{self.name}.md"
 
 
-def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]]) -> str:
+PAPER_PAGE = Page("forcegp reproduce", "reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
+TRIAL = "smoke"  # the preset that tests the machinery; its numbers mean nothing for the models
+
+
+def report(
+    experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]], page: Page = PAPER_PAGE
+) -> str:
     """Markdown from the documents of the experiments: one section for each, then the times."""
     preset = documents[experiments[0].name]["preset"]
-    page = page_of(preset)
     parts = [f"# {page.title}", page.introduction.format(command=documents[experiments[0].name]["command"])]
-    if preset in TRIAL_PRESETS:
+    if preset == TRIAL:
         parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers mean nothing for the models.**")
     for experiment in experiments:
         document = documents[experiment.name]
         parts.append(f"## {experiment.title}")
         parts += [f"![{experiment.title}]({page.name}/{name}.png)" for name in document["figures"]]
-        parts.append(experiment.section(document["summary"]))
+        parts.append(experiment.section(document["summary"]).strip())
         parts += _warnings(document["warnings"])
     seconds = {name: value for document in documents.values() for name, value in document["cpu_seconds"].items()}
     machines = sorted({machine for document in documents.values() for machine in document["machines"]})
@@ -180,32 +147,30 @@ def _times(machine: str, times: Mapping[str, float]) -> str:
     return f"{text}\n\n{markdown_table(['jobs', 'number', 'longest [CPU s]', 'all [CPU s]'], rows)}"
 
 
-KIND = "forcegp reproduce"
-
-
 def reproduce(
     experiments: Sequence[Experiment],
     preset: str,
     out: Path,
     *,
     command: str,
+    page: Page = PAPER_PAGE,
     docs: Path | None = None,
     backend: Backend | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
-    Writes the page (`page_name`) and, in the folder of its name (`page_of`), `<name>.json`, `<name>.csv` and the
-    figures as PNG, into `out` and, if given, into `docs`, too. `command` is the command that the page names as its
+    Writes the page (`Page.file`) and, in the folder of its name, `<name>.json`, `<name>.csv` and the figures as PNG,
+    into `out` and, if given, into `docs`, too. `command` is the command that the page names as its
     source. Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and
     as `JobStore.open` and `run_jobs`.
     """
     for experiment in experiments:
         experiment.require_possible()
-    results = JobStore.open(out, KIND, {"preset": preset})
+    results = JobStore.open(out, page.program, {"preset": preset})
     roots = (out,) if docs is None else (out, docs)
     for root in roots:
-        _make_folder(root / page_of(preset).name)
+        _make_folder(root / page.name)
     jobs = {job.name: job for experiment in experiments for job in experiment.jobs()}
     run_jobs(results, list(jobs.values()), backend, progress)
     documents, pictures = {}, {}
@@ -215,7 +180,7 @@ def reproduce(
         pictures |= figures
         stored = {job.name: results.load(job.name) for job in experiment.jobs()}
         documents[experiment.name] = {
-            "kind": KIND,
+            "kind": page.program,
             "forcegp_version": __version__,
             "preset": preset,
             "command": command,
@@ -227,20 +192,15 @@ def reproduce(
             "summary": summary,
         }
     for root in roots:
-        beside = root / page_of(preset).name
+        beside = root / page.name
         for name, figure in pictures.items():
             save_figure(figure, beside / f"{name}.png")
         for experiment in experiments:
             document = documents[experiment.name]
             write_json(beside / f"{experiment.name}.json", document)
             write_text(beside / f"{experiment.name}.csv", as_csv(experiment.rows(document["summary"])))
-        write_text(root / page_name(experiments, preset), report(experiments, documents))
+        write_text(root / page.file(experiments), report(experiments, documents, page))
     return {name: document["summary"] for name, document in documents.items()}
-
-
-def page_name(experiments: Sequence[Experiment], preset: str) -> str:
-    """`reproduction.md` for all experiments, `fig3.md` for one: a part does not take the place of the whole."""
-    return f"{experiments[0].name}.md" if len(experiments) == 1 else f"{page_of(preset).name}.md"
 
 
 def _make_folder(folder: Path) -> None:

@@ -3,12 +3,8 @@
 import io
 
 import pytest
-from tests.experiments.stored_jobs import keep
-
-from forcegp.evaluation.metrics import median_and_range
-from forcegp.experiments.experiment import DataSettings
-from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.force_experiment import (
+from benchmarks.force_priors.experiments import Transfer, UnilateralContact
+from benchmarks.force_priors.trials import (
     TEST_SEED,
     ForceExperiment,
     Trial,
@@ -17,7 +13,11 @@ from forcegp.experiments.force_experiment import (
     score_table,
     trial_name,
 )
-from forcegp.experiments.force_priors import Transfer, UnilateralContact
+from tests.experiments.stored_jobs import keep
+
+from forcegp.evaluation.metrics import median_and_range
+from forcegp.experiments.experiment import DataSettings
+from forcegp.experiments.fits import FitSettings
 from forcegp.jobs import JobStore
 
 DATA = DataSettings(train_seconds=3.0, rows=50, test_seconds=2.0, every=5)

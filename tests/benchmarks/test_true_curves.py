@@ -18,7 +18,7 @@ SPEED = np.linspace(0.01, 1.2, 40)  # m/s
 @pytest.fixture
 def curves(motion):
     """The true curves of a prior, fitted to rows that say to come from a simulation with these changes."""
-    from forcegp.experiments.force_jobs import true_curves
+    from benchmarks.force_priors.jobs import true_curves
 
     def of(prior, **changes):
         config = dataclasses.asdict(KukaSurfaceConfig(seconds=2, seed=1, **changes))
@@ -89,7 +89,7 @@ def test_what_the_simulation_did_not_follow_has_no_law(curves, prior, changes):
 
 
 def test_models_without_forces_have_no_law(motion):
-    from forcegp.experiments.force_jobs import true_curves
+    from benchmarks.force_priors.jobs import true_curves
 
     data = motion.rows(slice(0, None, 60))
     assert true_curves(IndependentGP(data.system).fit(data, options=OptimizerOptions(iterations=0))) == {}

@@ -8,24 +8,24 @@ from typing import Any
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.evaluation.metrics import formatted, markdown_table, medians
-from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
-from forcegp.experiments import published
-from forcegp.experiments.experiment import heading
-from forcegp.experiments.figures import draw_range
-from forcegp.experiments.force_experiment import (
+from benchmarks.force_priors.jobs import BLACK_BOX, KNOWN_PHYSICS, LAWS, MODEL, load
+from benchmarks.force_priors.trials import (
     LABELS,
     ForceExperiment,
     Trial,
     dots_figure,
+    heading,
     only_test,
     plain_ticks,
     score_table,
     trial_name,
     trials_on,
 )
-from forcegp.experiments.force_jobs import BLACK_BOX, KNOWN_PHYSICS, LAWS, MODEL, load
+from forcegp.evaluation import friction_curves_figure, normal_force_figure
+from forcegp.evaluation.metrics import formatted, markdown_table, medians
+from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
+from forcegp.experiments import published
+from forcegp.experiments.figures import draw_range
 from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 

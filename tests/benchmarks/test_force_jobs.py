@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.force_priors import jobs as force_jobs
 from tests.experiments.oracle import Tool
 from tests.experiments.stored_jobs import keep
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
-from forcegp.experiments import force_jobs
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.models import IndependentGP, StructuredGP, load_posterior
@@ -123,7 +123,7 @@ def test_black_boxes_are_scored_on_accelerations_alone(rubbing):
 
 
 def test_curves_are_held_against_their_laws(rubbing):
-    from forcegp.experiments.force_jobs import true_curves
+    from benchmarks.force_priors.jobs import true_curves
 
     posterior, _ = rubbing
     found, laws = force_jobs.curve_scores(posterior), true_curves(posterior)

@@ -50,15 +50,16 @@ SCENARIOS = {name: fields for name, (_, fields) in _SCENARIOS.items()}
 """Name -> fields of `KukaSurfaceConfig`."""
 
 LABELS = {name: label for name, (label, _) in _SCENARIOS.items()}  # what pages call them
-TASKS = "forcegp.experiments.force_jobs"
+TASKS = "benchmarks.force_priors.jobs"
 
 
 @dataclass(frozen=True)
 class Trial:
     """One model on one scenario.
 
-    prior: expression of `forcegp.priors.named_prior`, or a model of `force_jobs`; tests: label -> scenario that the
-    model is scored on, under that scenario's contacts; region: train at tool x < 0, test at x > 0.1 m.
+    prior: expression of `forcegp.priors.named_prior`, or a model of `benchmarks.force_priors.jobs`
+    tests: label -> scenario that the model is scored on, under that scenario's contacts
+    region: train at tool x < 0, test at x > 0.1 m
     """
 
     label: str
@@ -231,3 +232,8 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(subs=steps))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def heading(label: str) -> str:
+    """In bold, with a capital letter."""
+    return f"**{label[0].upper()}{label[1:]}**"
