@@ -28,6 +28,8 @@ factor = 3
 """,
     "only_types.py": "T = int\n",
     "unrelated.py": "x = 1\n",
+    "compiled.py": "TEXT = 'loop.c'\n",
+    "loop.c": "int one;\n",
     "lazy/__init__.py": """
 import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
@@ -136,3 +138,9 @@ def test_equal_in_every_process():
     code = "from forcegp.jobs import code_digest; print(code_digest('forcegp.experiments.fits'))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == code_digest("forcegp.experiments.fits") + "\n"
+
+
+def test_c_text_beside_a_module_counts_with_it(toolbox):
+    before = now("toolbox.compiled")
+    (toolbox / "loop.c").write_text("int two;\n")
+    assert now("toolbox.compiled") != before

@@ -230,7 +230,7 @@ def test_bounds_themselves_are_allowed(train):
 
 
 def test_defaults_are_those_of_the_papers(train):
-    """Rath et al. (2021), section 5; the ensemble is what docs/validation.md compares with."""
+    """Rath et al. (2021), section 5; the ensemble is what docs/how-to/validation.md compares with."""
     network, ensemble = NeuralNetwork(train.system), NetworkEnsemble(train.system)
     assert (network.width, network.steps, network.batch, network.rate) == (80, 5000, 1000, 0.01)
     assert (ensemble.members, ensemble.width, ensemble.depth, ensemble.beta) == (5, 128, 3, 0.5)

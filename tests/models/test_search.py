@@ -32,7 +32,7 @@ def from_place(index, before=(), progress=None, *, options, places=(0.5, 4.5, 5.
 
 @pytest.mark.parametrize(("model", "fraction"), [(StructuredGP, 0.8), (IndependentGP, 0.7)])
 def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
-    """With the 154 parameters of seven joints less than half of them (docs/performance.md); here there are 30."""
+    """With 154 parameters of seven joints less than half (docs/benchmarks/performance.md); here there are 30."""
     fast = model(train.system).fit(train, seed=1)
     slow = model(train.system).fit(train, seed=1, options=UNTIL_CONVERGED)
     assert fast.result.evaluations <= fraction * slow.result.evaluations

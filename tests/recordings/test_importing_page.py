@@ -1,4 +1,4 @@
-"""The example of docs/importing.md runs as it stands, its commands are commands, and its mapping is one."""
+"""The example of docs/how-to/importing.md runs as it stands, its commands are commands, and its mapping is one."""
 
 import re
 import shlex
@@ -14,7 +14,7 @@ from forcegp.recordings.mapping import UNITS
 
 @pytest.fixture(scope="module")
 def page(repository):
-    return (repository / "docs" / "importing.md").read_text(encoding="utf-8")
+    return (repository / "docs" / "how-to" / "importing.md").read_text(encoding="utf-8")
 
 
 def test_the_example_runs(page, tmp_path):
@@ -42,5 +42,5 @@ def test_the_mapping_is_one(page, tmp_path):
 
 def test_every_unit_is_on_the_page(page):
     (row,) = re.findall(r"\| `--unit` \|.*\| (.*) \|\n", page)
-    told = {part.split(": ")[0]: set(part.split(": ")[1].split(". ")[0].split(", ")) for part in row.split("; ")}
+    told = {part.split(": ")[0]: set(part.split("`")[1].split(", ")) for part in row.split("; ")}
     assert told == {quantity: set(units) for quantity, units in UNITS.items()}

@@ -9,92 +9,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from forcegp.codegen.c_text import c_text
 from forcegp.codegen.graph import LEAVES, Graph
-from forcegp.codegen.vector_math import LANE_FUNCTIONS
+from forcegp.codegen.vector_math import lane_functions
 
 STATEMENTS = 500  # per part
 LONG_PART = 2500  # of dynamics, whose values are used again soon: 10-20 % faster, compiled as fast
 
-SCALAR_HEAD = """\
-typedef double real;
-#define LANES 1
-#define AT(x, k) (x)
-#define R(c) (c)
-#define LOAD(p) (*(p))
-#define STORE(p, x) (*(p) = (x))
-#define TOTAL(x) (x)
-#define r_exp exp
-#define r_tanh tanh
-#define r_asinh asinh
-#define r_sqrt sqrt
-#if defined(__GNUC__)
-#define APART __attribute__((noinline, unused))
-#else
-#define APART
-#endif
-"""
-ROWS = """\
-#if LANES >= 4
-typedef double quad __attribute__((vector_size(32), aligned(8), may_alias));
-typedef long long quad_bits __attribute__((vector_size(32)));
-#if defined(__clang__)
-#define MIX(x, y, ...) __builtin_shufflevector(x, y, __VA_ARGS__)
-#else
-#define MIX(x, y, ...) __builtin_shuffle(x, y, (quad_bits){__VA_ARGS__})
-#endif
-/* transposes; the last four columns may overlap those before */
-#define EACH_TILE for (int k = 0; k < LANES; k += 4) \\
-  for (int j = 0, c = 0; j < size; j += 4, c = j + 4 < size ? j : size - 4)
-INLINE quad_bits turn(const double *from, long above, double *to, long below) { /* true where finite */
-#define ROW(l) (*(const quad *)(from + l * above))
-  const quad a = MIX(ROW(0), ROW(1), 0, 4, 2, 6), b = MIX(ROW(0), ROW(1), 1, 5, 3, 7);
-  const quad c = MIX(ROW(2), ROW(3), 0, 4, 2, 6), d = MIX(ROW(2), ROW(3), 1, 5, 3, 7);
-  *(quad *)to = MIX(a, c, 0, 1, 4, 5);
-  *(quad *)(to + below) = MIX(b, d, 0, 1, 4, 5);
-  *(quad *)(to + 2 * below) = MIX(a, c, 2, 3, 6, 7);
-  *(quad *)(to + 3 * below) = MIX(b, d, 2, 3, 6, 7);
-  return (a - a == 0.0) & (b - b == 0.0) & (c - c == 0.0) & (d - d == 0.0);
-}
-#define WHOLE(stride) (live == LANES && size >= 4 && (stride))
-#endif
-/* rows of `stride` numbers to lanes; those that no state lives in repeat the last. Returns what is not finite */
-static APART int rows_read(const double *p, long stride, int size, long live, real *x) {
-  int found = 0;
-#if LANES >= 4
-  if (WHOLE(stride)) {
-    quad_bits finite = ~(quad_bits){0};
-    EACH_TILE finite &= turn(p + k * stride + c, stride, (double *)(x + c) + k, LANES);
-    return !(finite[0] & finite[1] & finite[2] & finite[3]);
-  }
-#endif
-  for (int k = 0; k < LANES; k++) for (int j = 0; j < size; j++) {
-    const double value = p[(k < live ? k : live - 1) * stride + j];
-    AT(x[j], k) = value; found |= !(value - value == 0.0);
-  }
-  return found;
-}
-static APART int rows_write(const real *y, int size, long live, double *p, long stride) {
-  int found = 0;
-#if LANES >= 4
-  if (WHOLE(stride)) {
-    quad_bits finite = ~(quad_bits){0};
-    EACH_TILE finite &= turn((const double *)(y + c) + k, LANES, p + k * stride + c, stride);
-    return !(finite[0] & finite[1] & finite[2] & finite[3]);
-  }
-#endif
-  for (int k = 0; k < live; k++) for (int j = 0; j < size; j++) {
-    const double value = AT(y[j], k);
-    p[k * stride + j] = value; found |= !(value - value == 0.0);
-  }
-  return found;
-}
-static APART void rows_add(const real *y, int size, long live, real *sum) {
-  for (int j = 0; j < size; j++) {
-    if (live == LANES) sum[j] += y[j];
-    else for (int k = 0; k < live; k++) AT(sum[j], k) += AT(y[j], k);
-  }
-}
-"""
+ROWS = c_text(__name__, "rows.h")
 """Between rows of numbers, one per state, and lanes."""
 
 SCALAR_NAMES = {"absolute": "fabs", "power": "pow"}
@@ -207,8 +129,8 @@ def write_program(program: Program, lanes: int, statements: int = LONG_PART) -> 
 def head(lanes: int) -> str:
     """What stands before all functions: the type `real`, and functions on it."""
     if lanes == 1:
-        return "#include <math.h>\n" + SCALAR_HEAD
-    return LANE_FUNCTIONS.replace("@LANES@", str(lanes))
+        return "#include <math.h>\n" + c_text(__name__, "scalar.h")
+    return lane_functions(lanes)
 
 
 def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str, int]] | None = None) -> str:

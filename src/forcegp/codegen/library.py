@@ -1,8 +1,8 @@
 """Programs made at run time: C text compiled, kept in a folder, loaded by later processes, called with tensors.
 
 A file of the folder is named by a hash of everything that decides what is in it. Loading it runs its code with the
-rights of the process, so it must be out of reach of others (`own_file`). docs/compiled-dynamics.md says what is
-trusted, and why this is C of our own and not `torch.compile`.
+rights of the process, so it must be out of reach of others (`own_file`). What is trusted, and why
+this is C of our own and not `torch.compile`: docs/explanation/compiled-dynamics.md.
 """
 
 import ctypes

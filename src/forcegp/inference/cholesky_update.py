@@ -1,8 +1,8 @@
 """Learning from more rows without starting again: the exact posterior with rows appended or left out.
 
 Rows are appended by the block Cholesky factorisation of T in deflated coordinates (Golub & Van Loan 2013, section
-4.2.9; docs/incremental.md). What a row is worth is the Kullback-Leibler divergence from the posterior without it to the
-one with it. With P = T^-1 and alpha = P t it needs the row's own blocks only,
+4.2.9; docs/how-to/incremental.md). What a row is worth is the Kullback-Leibler divergence from the posterior without it
+to the one with it. With P = T^-1 and alpha = P t it needs the row's own blocks only,
 
     1/2 (tr P_ii - log|P_ii| - r + alpha_i^T (P_ii^-1 - I) alpha_i),
 

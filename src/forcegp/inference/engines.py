@@ -35,10 +35,10 @@ FEW_FEATURES = 3
 """Features of a latent up to which inducing points can be expected to leave nothing out."""
 
 MANY_POINTS = 1000
-"""Inducing points of a latent with more features: measured, docs/large-data.md."""
+"""Inducing points of a latent with more features: measured, docs/how-to/large-data.md."""
 
 ENOUGH = 0.02
-"""Prior variance of a row in units of its noise that inducing points may leave out: measured, docs/large-data.md."""
+"""Prior variance of a row in units of its noise that inducing points may leave out: docs/how-to/large-data.md."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.codegen.c_text import c_text, filled
 from forcegp.codegen.c_writer import c_value
 from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
@@ -32,21 +33,6 @@ PADDING = 8
 BLOCK = 64
 """Centres whose kernels are held at once."""
 
-ROOTS = """
-static APART void NAME_roots(const double *t, const double *F, const double *z, double *restrict P) {
-  const long n = (long)t[0]; double k[LATENTS * BLOCK];
-  for (long first = 0; first < n; first += BLOCK) {
-    const long count = n - first < BLOCK ? n - first : BLOCK;
-    NAME_kernels(t, z, first, count, k);
-    for (long g = 0; g < LATENTS; g++) for (long j = 0; j < count; j += 4) {
-      const double *f = F + (g * n + first + j) * RANK, *w = k + g * BLOCK + j; double *p = P + g * RANK;
-      for (long r = 0; r < RANK; r += LANES)
-        STORE(p + r, LOAD(p + r) + ((w[0] * LOAD(f + r) + w[1] * LOAD(f + RANK + r))
-                                    + (w[2] * LOAD(f + 2 * RANK + r) + w[3] * LOAD(f + 3 * RANK + r))));
-    }
-  }
-}
-"""
 
 PairFunction = Callable[[Tensor, Tensor], Tensor]
 """(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair."""
@@ -191,9 +177,10 @@ class KernelSum:
     def roots_source(self, lanes: int, rank: int) -> str:
         """`NAME_roots(t, F, z, P)`: P (G, rank) += k(z, Z) F for one state, F (G, N filled up, rank)."""
         kernels = self._loop(f"{self.name}_kernels", list(self.kernels), [], lanes, True)
-        return kernels + ROOTS.replace("NAME", self.name).replace("RANK", str(rank)).replace(
-            "LATENTS", str(len(self.latents))
-        ).replace("BLOCK", str(BLOCK))
+        return kernels + filled(
+            c_text(__name__, "kernel_roots.c"),
+            {"NAME": self.name, "RANK": rank, "LATENTS": len(self.latents), "BLOCK": BLOCK},
+        )
 
     def _loop(self, name: str, made: list[int], owner: list[int], lanes: int, one: bool) -> str:
         """One state and several centres at a time with `one`, else several states."""

@@ -2,12 +2,13 @@
 
 import importlib.metadata
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import head, write_function
 from forcegp.data import units_for
 from forcegp.inference.one_input_calls import OneInputCall
@@ -69,7 +70,8 @@ class CFiles:
     def write(self, folder: Path, source: str | None, said: str, checks: Sequence[Check]) -> None:
         """All files; `said` is how good the program is."""
         start = [", ".join(map(repr, x.tolist())) for x in np.split(checks[0].states[0], 3)]
-        program, stepped = _sections("model.c"), STEPS[self.integrator].replace("PROGRAM", self._stepped)
+        program = sections(__name__, "exported_c/model.c")
+        stepped = STEPS[self.integrator].replace("PROGRAM", self._stepped)
         words: dict[str, object] = {"NAME": self.name, "NV": self.code.nv, "DT": self.dt, "TITLE": self._title}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
@@ -78,17 +80,20 @@ class CFiles:
         words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
         if "covariance" in self.kinds:
             words["GIVEN"] = len(self.code.program("covariance").nodes)
-        words = {word: _filled(str(value), words) for word, value in words.items()}
-        functions = _filled("".join(program[kind] for kind in self.kinds), words)
+        words = {word: filled(str(value), words) for word, value in words.items()}
+        functions = filled("".join(program[kind] for kind in self.kinds), words)
         prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
         words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
-        parts = [_filled(program["head"], words), *self._program(), _filled(program["calls"], words), functions]
-        files = {f"{self.name}.c": "\n".join(parts), f"{self.name}.h": _filled(_template("model.h"), words)}
+        parts = [filled(program["head"], words), *self._program(), filled(program["calls"], words), functions]
+        files = {
+            f"{self.name}.c": "\n".join(parts),
+            f"{self.name}.h": filled(c_text(__name__, "exported_c/model.h"), words),
+        }
         for form in ("external", "acados") if self.dt is not None else ("external",):
-            found = _sections(f"{form}.c")
+            found = sections(__name__, f"exported_c/{form}.c")
             chosen = "".join(found[kind] for kind in ("head", *self.kinds) if kind in found)
-            files[f"{self.name}_{form}.c"] = _filled(chosen, words)
-        files |= {file: _filled(_template(file), words) for file in ALIKE}
+            files[f"{self.name}_{form}.c"] = filled(chosen, words)
+        files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
         for file, content in files.items():
             (folder / file).write_text(content, encoding="ascii")
 
@@ -159,20 +164,6 @@ class CFiles:
                 lines.append(f'compare("{check.function}", r{j}, {what}_{j}[k], {wanted.shape[1]}, {bound!r});')
             calls.append(f"  for (int k = 0; k < {len(states)}; k++) {{\n    " + "\n    ".join(lines) + "\n  }")
         return "\n".join(arrays), "\n".join(calls)
-
-
-def _template(file: str) -> str:
-    return (Path(__file__).parent / "exported_c" / file).read_text(encoding="ascii")
-
-
-def _sections(file: str) -> dict[str, str]:
-    """The parts of a template, by the names above them."""
-    return dict(re.findall(r"^//// (\S+)\n(.*?)(?=^////|\Z)", _template(file), re.MULTILINE | re.DOTALL))
-
-
-def _filled(text: str, words: Mapping[str, object]) -> str:
-    """The text with what stands for every `@WORD@`."""
-    return re.sub("@([A-Z_]+)@", lambda found: str(words[found[1]]), text)
 
 
 def _numbers(values: Sequence[float]) -> str:

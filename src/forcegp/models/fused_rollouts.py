@@ -14,155 +14,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.codegen.c_text import c_text, sections
 from forcegp.codegen.c_writer import ROWS
 from forcegp.codegen.library import in_threads
 from forcegp.errors import NumericalWarning
 from forcegp.integration.integrators import Integrator
 from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate, warn_of_divergence
 
-STEPS = {
-    "symplectic-euler": """
-      PROGRAM(t, live, x, y);
-      for (int j = 0; j < N; j++) { a[j] = y[j]; v1[j] = x[N + j] + dt * y[j]; q1[j] = x[j] + dt * v1[j]; }
-""",
-    "rk4": """
-      const double c[4] = {0.0, 0.5 * dt, 0.5 * dt, dt}, b[4] = {dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0};
-      for (int j = 0; j < N; j++) { q0[j] = q1[j] = x[j]; v0[j] = v1[j] = x[N + j]; y[j] = R(0.0); }
-      for (int s = 0; s < 4; s++) {
-        for (int j = 0; j < N; j++) { x[j] = q0[j] + c[s] * x[N + j]; x[N + j] = v0[j] + c[s] * y[j]; }
-        PROGRAM(t, live, x, y);
-        for (int j = 0; j < N; j++) {
-          if (!s) a[j] = y[j];
-          q1[j] += b[s] * x[N + j]; v1[j] += b[s] * y[j];
-        }
-      }
-""",
-    "implicit-midpoint": """
-      const double h = 0.5 * dt;
-      double length[LANES]; int done[LANES];
-      for (int j = 0; j < N; j++) { q0[j] = x[j]; v0[j] = m[j] = x[N + j]; d[j] = R(0.0); }
-      for (int k = 0; k < LANES; k++) { length[k] = 1.0; done[k] = 0; }
-      PROGRAM(t, live, x, y);
-      for (int j = 0; j < N; j++) a[j] = y[j];
-      for (int round = 0; round < ROUNDS; round++) {
-        for (int j = 0; j < N; j++) { x[j] = q0[j] + h * m[j]; x[N + j] = m[j]; }
-        PROGRAM(t, live, x, y);
-        int left = 0;
-        for (int k = 0; k < live; k++) {
-          double J[N][N], r[N], turned = 0.0, size = 0.0, step = 0.0, all = 0.0;
-          if (done[k]) continue;
-          for (int i = 0; i < N; i++) {
-            r[i] = -(AT(m[i], k) - AT(v0[i], k) - h * AT(y[i], k));
-            for (int j = 0; j < N; j++)
-              J[i][j] = (i == j) - h * (AT(y[N + 3 * N * i + N + j], k) + h * AT(y[N + 3 * N * i + j], k));
-          }
-          for (int p = 0; p < N; p++) {
-            int best = p;
-            for (int i = p + 1; i < N; i++) if (fabs(J[i][p]) > fabs(J[best][p])) best = i;
-            for (int j = 0; j < N; j++) { const double z = J[p][j]; J[p][j] = J[best][j]; J[best][j] = z; }
-            const double z = r[p]; r[p] = r[best]; r[best] = z;
-            for (int i = p + 1; i < N; i++) {
-              const double w = J[i][p] / J[p][p];
-              for (int j = p; j < N; j++) J[i][j] -= w * J[p][j];
-              r[i] -= w * r[p];
-            }
-          }
-          for (int i = N - 1; i >= 0; i--) {
-            for (int j = i + 1; j < N; j++) r[i] -= J[i][j] * r[j];
-            r[i] /= J[i][i];
-          }
-          for (int i = 0; i < N; i++) {
-            turned += r[i] * AT(d[i], k); size += AT(d[i], k) * AT(d[i], k);
-            step += r[i] * r[i]; all += AT(m[i], k) * AT(m[i], k);
-          }
-          if (turned < -0.5 * size && length[k] > 1e-4) { /* beyond the root: go back on the same step */
-            const double shorter = fmin(fmax(1.0 / (1.0 - turned / size), 0.1), 0.5) * length[k];
-            for (int i = 0; i < N; i++) AT(m[i], k) += (shorter - length[k]) * AT(d[i], k);
-            length[k] = shorter;
-          } else {
-            for (int i = 0; i < N; i++) { AT(d[i], k) = r[i]; AT(m[i], k) += r[i]; }
-            length[k] = 1.0;
-            done[k] = sqrt(step) <= 1e-9 * (1.0 + sqrt(all));
-          }
-          left |= !done[k];
-        }
-        if (!left) break;
-      }
-      for (int j = 0; j < N; j++) { q1[j] = q0[j] + dt * m[j]; v1[j] = 2.0 * m[j] - v0[j]; }
-      for (int k = 0; k < live; k++) if (!done[k]) AT(v1[0], k) = NAN;
-""",
-}
+STEPS = sections(__name__, "rollout_steps.c")
 """One step in C: from x = [q, v, u] to q1, v1, with the acceleration a at its beginning."""
-
-LOOP = """
-int evaluate(long first, long last, const double *const *t, long steps, double dt, const double *start_q,
-             const double *start_v, const double *u, double *Q, double *V, double *A, long long *ended) {
-  enum {N = JOINTS, ROUNDS = 60};
-  real x[3 * N], y[OUTPUTS], q1[N], v1[N], a[N], q0[N], v0[N], m[N], d[N];
-  (void)q0; (void)v0; (void)m; (void)d;
-  for (long i = first; i < last; i += LANES) {
-    const long live = last - i < LANES ? last - i : LANES;
-    int going = 0;
-    for (int k = 0; k < LANES; k++) {
-      const long row = k < live ? i + k : last - 1;
-      for (int j = 0; j < N; j++) {
-        AT(x[j], k) = start_q[row * N + j];
-        AT(x[N + j], k) = start_v[row * N + j];
-        if (k < live) { Q[row * (steps + 1) * N + j] = AT(x[j], k); V[row * (steps + 1) * N + j] = AT(x[N + j], k); }
-      }
-      if (k < live) { ended[row] = -1; going |= 1 << k; }
-    }
-    long stopped = 0;
-    for (long s = 0; s < steps && going; s++) {
-      stopped = s + 1;
-      rows_read(u + (i * steps + s) * N, steps * N, N, live, x + 2 * N);
-      real qs[N], vs[N];
-      for (int j = 0; j < N; j++) { qs[j] = x[j]; vs[j] = x[N + j]; }
-      { STEP }
-      real fast = R(0.0), none = R(0.0);
-      for (int j = 0; j < N; j++) { fast += v1[j] * v1[j]; none += q1[j] - q1[j]; }
-      int usual = going == (1 << live) - 1;
-      for (int k = 0; k < live; k++) usual &= AT(fast, k) <= LIMIT * LIMIT && AT(none, k) == 0.0;
-      if (usual) {
-        for (int j = 0; j < N; j++) { x[j] = q1[j]; x[N + j] = v1[j]; }
-        rows_write(q1, N, live, Q + (i * (steps + 1) + s + 1) * N, (steps + 1) * N);
-        rows_write(v1, N, live, V + (i * (steps + 1) + s + 1) * N, (steps + 1) * N);
-        rows_write(a, N, live, A + (i * steps + s) * N, steps * N);
-        continue;
-      }
-      for (int k = 0; k < live; k++) {
-        double *to_q = Q + ((i + k) * (steps + 1) + s + 1) * N, *to_v = V + ((i + k) * (steps + 1) + s + 1) * N;
-        int finite = 1, slow = 1;
-        const int before = going >> k & 1;
-        for (int j = 0; j < N; j++) {
-          finite &= AT(q1[j], k) - AT(q1[j], k) == 0.0 && AT(v1[j], k) - AT(v1[j], k) == 0.0;
-          slow &= fabs(AT(v1[j], k)) <= LIMIT;
-          A[((i + k) * steps + s) * N + j] = before ? AT(a[j], k) : NAN;
-        }
-        if (before && !(finite && slow)) { going &= ~(1 << k); ended[i + k] = finite ? s + 1 : -2 - (s + 1); }
-        for (int j = 0; j < N; j++) {
-          const int on = going >> k & 1;
-          AT(x[j], k) = on ? AT(q1[j], k) : AT(qs[j], k); /* where it stopped the program can be asked */
-          AT(x[N + j], k) = on ? AT(v1[j], k) : AT(vs[j], k);
-          to_q[j] = on ? AT(q1[j], k) : NAN;
-          to_v[j] = on ? AT(v1[j], k) : NAN;
-        }
-      }
-    }
-    for (int k = 0; k < live; k++) for (long s = stopped; s < steps; s++) for (int j = 0; j < N; j++) {
-      Q[((i + k) * (steps + 1) + s + 1) * N + j] = V[((i + k) * (steps + 1) + s + 1) * N + j] = NAN;
-      A[((i + k) * steps + s) * N + j] = NAN;
-    }
-  }
-  return 0;
-}
-"""
 
 
 def loop_source(method: str, function: str, nv: int) -> str:
     """The C function `evaluate` of a loop whose steps call `function`, which for implicit ones gives slopes, too."""
     outputs = nv + 3 * nv**2 if method == "implicit-midpoint" else nv
-    text = ROWS + LOOP.replace("STEP", STEPS[method].replace("PROGRAM", function), 1)
+    text = ROWS + c_text(__name__, "rollout_loop.c").replace("STEP", STEPS[method].replace("PROGRAM", function), 1)
     for name, value in (("JOINTS", nv), ("OUTPUTS", outputs), ("LIMIT", repr(SPEED_LIMIT))):
         text = text.replace(name, str(value))
     return text

@@ -160,9 +160,9 @@ class Predictor(Summary):
     def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
         """The state (q, v) `dt` seconds later under constant u, each (nv,) or (n, nv); differentiable as `mean`.
 
-        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/rollouts.md), which is differentiable
-        once. Raises InvalidInput for "projected", other names and a dt that is no positive number, NumericalError where
-        an implicit step is not found.
+        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/how-to/rollouts.md), which is
+        differentiable once. Raises InvalidInput for "projected", other names and a dt that is no positive number,
+        NumericalError where an implicit step is not found.
         """
         states, single = self._states(q, v, u)
         state = self._stepped(torch.cat(states, dim=-1), dt, integrator)

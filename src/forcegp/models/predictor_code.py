@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from forcegp.codegen.c_text import c_text
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Copier, Graph
@@ -32,36 +33,6 @@ TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 PURPOSE = Purpose("a compiled predictor", "the environment variable XDG_CACHE_HOME", "give compile=False")
 
 WITH_SLOPES = ("linearize", "forces")
-
-COVARIANCE = """
-static APART void covariance(const double *const *t, const double *y, double *out) {
-  enum {N = JOINTS, C = LATENTS, K = RANK};
-  const double *W = y, *d = y + N * C;
-  double P[C * K], Q[N * K];
-  memset(P, 0, sizeof P);
-  ROOTS
-  memset(Q, 0, sizeof Q);
-  for (int a = 0; a < N; a++) for (int c = 0; c < C; c++) for (int r = 0; r < K; r += LANES)
-    STORE(Q + a * K + r, LOAD(Q + a * K + r) + W[a * C + c] * LOAD(P + c * K + r));
-  for (int a = 0; a < N; a++) for (int b = 0; b <= a; b++) {
-    const double *x = Q + a * K, *z = Q + b * K;
-    real s = R(0.0), s1 = s, s2 = s, s3 = s; /* no addition waits for the one before */
-    double prior = 0.0;
-    int r = 0;
-    for (; r + 3 * LANES < K; r += 4 * LANES) {
-      s += LOAD(x + r) * LOAD(z + r);
-      s1 += LOAD(x + r + LANES) * LOAD(z + r + LANES);
-      s2 += LOAD(x + r + 2 * LANES) * LOAD(z + r + 2 * LANES);
-      s3 += LOAD(x + r + 3 * LANES) * LOAD(z + r + 3 * LANES);
-    }
-    for (; r < K; r += LANES) s += LOAD(x + r) * LOAD(z + r);
-    s = (s + s1) + (s2 + s3);
-    for (int c = 0; c < C; c++) prior += W[a * C + c] * d[c] * W[b * C + c];
-    prior = WIDENED * (prior - TOTAL(s));
-    out[a * N + b] = prior; out[b * N + a] = prior; /* the same place with one joint */
-  }
-}
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +136,7 @@ class PredictorCode:
             calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
             first, place = first + len(part.latents), place + len(part.operands)
         sizes = {"JOINTS": self.nv, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
-        text = COVARIANCE.replace("  ROOTS", "  " + "\n  ".join(calls))
+        text = c_text(__name__, "covariance.c").replace("  ROOTS", "  " + "\n  ".join(calls))
         for name, value in sizes.items():
             text = text.replace(name, str(value))
         return text

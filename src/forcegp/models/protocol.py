@@ -291,7 +291,8 @@ class Posterior(MotionModel, Summary, ABC):
         Parameters
         ----------
         rows: with the same joints, measured on the system that the model was trained on.
-        budget: keep this many rows at most: those that the posterior would change most without (docs/incremental.md).
+        budget: keep this many rows at most: those that the posterior would change most without
+            (docs/how-to/incremental.md).
             The result is then exactly that of conditioning on these. None keeps all.
 
         Raises InvalidInput for rows that do not fit and for models that would have to be trained again, ContactError

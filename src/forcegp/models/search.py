@@ -175,7 +175,7 @@ Outcome = TypeVar("Outcome")
 
 
 AT_ONCE = 2
-"""Starts at once, behind which later ones are dropped: behind a single poor one, 22 nats go lost (docs/solvers.md)."""
+"""Starts at once, behind which later ones are dropped: one poor one costs 22 nats (docs/explanation/solvers.md)."""
 
 SMALL = OptimizerOptions(slow=0.02, patience=100)
 """The search on so few rows: to hundredths of a nat, which no prediction shows."""

@@ -250,7 +250,7 @@ def shrunk(
     (Regression with errors in variables; Carroll et al., "Measurement error in nonlinear models", 2006, section 4.2.) S
     is diagonal: correlations between joints are those of one motion and not of the next. With them, on two held-out
     fifths of a recording of a Franka Panda, intervals of 95 % covered 76 to 92 % and the negative log density was 10.6
-    nats a row, without them 87 to 100 % and 5.4 (docs/real-robots.md).
+    nats a row, without them 87 to 100 % and 5.4 (docs/benchmarks/real-robots.md).
     """
     torque_noise = (H * force_std.square()) @ H.mT
     kept = torch.linalg.solve(torque_noise + moments, moments.expand_as(torque_noise)).mT  # G

@@ -136,7 +136,7 @@ class StructuredGP(StructuredModel):
         start: Mapping[str, Tensor] | None = None,
         progress: FitProgress | None = None,
     ) -> StructuredPosterior:
-        """Learn from windows of raw positions or velocities instead of the column `a` (docs/without-accelerations.md).
+        """Learn from windows of raw positions or velocities instead of `a` (docs/how-to/without-accelerations.md).
 
         Parameters
         ----------

@@ -272,8 +272,9 @@ class StructuredPosterior(Posterior):
         """As `Posterior.update`; `keep` chooses the rows that stay.
 
         With a `horizon` in s, forces change with time: kernels become k(z, z') exp(-|t - t'| / horizon), one for all or
-        {term: its own}, and the posterior, through inducing points, is that at the last row (docs/incremental.md). Rows
-        of a call count as simultaneous, those of the fit as at its first row. Raises InvalidInput where time goes back.
+        {term: its own}, and the posterior, through inducing points, is that at the last row
+        (docs/how-to/incremental.md). Rows of a call count as simultaneous, those of the fit as at its first row. Raises
+        InvalidInput where time goes back.
         """
         if self.target is not None:
             raise InvalidInput(

@@ -1,7 +1,8 @@
 """Fitting again: on all rows from what some rows gave, and with the normal force that a fit has found.
 
-docs/large-data.md describes the first. Solved for the second, Q_U would no longer be affine in the latent functions,
-and inference no longer exact (`python -m benchmarks.force_pictures contact-friction` draws the curve with and without).
+docs/how-to/large-data.md describes the first. Solved for the second, Q_U would no longer be affine in the latent
+functions, and inference no longer exact (`python -m benchmarks.force_pictures contact-friction` draws the curve with
+and without).
 """
 
 import warnings

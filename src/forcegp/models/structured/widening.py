@@ -1,4 +1,4 @@
-"""How much wider than the posterior at the fitted hyper-parameters the intervals of a fit have to be (docs/forces.md).
+"""How much wider than the posterior at the fitted hyper-parameters intervals have to be (docs/how-to/forces.md).
 
 Two things are missing from that posterior; one factor on its standard deviations, found at the training states, makes
 up for both. Means do not change.

@@ -1,0 +1,83 @@
+"""Numbers taken out of ROS messages, against those that were put in, and messages in the order of time."""
+
+import numpy as np
+import pytest
+from tests.recordings.log_files import EPOCH, joint_states, motion
+
+from forcegp.errors import FileFormatError
+from forcegp.recordings import open_source
+from forcegp.recordings.ros_bag import numbers
+
+typesys = pytest.importorskip("rosbags.typesys")
+ROS2 = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
+def joint_state(names, positions, efforts=()):
+    header = ROS2.types["std_msgs/msg/Header"]
+    stamp = ROS2.types["builtin_interfaces/msg/Time"](sec=5, nanosec=7)
+    position, effort = (np.array(values, dtype=np.float64) for values in (positions, efforts))
+    return ROS2.types["sensor_msgs/msg/JointState"](
+        header=header(stamp=stamp, frame_id="base"),
+        name=list(names),
+        position=position,
+        velocity=np.zeros(0),
+        effort=effort,
+    )
+
+
+def test_joint_states_go_by_the_names_of_joints():
+    message = joint_state(("elbow", "é/_"), (0.5, -0.5), (2.0, 3.0))
+    expected = {"position.elbow": 0.5, "position.é/_": -0.5, "effort.elbow": 2.0, "effort.é/_": 3.0}
+    assert numbers(message) == {"header.stamp": 5_000_000_007, **expected}
+    assert numbers(message, ("effort",)) == {"effort.elbow": 2.0, "effort.é/_": 3.0}
+    with pytest.raises(FileFormatError, match="2 names but 1 values of 'position'"):
+        numbers(joint_state(("a", "b"), (1.0,)))
+
+
+def test_nested_messages_arrays_and_texts():
+    types = typesys.get_types_from_msg(
+        "bool flag\nint16[3] shorts\nstring text\nfloat32 f\nInner[] inner\nuint64 large\nfloat64[] free\n"
+        "string[] words\nuint8[] picture",
+        "test_msgs/msg/Outer",
+    ) | typesys.get_types_from_msg("int8 a\nfloat64 b", "test_msgs/msg/Inner")
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    store.register(types)
+    inner = store.types["test_msgs/msg/Inner"]
+    message = store.types["test_msgs/msg/Outer"](
+        flag=True,
+        shorts=np.array([1, -2, 300], np.int16),
+        text="odd",
+        f=0.25,
+        inner=[inner(a=1, b=1.5), inner(a=-1, b=2.5)],
+        large=2**40,
+        free=np.array([3.5, 4.5]),
+        words=["a", "long word"],
+        picture=np.zeros(5000, np.uint8),
+    )
+    read = store.deserialize_cdr(store.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
+    assert numbers(read) == {
+        **{"flag": 1, "shorts[0]": 1, "shorts[1]": -2, "shorts[2]": 300, "f": 0.25, "large": 2**40},
+        **{"inner[0].a": 1, "inner[0].b": 1.5, "inner[1].a": -1, "inner[1].b": 2.5, "free[0]": 3.5, "free[1]": 4.5},
+    }
+
+
+@pytest.mark.parametrize(
+    "order", [np.r_[0:200:2, 1:200:2], np.r_[1:40, 0, 40:200]], ids=["chunks that overlap", "one chunk out of order"]
+)
+def test_messages_come_in_the_order_of_time(tmp_path, order):
+    """Several chunks of 1 MiB: every message carries 20 kB of frame name."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    messages = list(joint_states(motion(), ROS2, ros1=False))
+    with Writer(tmp_path / "log", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=ROS2)
+        for row in order:
+            stamp, message = messages[row]
+            message.header.frame_id = "f" * 20_000
+            bag.write(connection, stamp, ROS2.serialize_cdr(message, connection.msgtype))
+    names = ["/joint_states:log_time", "/joint_states:position.elbow"]
+    pieces = list(open_source(tmp_path / "log").chunks(names, 64))
+    assert all(len(piece[names[0]]) <= 64 for piece in pieces)
+    times, positions = (np.concatenate([piece[name] for piece in pieces]) for name in names)
+    np.testing.assert_array_equal(times, EPOCH + np.round(motion()["time"] * 1e9).astype(np.int64))
+    np.testing.assert_array_equal(positions, motion()["q"][:, 1])
