@@ -12,7 +12,7 @@ ARGS ?=
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: demo test test-all test-processors mutants check format bench clean help
+.PHONY: demo test test-all test-processors mutants test-browser check docs format bench clean help
 
 demo: $(VENV)/.demo  ## simulate, learn and evaluate; prints the table and writes the pictures
 	$(BIN)/forcegp demo $(ARGS)
@@ -30,12 +30,19 @@ test-processors: $(VENV)/.test  ## run the tests as other processors and a busy 
 mutants: $(VENV)/.mutants  ## put faults into the source, one at a time, and see whether the tests notice; goes on where it ended
 	$(BIN)/python -m tests.mutants $(ARGS)
 
+test-browser: $(VENV)/.browser  ## look at reports in a headless Chromium, which must be installed
+	$(BIN)/python -m pytest -q -rs tests/report $(ARGS)
+
 check: $(VENV)/.check  ## lint, format, types and the rule of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/pyright -p pyright-public.json
 	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+# One thread: notebooks are small, and the cores belong to the tests.
+docs: $(VENV)/.docs  ## build the documentation into build/docs; a warning is an error
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs $(ARGS)
 
 format: $(VENV)/.check  ## mend what ruff can mend by itself
 	$(BIN)/ruff check --fix .
@@ -52,17 +59,21 @@ help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 18
 
 # A larger installation contains the smaller ones, so it stamps them too.
-$(VENV)/.demo: EXTRAS := sim
+$(VENV)/.demo: EXTRAS := sim,view
 $(VENV)/.demo: STAMPS := $(VENV)/.demo
 $(VENV)/.test: EXTRAS := sim,test,logs
 $(VENV)/.test: STAMPS := $(VENV)/.demo $(VENV)/.test
 $(VENV)/.check: EXTRAS := sim,test,logs,dev
 $(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
+$(VENV)/.browser: EXTRAS := sim,test,logs,browser,rerun
+$(VENV)/.browser: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.browser
+$(VENV)/.docs: EXTRAS := sim,test,logs,docs
+$(VENV)/.docs: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.docs
 $(VENV)/.mutants: EXTRAS := sim,test,logs,mutants
 $(VENV)/.mutants: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.mutants
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
-$(VENV)/.demo $(VENV)/.test $(VENV)/.check $(VENV)/.mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+$(VENV)/.demo $(VENV)/.test $(VENV)/.check $(VENV)/.browser $(VENV)/.docs $(VENV)/.mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing forcegp[$(EXTRAS)] in $(VENV): one to two minutes the first time."
 	$(BIN)/python -m pip install --quiet --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'

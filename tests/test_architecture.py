@@ -63,17 +63,23 @@ PACKAGES = {
 }
 PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}
 PACKAGES["validation"] = set(PACKAGES) - {"simulation"}
+PACKAGES["report"] = set(PACKAGES) - {"simulation"}
 PACKAGES["experiments"] = set(PACKAGES)
 PACKAGES["cli"] = set(PACKAGES)
+PACKAGES["__main__"] = {"cli"}
 
 # Optional or slow to import: imported inside the function that uses them. Modules named here may import them
 # at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
     "casadi": (),
+    "viser": (),
+    "trimesh": (),
+    "rerun": (),
+    "jinja2": ("forcegp.report.page",),
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),
     "pybullet": (),
-    "matplotlib": ("forcegp.evaluation.plots", "forcegp.experiments", "forcegp.validation.figures"),
+    "matplotlib": ("forcegp.evaluation.plots", "forcegp.report", "forcegp.experiments", "forcegp.validation.figures"),
     "joblib": (),
     "rosbags": (),
     "tyro": ("forcegp.cli",),
@@ -259,9 +265,11 @@ def test_the_whole_public_api_loads_neither_simulator_nor_plots_nor_command_line
     assert not loaded & IMPORTED_WHERE_USED.keys()
 
 
-def test_help_needs_neither_torch_nor_numpy():
+@pytest.mark.parametrize("words", ["--help", "import --help", "fit --pionts 3", "fti", "--print-completion bash"])
+def test_help_and_usage_errors_need_neither_torch_nor_numpy(words):
     loaded = modules_loaded_by(
-        "import sys; sys.argv = ['forcegp', '--help']; from forcegp.cli.main import main; main()"
+        "import contextlib; from forcegp.cli.main import main\n"
+        f"with contextlib.suppress(SystemExit): main({words.split()})"
     )
     assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
 

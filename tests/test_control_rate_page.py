@@ -1,4 +1,4 @@
-"""The example of docs/control-rate.md runs as it stands."""
+"""The example of docs/how-to/control-rate.md runs as it stands."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ from tests.examples import run_example
 
 
 def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "control-rate.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "control-rate.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     rank, one, linear, many, step, inverse, gradient = printed.splitlines()
@@ -22,7 +22,7 @@ def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_pages_that_it_names_exist(repository: Path):
-    page = (repository / "docs" / "control-rate.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "control-rate.md").read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)#]+)\)", page)
     assert links
-    assert not [link for link in links if not (repository / "docs" / link).exists()]
+    assert not [link for link in links if not (repository / "docs" / "how-to" / link).exists()]

@@ -14,7 +14,7 @@ from forcegp.cli.main import parse_arguments
 
 
 def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "your-robot.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "your-robot.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     noise, error, *_, any_force, friction = printed.splitlines()
@@ -24,7 +24,7 @@ def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "comparing-priors.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "comparing-priors.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     verdict, joint, contact, none, left_out = printed.splitlines()
@@ -37,8 +37,15 @@ def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
             parse_arguments(shlex.split(command.partition(">")[0].replace("$seed", "1")))
 
 
+def test_the_page_on_reports_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "how-to" / "reports.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    printed = run_example(example, tmp_path).splitlines()
+    assert printed == re.findall(r"print\(.*\)  # (.*)", example)
+
+
 def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "motions.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "motions.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     windows, rms = run_example(example, tmp_path).split()[:2]
     assert windows == "7"
@@ -49,7 +56,7 @@ def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     mass, verdict, _ = printed.splitlines()[-3:]
@@ -61,7 +68,7 @@ def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "identification.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
     commands, *_ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the others need logs of the reader's own
     for command in commands.splitlines():
         program, *words = command.split()
@@ -72,7 +79,7 @@ def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_pa
 
 
 def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "rollouts.md").read_text(encoding="utf-8")
     printed = run_example("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), tmp_path)
     states, more, diverged, free, held, gradient = printed.splitlines()[-6:]
     assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
@@ -83,13 +90,13 @@ def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "incremental.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "incremental.md").read_text(encoding="utf-8")
     printed = [run_example(code, tmp_path) for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
     assert [text.splitlines()[-1] for text in printed] == ["70 40", "True True"]
 
 
 def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "large-data.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "large-data.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     engine, refined, left_out = printed.splitlines()
@@ -102,14 +109,14 @@ def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "gpu.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "gpu.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     assert printed.splitlines()[-1] == "cpu"
 
 
 def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
-    page = (repository / "docs" / "rollouts.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "rollouts.md").read_text(encoding="utf-8")
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
     assert names == ["Simulate", "Simulate", "Fit", "Rollout"]
@@ -139,7 +146,9 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
         assert (tmp_path / "swing-up.png").stat().st_size > 10_000
     else:
         assert min(first, second) > 0.9
-    page = (repository / "docs" / "deploy.md").read_text(encoding="utf-8")
+    parts = (repository / "examples").glob(f"{program}*.py")
+    source = "".join(part.read_text(encoding="utf-8") for part in parts)
+    page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
     shown = page.partition(f"[examples/{program}.py]")[2].partition("```py\n")[2].partition("```")[0]
     assert len(shown.splitlines()) >= 3
     for line in shown.splitlines():
@@ -148,7 +157,7 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "deploy.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     files, agree = run_example(example, tmp_path).splitlines()
     assert "lbr_iiwa_acados.c" in files

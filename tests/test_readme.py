@@ -39,13 +39,13 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
 def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Path):
     readme = (repository / "README.md").read_text(encoding="utf-8")
     assert len(readme.split()) <= 700
-    answer = (repository / "docs" / "auto" / "answer.txt").read_text(encoding="utf-8")
+    answer = (repository / "docs" / "how-to" / "auto" / "answer.txt").read_text(encoding="utf-8")
     assert f"```text\n{answer}```" in readme
-    assert f"```text\n{answer}```" in (repository / "docs" / "auto.md").read_text(encoding="utf-8")
+    assert f"```text\n{answer}```" in (repository / "docs" / "how-to" / "auto.md").read_text(encoding="utf-8")
 
 
 def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
     example, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # the other has tests of its own
     printed = run_example(example, tmp_path)
     tool, total, curve, error, free = printed.splitlines()
@@ -58,7 +58,7 @@ def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
 
 
 def test_the_commands_and_priors_of_the_page_on_forces_exist(repository: Path):
-    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
     rows = page.partition("## Which prior?")[2].partition("\n## ")[0]
     told = {name.partition(":")[0] for name in re.findall(r"^\| `([^`]+)` \|", rows, re.MULTILINE)}
     assert told == set(NAMED_PRIORS) - {"air-drag"}
@@ -79,16 +79,16 @@ def test_the_commands_and_priors_of_the_page_on_forces_exist(repository: Path):
 
 
 def test_the_pictures_and_pages_that_the_page_on_forces_names_exist(repository: Path):
-    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)#]+)\)", page)
-    assert not [link for link in set(links) if not (repository / "docs" / link).exists()]
+    assert not [link for link in set(links) if not (repository / "docs" / "how-to" / link).exists()]
     drawn = re.findall(r"\]\(forces/(.*)\.png\)", page)
     assert set(drawn) == set(PICTURES)
 
 
 def test_the_reproduced_numbers_are_those_of_the_reproduction(repository: Path):
-    document = json.loads((repository / "docs" / "reproduction" / "fig2b.json").read_text(encoding="utf-8"))
-    readme = (repository / "docs" / "features.md").read_text(encoding="utf-8")
+    document = json.loads((repository / "docs" / "paper" / "reproduction" / "fig2b.json").read_text(encoding="utf-8"))
+    readme = (repository / "docs" / "start" / "features.md").read_text(encoding="utf-8")
     for model, curve in document["summary"]["curves"].items():
         cells = [
             f"{published.FIG2B_MAE[model][count]:.4f} / **{curve[str(count)]['mae']['median']:.4f}**"

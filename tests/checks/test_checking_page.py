@@ -1,4 +1,4 @@
-"""The example of docs/checking.md runs as it stands and finds what it says; its commands are commands."""
+"""The example of docs/how-to/checking.md runs as it stands and finds what it says; its commands are commands."""
 
 import re
 import shlex
@@ -14,7 +14,7 @@ from forcegp.cli.prepare import Prepare
 
 @pytest.fixture(scope="module")
 def page(repository):
-    return (repository / "docs" / "checking.md").read_text(encoding="utf-8")
+    return (repository / "docs" / "how-to" / "checking.md").read_text(encoding="utf-8")
 
 
 def test_the_example_finds_what_was_planted(page, tmp_path):
@@ -35,4 +35,4 @@ def test_the_commands_are_commands(page):
 
 def test_its_links_lead_somewhere(page, repository):
     for target in re.findall(r"\]\(([^)#]+)\)", page):
-        assert (repository / "docs" / target).exists(), target
+        assert (repository / "docs" / "how-to" / target).exists(), target

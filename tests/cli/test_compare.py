@@ -32,7 +32,7 @@ def here(folder, monkeypatch):
 
 def test_the_table_has_a_line_per_candidate_and_the_verdict_follows(forcegp, folder):
     sum_of_two = "joint-friction+joint-ripple"
-    words = ("--prior", "joint", "--prior", "joint-friction", "--prior", sum_of_two, "--points", 30)
+    words = ("--priors", f"joint,joint-friction,{sum_of_two}", "--points", 30)
     done = forcegp("compare", "train.h5", *words, "--test", "test.h5", *QUICK, folder=folder)
     assert done.returncode == 0, done.stderr
     for name, functions in (("joint", 3), ("joint-friction", 3), ("joint-friction + joint-ripple", 6)):
@@ -52,7 +52,7 @@ def test_the_table_has_a_line_per_candidate_and_the_verdict_follows(forcegp, fol
 
 
 def test_json_and_the_folder_hold_the_same(forcegp, folder):
-    words = ("--prior", "joint-friction", "--prior", "none", "--prior", "joint : inputs = v", "--out", "priors")
+    words = ("--priors", "joint-friction,none,joint : inputs = v", "--out", "priors")
     more = ("--noise", "learned", "--force-noise", "0.01", "--block-seconds", "0.1", "--mean", "analytical")
     done = forcegp("compare", "train.h5", *words, *more, *QUICK, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
@@ -68,7 +68,7 @@ def test_json_and_the_folder_hold_the_same(forcegp, folder):
     assert not found["candidates"][1]["supported"]
     config = json.loads((folder / "priors" / "config.json").read_text())
     assert config["kind"] == "forcegp compare"
-    assert config["options"]["prior"] == ["joint-friction", "none", "joint : inputs = v"]
+    assert config["options"]["priors"] == ["joint-friction", "none", "joint : inputs = v"]
     for name, place in stored["models"].items():
         posterior = load_posterior(folder / "priors" / place)
         assert posterior.model.prior == named_prior(name)
@@ -82,14 +82,14 @@ def test_json_and_the_folder_hold_the_same(forcegp, folder):
     assert "--overwrite" in again.stderr
 
 
-TWO = "--prior joint --prior joint-friction"
+TWO = "--priors joint,joint-friction"
 WRONG = [
-    ("compare train.h5", "--prior names the candidates, and there is none; give it twice or more"),
-    ("compare train.h5 --prior joint", "there is only joint; give it twice or more"),
-    ("compare train.h5 --prior joint --prior joint", "--prior 'joint' is the same as 'joint'"),
-    ("compare train.h5 --prior joint --prior joint:inputs=q/v/u", "is the same as 'joint'"),
-    ("compare train.h5 --prior joint --prior jiont-friction", "no prior 'jiont-friction'"),
-    ("compare train.h5 --prior joint --prior joint:colour=red", "prior 'joint' cannot take 'colour=red'"),
+    ("compare train.h5", "--priors lists the candidates, and there is none; give two or more"),
+    ("compare train.h5 --priors joint", "there is only joint; give two or more"),
+    ("compare train.h5 --priors joint,joint", "--priors: 'joint' is the same as 'joint'"),
+    ("compare train.h5 --priors joint,joint:inputs=q/v/u", "is the same as 'joint'"),
+    ("compare train.h5 --priors joint,jiont-friction", "no prior 'jiont-friction'"),
+    ("compare train.h5 --priors joint,joint:colour=red", "prior 'joint' cannot take 'colour=red'"),
     (f"compare train.h5 {TWO} --points 61", "--points 61 must be an integer from 2 to 60, the rows"),
     (f"compare train.h5 {TWO} --points 1", "--points 1 must be an integer from 2 to 60, the rows"),
     (f"compare train.h5 {TWO} --block-seconds 0", "seconds is 0.0; it must be positive"),
@@ -122,7 +122,7 @@ def test_without_points_given_all_of_few_rows_are_taken(here, capfd):
 
 
 def test_the_next_fit_has_the_robot_and_the_noise_that_were_compared(forcegp, folder):
-    words = ("--prior", "joint-friction", "--prior", "none", "--points", 10, "--gravity", "0,0,-9.8", "--no-checks")
+    words = ("--priors", "joint-friction,none", "--points", 10, "--gravity", "0,0,-9.8", "--no-checks")
     done = forcegp("compare", "train.h5", *words, "--noise", "0.1", *QUICK, folder=folder)
     assert done.returncode == 0, done.stderr
     told = " ".join(done.stdout.split())

@@ -9,7 +9,7 @@ from tests.models.arm import URDF, arm_data, arm_system
 from forcegp import Dataset
 
 QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1, "--no-checks")
-FEW = ("--seconds", 2, "--motions", 3, "--limits", "velocity=1.5", "--limits", "acceleration=9,9,8")
+FEW = ("--seconds", 2, "--tries", 3, "--limits", "velocity=1.5,acceleration=9,9,8")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
 
 
 def test_a_robot_without_a_model(forcegp, folder):
-    words = ("excite", "--robot", "arm.urdf", *FEW, "--start", "0,0.5,0.5", "--surface", "hand:plane:0,0,1,-9")
+    words = ("excite", "--robot", "arm.urdf", *FEW, "--posture", "0,0.5,0.5", "--avoid", "hand:plane:0,0,1,-9")
     done = forcegp(*words, "--out", "bare.csv", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
@@ -76,12 +76,12 @@ def test_a_robot_without_a_model(forcegp, folder):
         (("run", "--limits", "velocity=fast"), "--limits velocity=fast: give numbers"),
         (("run", "--limits", "jerk=1"), "jerk"),
         (("run", "--limits", "velocity=0"), "joint pan: no motion"),
-        (("run", "--start", "a,b"), "--start a,b: give one number per joint"),
-        (("run", "--surface", "hand@0,0,0.2:plane:0,0,1,0", "--clearance", "5"), "not 5, at the start"),
+        (("run", "--posture", "a,b"), "'a,b' is no list of numbers"),
+        (("run", "--avoid", "hand@0,0,0.2:plane:0,0,1,0", "--clearance", "5"), "not 5, at the start"),
     ],
 )
 def test_what_is_refused(forcegp, folder, words, message):
-    done = forcegp("excite", *words, "--seconds", 1, "--motions", 1, "--out", "never.csv", folder=folder)
+    done = forcegp("excite", *words, "--seconds", 1, "--tries", 1, "--out", "never.csv", folder=folder)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

@@ -36,7 +36,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
     "payload": (("log.h5", "--cutoff", "none", "--delay", 0, "--out", "held"), "held/payload.json"),
-    "compare": (("arm.h5", "--prior", "joint", "--prior", "joint-friction", *QUICK, "--out", "c"), "c/comparison.json"),
+    "compare": (("arm.h5", "--priors", "joint,joint-friction", *QUICK, "--out", "c"), "c/comparison.json"),
     "identify": (("arm.h5", "--learn", "hand:mass", *QUICK, "--out", "found"), "found/identified.urdf"),
     "evaluate": (("run", "test.h5", "--plots", "figures"), "figures/evaluation.json"),
     "validate": (
@@ -56,10 +56,11 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
         ),
         "results/report.md",
     ),
+    "view": (("run", "test.h5", "--seconds", 0.2, "--html", "seen.html"), "seen.html"),
     "rollout": (("run", "test.h5", "--starts", 1, "--seconds", 0.05, "--out", "motion"), "motion/rollout.h5"),
     "monitor": (("free-run", "pushed.h5", "--free", "free.h5", "--out", "touched"), "touched/contacts.csv"),
     "excite": (
-        ("run", "--seconds", 1, "--motions", 2, "--clearance", 0.001, "--surface", "none", "--out", "next.csv"),
+        ("run", "--seconds", 1, "--tries", 2, "--clearance", 0.001, "--avoid", "none", "--out", "next.csv"),
         "next.png",
     ),
     "export": (("run", "--to", "c", "--out", "deployed"), "deployed/self_test.c"),
@@ -124,7 +125,7 @@ def test_version_and_help_through_the_module(installed):
     assert done.returncode == 0
     assert re.fullmatch(r"forcegp \d+\.\d+\.\d+\n", done.stdout)
     environment = {**os.environ, "COLUMNS": "100"}
-    words = [sys.executable, "-m", "forcegp.cli", "--help"]
+    words = [sys.executable, "-m", "forcegp", "--help"]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(re.search(rf"^\W*{command}\s", done.stdout, re.M) for command in COMMANDS)
@@ -134,4 +135,4 @@ def test_version_and_help_through_the_module(installed):
 def test_every_command_has_an_example_in_its_help(forcegp, command):
     done = forcegp(command, "--help")
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(rf"For instance:\n\s+forcegp {command} \S", done.stdout)
+    assert re.search(rf"Examples:\n\s+forcegp {command} \S", done.stdout)

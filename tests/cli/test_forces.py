@@ -34,7 +34,7 @@ def arm(forcegp, tmp_path_factory):
     other = friction_data(50, seed=2, system=other_system())
     # friction_data knows the tool's friction on its own plane only
     dataclasses.replace(other, truth={"a": other.truth["a"], "lambda": other.truth["lambda"]}).save(folder / "other.h5")
-    words = ("--prior", "joint-friction", "--prior", "contact-friction:kernel=linear", *QUICK)
+    words = ("--prior", "joint-friction,contact-friction:kernel=linear", *QUICK)
     fitted = forcegp("fit", "train.h5", *words, "--out", "run", folder=folder)
     assert fitted.returncode == 0, fitted.stderr
     return folder
@@ -97,7 +97,7 @@ def test_another_robot_and_contact_are_named_with_the_remedy_and_the_remedy_help
 
 
 def test_rollouts_move_to_the_system_of_the_recording(arm, forcegp, tmp_path):
-    words = ("rollout", "run", "other.h5", "--start", "0", "--seconds", "0.05")
+    words = ("rollout", "run", "other.h5", "--start-rows", "0", "--seconds", "0.05")
     default = forcegp(*words, "--out", tmp_path / "model", "--json", folder=arm)
     assert default.returncode == 0, default.stderr
     assert "--system data" in default.stderr

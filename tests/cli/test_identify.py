@@ -35,7 +35,7 @@ def folder(tmp_path_factory):
 
 def test_the_whole_command(forcegp, folder):
     done = forcegp(
-        *("identify", "arm.h5", "--learn", "hand:mass,com", "--learn", "viscous-joint-friction=0.1"),
+        *("identify", "arm.h5", "--learn", "hand:mass,com,viscous-joint-friction=0.1"),
         *("--model", "analytical", "--points", 50, "--out", "run"),
         folder=folder,
     )
@@ -96,7 +96,7 @@ WRONG = [
     ("--learn armature", "armature is 0 for pan, lift, bend"),
     ("--learn armature=heavy", "'heavy' is not a number"),
     ("--learn armature:pn=0.1", "no joint 'pn' in arm; did you mean 'pan'?"),
-    ("--learn hand:mass --learn hand:mass,com", "mass of 'hand' is named twice"),
+    ("--learn hand:mass,hand:mass,com", "mass of 'hand' is named twice"),
     ("--learn hand:mass --model analytical --mean zero", "leave --mean zero out"),
     ("--learn hand:mass --prior-strength -1", "prior_strength is -1.0"),
     ("--learn hand:mass --noise loud", "--noise is 'loud'"),

@@ -58,7 +58,7 @@ def test_a_missing_contact_is_said_once_by_fit_and_by_evaluate(forcegp, folder):
 
 def test_compare_looks_too(forcegp, folder):
     done = forcegp(
-        *("compare", "sign.h5", "--prior", "joint", "--prior", "joint-friction", "--points", 12, "--iterations", 2),
+        *("compare", "sign.h5", "--priors", "joint,joint-friction", "--points", 12, "--iterations", 2),
         *("--restarts", 1),
         folder=folder,
     )

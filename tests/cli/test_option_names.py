@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tests.models.arm import arm_data
 
-from forcegp.cli.main import COMMANDS, parse_arguments
+from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 from forcegp.cli.terminal import OTHERWISE, with_option_names
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
@@ -35,7 +35,7 @@ def test_arguments_become_the_options_of_the_command(message, words):
 
 
 def test_every_other_name_is_an_option_of_some_command():
-    everywhere = {name for kind, _ in COMMANDS.values() for name in kind.__dataclass_fields__}
+    everywhere = {name for command in COMMANDS for name in command_class(command).__dataclass_fields__}
     assert set(OTHERWISE.values()) <= everywhere
 
 

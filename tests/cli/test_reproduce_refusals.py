@@ -12,10 +12,8 @@ REFUSALS = [
     ("fig2b --backend dask", "no backend 'dask'; choose serial, joblib"),
     ("fig2b --preset smoke --points 500", "its data have 400 rows, so give 2 to 400"),
     ("fig2b --preset smoke --points 1", "asked for 1 training points"),
-    ("fig2b --seeds -3", "--seeds"),
-    ("fig2b --preset forces-smoke", "no figure 'fig2b'"),
+    ("fig2b --seed-list -3", "--seed-list"),
     ("friction", "no figure 'friction'"),
-    ("friction --preset forces-smoke --points 201", "have 200 rows, so give 2 to 200"),
 ]
 
 

@@ -20,7 +20,7 @@ QUICK = ("--points", "8", "--iterations", "2", "--restarts", "1")
 
 def test_rollouts_are_compared_with_the_recording_and_written(workshop, forcegp, tmp_path):
     out = tmp_path / "out"
-    words = ("rollout", "run", "test.h5", "--start", "0,100,200", "--seconds", 0.25, "--baumgarte", "10,1")
+    words = ("rollout", "run", "test.h5", "--start-rows", "0,100,200", "--seconds", 0.25, "--baumgarte", "10,1")
     done = forcegp(*words, "--samples", 3, "--seed", 1, "--out", out, "--json", folder=workshop)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
@@ -79,17 +79,17 @@ def folder(tmp_path, monkeypatch, capfd):
 
 
 WRONG = [
-    ("rollout run arm.h5 --start 15 --seconds 0.1", "only 0.04 s are left from row 15 to the end of its episode"),
-    ("rollout run two.h5 --start 5 --seconds 0.05", "start at row 4 or before"),
+    ("rollout run arm.h5 --start-rows 15 --seconds 0.1", "only 0.04 s are left from row 15 to the end of its episode"),
+    ("rollout run two.h5 --start-rows 5 --seconds 0.05", "start at row 4 or before"),
     ("rollout run two.h5 --seconds 0.15", "no episode lasts 0.15 s: the longest has 0.09 s"),
-    ("rollout run arm.h5 --start 20 --seconds 0.05", "row 20 does not exist; the dataset has rows 0 to 19"),
-    ("rollout run arm.h5 --start -1 --seconds 0.05", "row -1 does not exist"),
-    ("rollout run arm.h5 --start first --seconds 0.05", "--start is 'first'; give row numbers"),
-    ("rollout run arm.h5 --start 1 --starts 2 --seconds 0.05", "--start and --starts were both given"),
+    ("rollout run arm.h5 --start-rows 20 --seconds 0.05", "row 20 does not exist; the dataset has rows 0 to 19"),
+    ("rollout run arm.h5 --start-rows -1 --seconds 0.05", "row -1 does not exist"),
+    ("rollout run arm.h5 --start-rows first --seconds 0.05", "'first' is no list of whole numbers"),
+    ("rollout run arm.h5 --start-rows 1 --starts 2 --seconds 0.05", "--start-rows and --starts were both given"),
     ("rollout run arm.h5 --starts 0 --seconds 0.05", "the number of starts is 0"),
     ("rollout run arm.h5 --starts 1 --seconds 0", "at least one step of the recording, 0.01 s"),
     ("rollout run arm.h5 --starts 1 --seconds nan", "the length is nan s"),
-    ("rollout run gap.h5 --start 5 --seconds 0.05", "the time steps are uneven: 0.02 s after row 6"),
+    ("rollout run gap.h5 --start-rows 5 --seconds 0.05", "the time steps are uneven: 0.02 s after row 6"),
     ("rollout run backwards.h5 --starts 1 --seconds 0.05", "not in the order of time"),
     ("rollout run other.h5 --starts 1 --seconds 0.05", "joints a, b, c; the model was trained on pan, lift, bend"),
     (
@@ -123,7 +123,7 @@ def test_a_model_that_diverges_is_still_drawn_and_said(folder, forcegp, starts, 
     u = np.array(data.u)
     u[:3] += 5000.0  # Nm: more than 100 rad/s within a step or two
     dataclasses.replace(data, u=u).save("fast.h5")
-    words = ("rollout", "run", "fast.h5", "--start", starts, "--seconds", 0.05, "--samples", 2, "--out", "out")
+    words = ("rollout", "run", "fast.h5", "--start-rows", starts, "--seconds", 0.05, "--samples", 2, "--out", "out")
     done = forcegp(*words, folder=folder)
     assert done.returncode == 0, done.stderr
     assert f"warning: {2 - lasting} of 2 rollouts diverged, the first at step" in done.stderr

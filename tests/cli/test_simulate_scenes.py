@@ -32,10 +32,10 @@ def test_free_arms_need_no_other_library(forcegp, tmp_path, arm):
     [
         ("--friction-coefficient 2.5", {"friction": "viscous", "viscous_coefficient": 2.5}),
         (
-            "--friction stribeck --friction-coefficient 0.2 --surface sphere --joint-friction stribeck --patch 2",
+            "--tool-friction stribeck --friction-coefficient 0.2 --surface sphere --joint-friction stribeck --patch 2",
             {"friction": "stribeck", "coulomb_coefficient": 0.2, "surface": "sphere", "patch_factor": 2.0},
         ),
-        ("--contact bullet --friction-coefficient 0.2", {"friction": "coulomb", "coulomb_coefficient": 0.2}),
+        ("--contact-model bullet --friction-coefficient 0.2", {"friction": "coulomb", "coulomb_coefficient": 0.2}),
     ],
 )
 def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
@@ -55,9 +55,9 @@ def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--contact bullet --friction viscous", "contact 'bullet' has Coulomb friction"),
+        ("--contact-model bullet --tool-friction viscous", "contact 'bullet' has Coulomb friction"),
         ("--surface none --patch 4", "a patch needs a surface"),
-        ("--friction wet", "wet"),
+        ("--tool-friction wet", "wet"),
     ],
 )
 def test_options_that_do_not_fit_end_in_one_line(forcegp, tmp_path, options, message):

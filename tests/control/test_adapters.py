@@ -1,4 +1,4 @@
-"""The examples of docs/control.md: they run, and with the tools of others where these are installed."""
+"""The examples of docs/how-to/control.md: they run, and with the tools of others where these are installed."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ __all__ = ["predictor"]  # a fixture
 
 @pytest.fixture(scope="module")
 def examples() -> list[str]:
-    page = Path(__file__).resolve().parents[2] / "docs" / "control.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "control.md"
     return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 

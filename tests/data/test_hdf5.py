@@ -247,11 +247,11 @@ def test_damaged_bytes_raise_or_load_something_valid(tmp_path_factory, data):
     dataclasses.replace(loaded)  # checks every field again
 
 
-# ---------------------------------------------------------------- docs/data-format.md
+# ---------------------------------------------------------------- docs/how-to/data-format.md
 
 
 def test_the_example_in_the_docs_writes_a_file_that_loads(repository, tmp_path, monkeypatch):
-    text = (repository / "docs/data-format.md").read_text(encoding="utf-8")
+    text = (repository / "docs/how-to/data-format.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
     monkeypatch.chdir(tmp_path)
     values = dataset()
@@ -260,7 +260,7 @@ def test_the_example_in_the_docs_writes_a_file_that_loads(repository, tmp_path, 
 
 
 def test_every_stored_name_is_in_the_docs(repository, file):
-    text = (repository / "docs/data-format.md").read_text(encoding="utf-8")
+    text = (repository / "docs/how-to/data-format.md").read_text(encoding="utf-8")
     with h5py.File(file, "r") as opened:
         names = [*opened.attrs]
         opened.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)

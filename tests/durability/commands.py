@@ -51,13 +51,15 @@ COMMANDS = {
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
     "identify": Writing(f"identify train.h5 --learn lbr_iiwa_link_7:mass {FEW} --out OUT"),
     "regression": Writing("identify air.h5 --model least-squares --out OUT"),
-    "compare": Writing(f"compare train.h5 --prior joint --prior joint-friction {FEW} --out OUT"),
+    "compare": Writing(f"compare train.h5 --priors joint,joint-friction {FEW} --out OUT"),
     "evaluate": Writing("evaluate run test.h5 --every 20 --plots OUT"),
     "rollout": Writing("rollout run test.h5 --starts 1 --seconds 0.02 --out OUT"),
     "check": Writing("check train.h5 --plots OUT"),
     "demo": Writing("demo --seconds 2 --points 10 --iterations 2 --out OUT", again=""),
     "validate": Writing(f"validate train.h5 {VALIDATE} --out OUT", "store", again=""),
-    "reproduce": Writing("reproduce fig2b --preset smoke --points 10 --seeds 7 --jobs 1 --out OUT", "store", again=""),
+    "reproduce": Writing(
+        "reproduce fig2b --preset smoke --points 10 --seed-list 7 --jobs 1 --out OUT", "store", again=""
+    ),
 }
 KILLED = ("simulate", "import", "fit", "identify", "validate", "reproduce")
 
@@ -74,7 +76,7 @@ def make_inputs(folder: Path, forcegp) -> None:
 
 def start(line: list[str], folder: Path) -> subprocess.Popen[str]:
     """The command as a process of its own."""
-    command = [sys.executable, "-m", "forcegp.cli", *line]
+    command = [sys.executable, "-m", "forcegp", *line]
     streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, cwd=folder, env={**os.environ, "COLUMNS": "100"}, text=True, **streams)
 

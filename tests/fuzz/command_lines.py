@@ -12,7 +12,7 @@ from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import DefectError, Target, require_ended_well
 from tests.fuzz.values import WORDS, hostile_pickle
 
-from forcegp.cli.main import COMMANDS, parse_arguments
+from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 from forcegp.errors import ForceGPError
 
 FILES = ("train.h5", "test.h5", "bare.h5", "arm.urdf", "log.csv", "log.yaml", "log.npz", "log.mcap")
@@ -36,13 +36,14 @@ VALID = {
     "check": ("check", "test.h5"),
     "prepare": ("prepare", "test.h5", "--cutoff", "20", "--out", "out.h5"),
     "fit": ("fit", "train.h5", *SMALL, "--out", "out"),
-    "compare": ("compare", "train.h5", "--prior", "joint", *SMALL),
+    "compare": ("compare", "train.h5", "--priors", "joint,none", *SMALL),
     "identify": ("identify", "test.h5", "--model", "least-squares", "--out", "out"),
     "evaluate": ("evaluate", "carried", "train.h5"),
     "rollout": ("rollout", "carried", "train.h5", "--starts", "1", "--seconds", "0.02", "--out", "out"),
     "monitor": ("monitor", "carried", "train.h5", "--free-seconds", "0.1", "--out", "out"),
     "export": ("export", "carried", "--to", "c", "--unchecked", "--out", "out"),
-    "excite": ("excite", "carried", "--motions", "2", "--seconds", "1", "--out", "out.csv"),
+    "view": ("view", "train.h5", "--html", "nowhere/scene.html"),
+    "excite": ("excite", "carried", "--tries", "2", "--seconds", "1", "--out", "out.csv"),
     "validate": ("validate", "test.h5", "--models", "none-such", "--out", "out"),
     "simulate": ("simulate", "none-such", "--out", "out.h5"),
     "demo": ("demo", "--seconds", "0"),
@@ -53,8 +54,10 @@ LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000
 """Nobody may ask for so many seconds of simulation, say, in a test."""
 MORE = {"--help", "--no-checks", "--no-hyperprior"}
 OPTIONS = {
-    name: sorted({"--" + item.name.replace("_", "-") for item in fields(kind) if item.name != "debug"} | MORE)
-    for name, (kind, _) in COMMANDS.items()
+    name: sorted(
+        {"--" + item.name.replace("_", "-") for item in fields(command_class(name)) if item.name != "debug"} | MORE
+    )
+    for name in COMMANDS
 }
 
 

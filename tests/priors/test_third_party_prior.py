@@ -24,7 +24,7 @@ def test_it_is_short(text):
 
 
 def test_the_page_on_forces_shows_the_same_file(repository, text):
-    page = (repository / "docs" / "forces.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert [block for block in blocks if "class AirDrag" in block] == [text]
 

@@ -235,7 +235,7 @@ def test_default_folder(robot, monkeypatch, tmp_path):
 
 
 def test_the_page_on_compiled_dynamics_runs(repository, tmp_path):
-    page = (repository / "docs" / "compiled-dynamics.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "explanation" / "compiled-dynamics.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, "-c", example]

@@ -1,7 +1,7 @@
 """A small arm that moves through time: heavier than its URDF says, and with friction that nobody told the model.
 
-`python -m tests.validation.moving_arm FOLDER` writes what docs/validation.md shows: arm.urdf, and 20 s of an arm with
-Stribeck friction as log.h5.
+`python -m tests.validation.moving_arm FOLDER` writes what docs/how-to/validation.md shows: arm.urdf, and
+20 s of an arm with Stribeck friction as log.h5.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""docs/validation.md: its commands can be read, its example runs, and its pictures exist."""
+"""docs/how-to/validation.md: its commands can be read, its example runs, and its pictures exist."""
 
 import re
 import shlex
@@ -13,7 +13,7 @@ from forcegp.cli.validate import Validate
 from forcegp.validation import DEFAULT_MODELS
 from forcegp.validation.candidates import candidates
 
-PAGE = Path(__file__).resolve().parent.parent.parent / "docs" / "validation.md"
+PAGE = Path(__file__).resolve().parent.parent.parent / "docs" / "how-to" / "validation.md"
 
 
 @pytest.fixture(scope="module")

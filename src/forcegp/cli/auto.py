@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, Any, cast
 
 from rich.table import Table
 from rich.text import Text
@@ -19,37 +19,35 @@ import forcegp.analytical
 import forcegp.checks
 import forcegp.evaluation
 import forcegp.recordings
+import forcegp.report
 import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
-from forcegp.cli.command import CONFIG, URDF, unless_given
+from forcegp.cli.auto_answer import METHOD, NAMES, answer_lines, best_sentence, payload_text
+from forcegp.cli.command import CONFIG, URDF, Resuming, listed, unless_given
+from forcegp.cli.fit import calibrated_with_progress
 from forcegp.cli.import_log import Import
 from forcegp.cli.input_options import SYSTEM_FILE
-from forcegp.cli.terminal import Terminal, number
+from forcegp.cli.learning_options import MODEL_PARTS
+from forcegp.cli.terminal import Terminal
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
-INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
-METHOD = "torque-all"
-NAMES = {"analytical": "the URDF", f"identified-{METHOD}": "identified", f"joint-friction@{METHOD}": "friction learned"}
-SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+MODELS = "the URDF, identified, with friction learned"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Auto(Import):
+class Auto(Resuming, Import):
     """From logs and a URDF to a validated model: import, check, prepare, identify, learn, validate, report.
 
     Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
-    corrects them at once. The folder gets the model of the recommended kind learned from all rows (model, for
-    forcegp evaluate, rollout, monitor ...; c with its C code), identified.urdf, payload.json, the comparison
-    (validation/report.md) and the dataset. A run that was interrupted resumes.
+    corrects them at once. The folder gets the model of the recommended kind, learned from all rows: model, for
+    forcegp evaluate, rollout and monitor, and c with its C code. Beside them are report.html, identified.urdf,
+    payload.json, the comparison (validation/report.md) and the dataset. A run that was interrupted resumes.
 
-    For instance:
+    For example:
       forcegp auto run.csv --time t --q 'pos{1..6}' --u 'tau{1..6}' --robot arm.urdf --out answer
       forcegp auto run1.csv run2.csv --robot arm.urdf --mapping columns.yaml --correct --out answer
     """
-
-    interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
-    replaces: ClassVar[bool] = False
 
     robot: Annotated[Path, URDF, arg(metavar="ARM.urdf")] = field()
     """The robot that was recorded."""
@@ -59,7 +57,7 @@ class Auto(Import):
     """Correct the mistakes that are found in units, signs and the order of joints, and go on."""
     accept: bool = False
     """Go on although something is wrong with the log that nobody corrected."""
-    models: Annotated[tuple[str, ...], unless_given("NAME", "the URDF, identified, with friction learned")] = ()
+    models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=MODEL_PARTS)] = ()
     """What is compared, as for forcegp validate."""
     link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
     """Where a payload may be."""
@@ -116,12 +114,15 @@ class Auto(Import):
             "payload": None if payload is None else payload.to_dict(),
             "identified": identified.to_dict(),
             "weak": list(identified.weak_directions),
-            "models": document["models"],
+            **{name: document[name] for name in ("models", "joint_names", "units")},
             "recommended": forcegp.validation.recommended(document),
             "code": self._code(terminal, posterior),
         }
-        answer = _answer(content, dataset, identified, why_not if payload is None else _held(payload))
-        content |= {"answer": [": ".join(line) for line in answer], "cpu_seconds": time.process_time() - begin}
+        answer = answer_lines(content, dataset, identified, why_not if payload is None else payload_text(payload))
+        best = best_sentence(content, dataset)
+        content |= {"answer": [": ".join(line) for line in answer], "best": best}
+        self._write_report(terminal, posterior, recording, content, answer)
+        content |= {"cpu_seconds": time.process_time() - begin}
         write_json(self.out / "payload.json", {} if payload is None else payload.to_dict())
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
         write_text(self.out / "identified.urdf", identified.system.robot.to_urdf())
@@ -131,7 +132,7 @@ class Auto(Import):
         table.add_column(overflow="fold")
         for line in answer:
             table.add_row(*map(Text, line))
-        terminal.show(table)
+        terminal.show(table, Text(best))
         return content
 
     def _require_own_folder(self) -> None:
@@ -223,8 +224,39 @@ class Auto(Import):
             if best is None:
                 raise FitError(f"no model was fitted; {self.out / 'validation' / 'report.md'} has the reasons.")
             posterior = forcegp.validation.fitted_on_all_rows(comparison, best)
-            forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
+        posterior, why_not = calibrated_with_progress(terminal, posterior, recording)
+        if why_not is not None:
+            terminal.note(why_not)
+        forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
         return found.document, posterior
+
+    def _write_report(
+        self,
+        terminal: Terminal,
+        posterior: forcegp.models.Posterior,
+        recording: forcegp.Dataset,
+        content: Mapping[str, Any],
+        answer: list[tuple[str, str]],
+    ) -> None:
+        """The page to send around."""
+        command = dict(answer)["record next"].partition(" (")[0]
+        with terminal.progress("writing the report") as progress:
+            page = forcegp.report.model_page(
+                posterior,
+                recording,
+                title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.system.robot.name}",
+                best=content["best"],
+                findings=[forcegp.report.Finding(*line) for line in answer],
+                pictures=forcegp.report.validation_pictures(content),
+                tables=[forcegp.report.validation_table(content, NAMES)],
+                next_steps=[forcegp.report.Finding("Record the motion that teaches most:", command)],
+                details={
+                    name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
+                },
+                shapes=self.robot,
+                progress=progress,
+            )
+            forcegp.report.write_page(self.out / "report.html", page)
 
     def _code(self, terminal: Terminal, posterior: forcegp.models.Posterior) -> str | None:
         """The folder of the model's C program; None where there is no compiler, or none of this model."""
@@ -253,70 +285,3 @@ def _findings(terminal: Terminal, findings: list[forcegp.checks.Finding]) -> Tab
         )
         table.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
     return table
-
-
-def _answer(
-    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: forcegp.AnalyticalIdentification, held: str
-) -> list[tuple[str, str]]:
-    """What was found, in ten lines."""
-    names, values = dataset.joint_names, identified.values
-    import_, prepared = content["import"], content["preparation"]
-    deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
-    jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
-    seconds = content["seconds"]
-    rate = (len(dataset) - len(dataset.episodes)) / seconds
-    mistakes = ", ".join(_corrected(each) for each in content["mistakes"]) or "nothing"
-    late = prepared["delay"][0]
-    when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
-    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else "u shows no delay"
-    filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
-
-    def each(field: str, pattern: str = "{:.3g}") -> str:
-        return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in names)
-
-    units = [dataset.units[name] for name in ("q", "u")]
-    q, force = (unit if isinstance(unit, str) else " or ".join(dict.fromkeys(unit)) for unit in units)
-    models = content["models"]
-    scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
-    best = content["recommended"]
-    covered = models[best]["coverage_95"]
-    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
-    weak = ", ".join(name for name, _ in content["weak"][:3])
-    out = content["out"]
-    return [
-        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {len(names)} joints{jitter}"),
-        ("corrected", mistakes),
-        ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
-        ("dry friction", f"{each('coulomb')} {force}, near rest {each('breakaway')} more"),
-        ("viscous", f"{each('viscous')} {force} per {q}/s"),
-        ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
-        ("payload", held),
-        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
-        ("trust", f"{NAMES.get(best, best)}{intervals}"),
-        (
-            "record next",
-            f"forcegp excite {out}/model --seconds 10 --out next.csv"
-            + (f" (least is known of {weak})" if weak else ""),
-        ),
-        ("wrote", f"{out}/model, {out}/identified.urdf, {out}/validation/report.md"),
-    ]
-
-
-def _held(payload: forcegp.analytical.PayloadEstimate) -> str:
-    mass, error = payload.mass, 1.96 * payload.standard_errors["mass"]
-    if mass < max(SURE / 1.96 * error, LEAST_PAYLOAD):
-        return f"none ({mass:.2g} ± {error:.1g} kg)"
-    center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
-    return f"{mass:.3g} ± {error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
-
-
-def _corrected(mistake: Mapping[str, Any]) -> str:
-    """`q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected."""
-    flags = forcegp.checks.import_flags(mistake["correction"])
-    return flags.replace("--unit ", "").replace("--", "") or mistake["subject"]
-
-
-def _score(model: Mapping[str, Any]) -> str:
-    motions, error = model.get("motions"), model.get("nrmse")
-    last = None if not motions or not motions["rms"] else motions["rms"][-1]
-    return " / ".join(number(None if each is None else each["median"]) for each in (last, error))

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.table import Table
-from rich.text import Text
 from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import DatasetError
@@ -28,7 +26,7 @@ class Check(CutoffOptions, RobotOptions):
 
     Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
 
-    For instance:
+    For example:
       forcegp check log.h5 --robot arm.urdf
       forcegp check log.h5 --robot arm.urdf --plots look --strict
     """
@@ -43,8 +41,6 @@ class Check(CutoffOptions, RobotOptions):
     """Exit with code 2 if anything is wrong."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
@@ -74,6 +70,9 @@ class Check(CutoffOptions, RobotOptions):
 
 def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
     """One paragraph per finding, worst first, and the numbers of every joint."""
+    from rich.table import Table
+    from rich.text import Text
+
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")

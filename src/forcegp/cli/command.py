@@ -1,4 +1,4 @@
-"""What commands share: two flags, checks of what they read and write, where to compute, and `run`."""
+"""What commands share: how options are declared, checks of what they read and write, where to compute, and `run`."""
 
 from __future__ import annotations
 
@@ -6,27 +6,81 @@ import contextlib
 import json
 import os
 import platform
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, get_type_hints
 
 from tyro.conf import arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 import forcegp.parallel
 from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_writable, write_digests, write_json
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
-Json = Annotated[bool, arg(help="Print one JSON object on stdout, and nothing else there.")]
-Debug = Annotated[bool, arg(help="Show the traceback of an error.")]
-
 
 def unless_given(metavar: str, default: str, constructor: type | None = None) -> Any:
     """Annotates an option that is None unless it is given: what `--help` calls its value, and its default."""
     return arg(metavar=metavar, constructor=constructor, help_behavior_hint=f"(default: {default})")
+
+
+def split_list(text: str, goes_on: str | None = None) -> list[str]:
+    """The entries of a list that is written with commas.
+
+    What matches the regular expression `goes_on` cannot begin an entry: it belongs to the entry before it, with the
+    comma. So does what stands in parentheses. Raises ValueError for an empty entry.
+    """
+    entries: list[str] = []
+    for piece in text.split(","):
+        open_ = bool(entries) and entries[-1].count("(") > entries[-1].count(")")
+        if entries and (open_ or (goes_on is not None and re.fullmatch(goes_on, piece.strip()))):
+            entries[-1] += f",{piece}"
+        else:
+            entries.append(piece.strip())
+    if "" in entries:
+        raise ValueError(f"{text!r} holds an empty entry; write one comma between two entries, as in a,b.")
+    return entries
+
+
+@dataclass(frozen=True)
+class Listed(PrimitiveConstructorSpec[tuple[Any, ...]]):
+    """Annotates a tuple that is written as one list with commas."""
+
+    help_behavior_hint: str | None = None
+
+
+def listed(
+    metavar: str, default: str | None = None, of: type[str | int | float] = str, goes_on: str | None = None
+) -> Listed:
+    """Annotates a tuple: what `--help` calls its entries, what it is unless given, and what continues an entry."""
+
+    def instance(words: Sequence[str]) -> tuple[Any, ...]:
+        entries = split_list(words[0], goes_on)
+        try:
+            return tuple(map(of, entries))
+        except ValueError:
+            kind = {int: "whole numbers", float: "numbers"}[of]
+            raise ValueError(f"{words[0]!r} is no list of {kind}, as {'1,2' if of is int else '0.1,0.2'} is.") from None
+
+    return Listed(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=instance,
+        is_instance=lambda given: isinstance(given, tuple),
+        str_from_instance=lambda given: [",".join(map(str, given))],
+        help_behavior_hint=None if default is None else f"(default: {default})",
+    )
+
+
+NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
+"""What continues an entry that holds numbers: FRAME@x,y,z:SURFACE:n,n,n,n, or WHAT=X,X."""
+
+
+FIELDS = r"\w+ *=.*"
+"""What continues a prior: NAME:FIELD=VALUE,FIELD=VALUE."""
 
 
 def numbers_of(text: str, complaint: str, *, one: bool = False) -> list[float]:
@@ -47,7 +101,7 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
-OUTPUTS = ("out", "plots", "docs", "write_mapping")
+OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html", "rerun")
 """Names of the fields with what a command writes: never an input, nor another output."""
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
@@ -57,15 +111,19 @@ LOG = InputPath(" does not exist; give the path of a log.", Path.exists)
 MAPPING = InputPath(" is not a file; give --mapping a YAML file.")
 
 
+@dataclass(frozen=True, kw_only=True)
 class Command(ABC):
-    """One command: a frozen dataclass with its options as fields, the two below last, and what it does as `run`."""
+    """One command: a frozen dataclass with its options as fields, and what it does as `run`."""
 
     interrupted: ClassVar[str] = "no partial output was kept"
     """What Ctrl-C has left behind."""
     replaces: ClassVar[bool] = True
     """Whether an old folder of results goes, with all that is in it; else it is gone on with."""
-    json: Json
-    debug: Debug
+
+    json: bool = False
+    """Print one JSON object on stdout, and nothing else there."""
+    debug: bool = False
+    """Show the traceback of an error."""
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -108,15 +166,20 @@ class Command(ABC):
             elif given is True and not getattr(type(self), name):
                 words.append(flag)
             elif given != getattr(type(self), name):
-                for each in given if isinstance(given, tuple) else (given,):
-                    text = f"{each:g}" if isinstance(each, float) else str(each)
-                    words += [f"{flag}={text}"] if name == "gravity" else [flag, text]  # it may begin with a minus
+                each = given if isinstance(given, tuple) else (given,)
+                text = ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in each)
+                words += [f"{flag}={text}"] if name == "gravity" or text.startswith("-") else [flag, text]
         return words
+
+    @property
+    def name(self) -> str:
+        """The word after `forcegp`."""
+        return type(self).__name__.lower()
 
     @property
     def kind(self) -> str:
         """The command as people write it, by which folders that it wrote are recognised."""
-        return f"forcegp {type(self).__name__.lower()}"
+        return f"forcegp {self.name}"
 
     def require_free(self, path: Path | None) -> None:
         """Refuse what exists, unless it is an empty folder, or one that only this command wrote to, with --overwrite.
@@ -152,6 +215,8 @@ class Command(ABC):
             folder.mkdir()
             yield folder
             present = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+            from importlib.metadata import version  # 30 ms that --help and errors do without
+
             versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
             files = sorted({CONFIG, SUMS, *present})
             write_json(folder / CONFIG, {"kind": self.kind, **content, "versions": versions, "files": files})
@@ -174,13 +239,22 @@ def _same(one: Path, other: Path) -> bool:
 class BackendOptions(Command):
     """What every command asks that can compute in several processes."""
 
-    jobs: Annotated[int | None, arg(metavar="J", constructor=int, help_behavior_hint="")] = None
-    backend: Annotated[str | None, arg(metavar="serial|joblib", constructor=str, help_behavior_hint="")] = None
-    """serial: in this process. joblib: in processes of this machine. (default: serial for one job, else joblib)"""
+    jobs: Annotated[int | None, unless_given("J", "1", int)] = None
+    """So many pieces of work at once, each on one core."""
+    backend: Annotated[str | None, unless_given("serial|joblib", "serial for one job, else joblib", str)] = None
+    """serial: in this process. joblib: in processes of this machine."""
 
     def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
         """The backend that is asked for, or else the default. Raises InvalidInput for contradicting options."""
         return forcegp.parallel.backend_for(self.backend or default, self.jobs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resuming(Command):
+    """A command that keeps every finished piece of work in its folder."""
+
+    interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
+    replaces: ClassVar[bool] = False
 
 
 def require_free_file(

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from rich.text import Text
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import arg
 
 import forcegp
 import forcegp.evaluation
@@ -17,10 +16,10 @@ import forcegp.inference
 import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, FIELDS, listed, unless_given
 from forcegp.cli.input_options import ROBOT_OPTIONS
 from forcegp.cli.learning_options import LearningOptions
-from forcegp.cli.model_choice import POINTS, resolved_noise
+from forcegp.cli.model_choice import POINTS, PRIORS, resolved_noise
 from forcegp.cli.terminal import NONE, Terminal, columns, number
 from forcegp.errors import InvalidInput
 
@@ -32,19 +31,16 @@ SAME = (*ROBOT_OPTIONS, "contact", "known_force", "mean", "noise", "force_noise"
 class Compare(LearningOptions):
     """Fit several priors on the unknown forces to the same rows, and report which of them the data support.
 
-    Each --prior is one candidate, and may be a sum. Candidates are scored by the log density of stretches of time that
-    are left out of the training rows, without another fit; with --test also on another recording.
+    Each entry of --priors is one candidate, and may be a sum. Candidates are scored by the log density of stretches of
+    time that are left out of the training rows, without another fit. With --test also on another recording.
 
-    For instance:
-      forcegp compare train.h5 --prior joint --prior tool-friction --points 100
-      forcegp compare train.h5 --prior tool-friction --prior "tool-friction + joint-friction" --test test.h5
+    For example:
+      forcegp compare train.h5 --priors joint,tool-friction --points 100
+      forcegp compare train.h5 --priors "tool-friction,tool-friction + joint-friction" --test test.h5
     """
 
-    prior: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(give it twice or more)"),
-    ] = ()
-    """A candidate: the name of a prior as in forcegp fit, or a sum such as "tool-friction + joint-friction"."""
+    priors: Annotated[tuple[str, ...], listed(PRIORS, goes_on=FIELDS)] = ()
+    """Two candidates or more: names of priors as in forcegp fit, or sums such as "tool-friction + joint-friction"."""
     out: Annotated[Path | None, unless_given("FOLDER", "nothing is written")] = None
     """Also write every fitted model and comparison.json into this folder."""
     points: Annotated[int | None, unless_given("N", f"{POINTS}, or all rows", int)] = None
@@ -57,16 +53,14 @@ class Compare(LearningOptions):
     """Length of the stretches of time that are left out; longer than the time over which motion is correlated."""
     test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none")] = None
     """Another recording to score the candidates on as well."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, compare, write if asked to, and show."""
         if self.seed < 0:
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
-        if len(self.prior) < 2:
-            given = f"only {self.prior[0]}" if self.prior else "none"
-            raise InvalidInput(f"--prior names the candidates, and there is {given}; give it twice or more.")
+        if len(self.priors) < 2:
+            given = f"only {self.priors[0]}" if self.priors else "none"
+            raise InvalidInput(f"--priors lists the candidates, and there is {given}; give two or more.")
         self.require_free(self.out)
 
         dataset = forcegp.Dataset.load(self.data)
@@ -93,11 +87,11 @@ class Compare(LearningOptions):
 
     def _priors(self, system: forcegp.MechanicalSystem) -> dict[str, forcegp.priors.ForcePrior]:
         priors: dict[str, forcegp.priors.ForcePrior] = {}
-        for expression in self.prior:
+        for expression in self.priors:
             prior = forcegp.priors.named_prior(expression, system)
             same = next((name for name, other in priors.items() if other == prior), None)
             if same is not None:
-                raise InvalidInput(f"--prior {expression!r} is the same as {same!r}; give each candidate once.")
+                raise InvalidInput(f"--priors: {expression!r} is the same as {same!r}; give each candidate once.")
             priors[re.sub(r"\s*\+\s*", " + ", expression.strip())] = prior
         return priors
 
@@ -152,7 +146,7 @@ class Compare(LearningOptions):
                 "--out run"
             )
         table = columns(title, header, rows, long_names=True)
-        return [table, Text(comparison.verdict), Text(following)]
+        return [table, comparison.verdict, following]
 
     def _row(self, score: forcegp.evaluation.PriorScore, comparison: forcegp.PriorComparison) -> list[str]:
         best = score is comparison.best

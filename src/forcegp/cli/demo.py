@@ -16,8 +16,10 @@ import forcegp
 import forcegp.evaluation
 import forcegp.inference
 import forcegp.models
+import forcegp.report
+import forcegp.simulation
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import Command, Debug, Json
+from forcegp.cli.command import Command
 from forcegp.cli.evaluate import draw, evaluate_with_progress
 from forcegp.cli.fit import fit_summary, fit_with_progress
 from forcegp.cli.simulate import simulate_with_progress
@@ -39,10 +41,10 @@ PUBLISHED_MAE = dict(zip(MODELS, (published.FIG2B_MAE["s-gp"], published.FIG2B_M
 class Demo(Command):
     """A robot arm slides its tool on a surface, and a model learns the friction that nobody modelled.
 
-    Simulates a training and a test trajectory, fits the model of the paper (Rath, Geist, Trimpe 2021) without and with
-    its analytical mean, scores both on the other trajectory, draws pictures, and keeps everything in one folder.
+    Simulates a training and a test trajectory, and fits the model of the paper (Rath, Geist, Trimpe 2021) without and
+    with its analytical mean. Scores both on the other trajectory, draws pictures, and keeps everything in one folder.
 
-    For instance:
+    For example:
       forcegp demo --out demo --points 100
     """
 
@@ -58,8 +60,6 @@ class Demo(Command):
     """Most iterations of each fit."""
     jobs: Annotated[int, arg(metavar="J")] = 1
     """Processes for the starts of each fit."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """All four steps."""
@@ -97,8 +97,48 @@ class Demo(Command):
                 "machine": machine,
             }
             write_json(folder / "results.json", results)
-        self._show(terminal, evaluations, wall_seconds)
+            best = self._write_report(terminal, folder, models["S-GP + analytical mean"], test, evaluations, results)
+        self._show(terminal, evaluations, wall_seconds, best)
         return results
+
+    def _write_report(
+        self,
+        terminal: Terminal,
+        folder: Path,
+        posterior: forcegp.models.StructuredPosterior,
+        test: forcegp.Dataset,
+        evaluations: Mapping[str, forcegp.Evaluation],
+        results: Mapping[str, Any],
+    ) -> str:
+        """The page with everything, whose best sentence is returned."""
+        name, evaluation = list(evaluations.items())[-1]
+        best = forcegp.report.evaluation_sentence(evaluation, "rad/s²")
+        with terminal.progress("writing the report") as progress:
+            page = forcegp.report.model_page(
+                posterior,
+                test,
+                title=f"forcegp demo: a tool slides on a surface, friction learned from {self.points} points",
+                best=best,
+                findings=[
+                    forcegp.report.Finding("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
+                    forcegp.report.Finding("model", f"{name} of Rath, Geist and Trimpe (CoRL 2021)"),
+                    forcegp.report.Finding("tested on", f"{evaluation.rows} rows of a trajectory with another seed"),
+                ],
+                tables=[forcegp.report.evaluation_table(evaluation)],
+                next_steps=[
+                    forcegp.report.Finding(
+                        "The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"
+                    ),
+                    forcegp.report.Finding(
+                        "The robot live:", f"forcegp view {self.out}/s-gp-analytical-mean {self.out}/test.h5"
+                    ),
+                ],
+                details=results,
+                shapes=forcegp.simulation.kuka_file(),
+                progress=progress,
+            )
+            forcegp.report.write_page(folder / "report.html", page)
+        return best
 
     def _seeds(self) -> dict[str, int]:
         return {"train": self.seed, "test": self.seed + 1}
@@ -133,7 +173,9 @@ class Demo(Command):
         terminal.note(f"fitted {name}: {iterations} iterations ({seconds:.1f} s)")
         return posterior, fit_summary(posterior, seconds)
 
-    def _show(self, terminal: Terminal, evaluations: Mapping[str, forcegp.Evaluation], wall_seconds: float) -> None:
+    def _show(
+        self, terminal: Terminal, evaluations: Mapping[str, forcegp.Evaluation], wall_seconds: float, best: str
+    ) -> None:
         header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
         rows = []
         for name, evaluation in evaluations.items():
@@ -151,5 +193,7 @@ class Demo(Command):
         terminal.show(
             columns(title, header, rows),
             *([multipliers] if first.multiplier_mae is not None else []),
-            f"{self.out}/summary.png shows it; results.json, models and data lie beside it ({wall_seconds:.0f} s).",
+            f"Models, data, pictures and results.json are in {self.out} ({wall_seconds:.0f} s). Open the report:",
+            f"  {self.out}/report.html",
+            best,
         )

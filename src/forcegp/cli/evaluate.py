@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
 import forcegp.models
+import forcegp.report
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Command, listed, require_free_file, unless_given
 from forcegp.cli.input_options import SystemChoice, carried_over
-from forcegp.cli.learning_options import parse_contacts
+from forcegp.cli.learning_options import CONTACTS, parse_contacts
 from forcegp.cli.terminal import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,
@@ -33,8 +34,9 @@ from forcegp.errors import InvalidInput
 class Evaluate(Command):
     """Score a fitted model on a dataset that it has not seen: errors, likelihood, coverage, constraint error.
 
-    For instance:
+    For example:
       forcegp evaluate run test.h5 --plots figures
+      forcegp evaluate run test.h5 --report report.html --shapes arm.urdf
       forcegp evaluate run test.h5 --json | jq .mae
       forcegp evaluate run elsewhere.h5 --contact tool@0,0,0.1:plane:0,0,1,0.05
     """
@@ -43,27 +45,28 @@ class Evaluate(Command):
     """The folder that `forcegp fit --out` wrote."""
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to predict (HDF5)."""
-    every: Annotated[int, arg(metavar="K")] = 1
-    """Take every K-th row only."""
+    every: Annotated[int, arg(metavar="N")] = 1
+    """Take every N-th row only."""
     system: SystemChoice = "model"
     """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
-    contact: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: those of --system)"),
-    ] = ()
+    contact: Annotated[tuple[str, ...], listed(CONTACTS, "those of --system", goes_on=NUMBERS)] = ()
     """Predict under these contacts instead, for example a joint that stuck; written as for forcegp fit."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
+    report: Annotated[Path | None, unless_given("FILE.html", "no report")] = None
+    """Also write one page to send around: the robot in motion with its forces, pictures and errors."""
+    shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
+    """What the links look like in the report: a URDF with visual elements, its meshes beside it."""
     overwrite: bool = False
-    """Replace the folder of plots if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
+    """Replace the folder of plots and the report if forcegp wrote them."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Evaluate, draw if asked to, and show."""
         if self.every < 1:
             raise InvalidInput(f"--every is {self.every}; it must be at least 1.")
         self.require_free(self.plots)
+        if self.report is not None:
+            require_free_file(self.report, overwrite=self.overwrite, own=forcegp.report.is_page, what="a report")
 
         posterior = forcegp.load_posterior(self.run_folder)
         dataset = forcegp.Dataset.load(self.data).rows(slice(None, None, self.every))
@@ -92,11 +95,38 @@ class Evaluate(Command):
                 draw(terminal, folder, posterior, dataset)
                 write_json(folder / "evaluation.json", scores)
             terminal.note(f"plots: {self.plots}")
+        if self.report is not None:
+            self._write_report(terminal, posterior, dataset, evaluation, scores)
         known = isinstance(posterior, forcegp.models.StructuredPosterior) and not posterior.latent_names
         why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
         forces_table = force_facts(forces, why)
         terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
         return scores
+
+    def _write_report(
+        self,
+        terminal: Terminal,
+        posterior: forcegp.models.Posterior,
+        dataset: forcegp.Dataset,
+        evaluation: forcegp.Evaluation,
+        scores: Mapping[str, Any],
+    ) -> None:
+        assert self.report is not None
+        unit = acceleration_unit(dataset)
+        with terminal.progress("writing the report") as progress:
+            page = forcegp.report.model_page(
+                posterior,
+                dataset,
+                title=f"{self.run_folder.name} on {self.data.name}: {posterior.description}",
+                best=forcegp.report.evaluation_sentence(evaluation, unit),
+                findings=[forcegp.report.Finding("warning", each) for each in scores["warnings"]],
+                tables=[forcegp.report.evaluation_table(evaluation)],
+                details={**scores, "forcegp": forcegp.__version__},
+                shapes=self.shapes,
+                progress=progress,
+            )
+            forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
+        terminal.note(f"report: {self.report}")
 
 
 def evaluate_with_progress(
@@ -132,6 +162,12 @@ def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, 
     return list(figures)
 
 
+def acceleration_unit(dataset: forcegp.Dataset) -> str:
+    """Of all joints, or that each has its own."""
+    units = dataset.units["a"]
+    return units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
+
+
 def _report(
     posterior: forcegp.models.Posterior,
     evaluation: forcegp.Evaluation,
@@ -140,8 +176,7 @@ def _report(
     forces: Mapping[str, str],
 ) -> list[Any]:
     points = len(posterior.training)
-    units = dataset.units["a"]
-    unit = units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
+    unit = acceleration_unit(dataset)
     where = "" if posterior.target is None else ", carried to another robot or contacts"
     title = (
         f"{points} training points, {posterior.description}{where}; {evaluation.rows} rows of {data}; errors in {unit}"

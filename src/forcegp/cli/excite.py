@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-from forcegp.cli.command import DATASET, MODEL, Debug, Json, numbers_of, require_free_file, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, listed, numbers_of, require_free_file, unless_given
 from forcegp.cli.input_options import RobotOptions
-from forcegp.cli.learning_options import parse_contacts
+from forcegp.cli.learning_options import CONTACTS, parse_contacts
 from forcegp.cli.terminal import Terminal, columns, number
 from forcegp.errors import InvalidInput
 
@@ -23,37 +23,39 @@ from forcegp.errors import InvalidInput
 class Excite(RobotOptions):
     """Choose a motion within limits, from rest to rest, after which learned forces are surest.
 
-    With --robot instead of a model, one that identifies base parameters and friction. For instance:
-      forcegp excite run --limits velocity=1.5 --limits acceleration=6 --out next.csv
+    With --robot instead of a model, one that identifies base parameters and friction.
+
+    For example:
+      forcegp excite run --limits velocity=1.5,acceleration=6 --out next.csv
       forcegp excite --robot arm.urdf --limits velocity=1,1,2 --seconds 20 --out next.csv
     """
 
     run_folder: Annotated[Positional[Path | None], MODEL, arg(metavar="[RUN]")] = None
     """The folder that `forcegp fit --out` wrote."""
+    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the model's", Path)] = None
+    """A robot of which nothing was learned, instead of a model."""
     out: Annotated[Path, arg(metavar="FILE.csv")]
     """t, q, v, a and u to write, 100 rows per second, as `forcegp import` reads them; and a picture, FILE.png."""
     seconds: Annotated[float, arg(metavar="S")] = 10.0
     """How long the motion lasts."""
-    limits: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="WHAT=X[,X...]", help_behavior_hint="")] = ()
-    """Largest position (from the start), velocity, acceleration or torque, for all joints or for each (repeatable)."""
-    margin: Annotated[float, arg(metavar="PART")] = 0.9
+    limits: Annotated[tuple[str, ...], listed("WHAT=X[,X...],...", goes_on=NUMBERS)] = ()
+    """Largest position (from the start), velocity, acceleration or torque, for all joints or for each."""
+    limit_share: Annotated[float, arg(metavar="PART")] = 0.9
     """The part of the URDF's own limits that may be used."""
-    start: Annotated[str | None, unless_given("Q,Q...", "mean of the log, or middle of the ranges", str)] = None
-    """Posture at both ends."""
-    surface: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="FRAME:SURFACE", help_behavior_hint="")] = ()
-    """What points of the robot shall not touch, as in `forcegp fit --contact` (repeatable; default: its contacts)."""
+    posture: Annotated[tuple[float, ...], listed("Q,...", "mean of the log, or middle of the ranges", of=float)] = ()
+    """Positions of the joints at both ends."""
+    avoid: Annotated[tuple[str, ...], listed(CONTACTS, "its contacts", goes_on=NUMBERS)] = ()
+    """What points of the robot shall not touch, as in `forcegp fit --contact`; or none."""
     clearance: Annotated[float, arg(metavar="M")] = 0.05
-    """How far these points stay away."""
+    """How far the points of --avoid stay away, in m."""
     task: Annotated[Path | None, DATASET, unless_given("DATA", "all within the limits", Path)] = None
     """A log with the states at which forces shall be sure (HDF5)."""
-    motions: Annotated[int, arg(metavar="N")] = 300
+    tries: Annotated[int, arg(metavar="N")] = 300
     """How many motions to look at."""
     seed: Annotated[int, arg(metavar="K")] = 0
-    """Draws them."""
+    """Draws the motions that are looked at."""
     overwrite: bool = False
     """Replace the files if forcegp wrote them."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Choose, write, draw and show."""
@@ -68,15 +70,16 @@ class Excite(RobotOptions):
             name, _, values = word.partition("=")
             numbers = numbers_of(values, f"--limits {word}: give numbers, for example --limits velocity=1.5.")
             limits[name] = numbers[0] if len(numbers) == 1 else numbers
-        complaint = f"--start {self.start}: give one number per joint, with commas."
-        given = {name: getattr(self, name) for name in ("seconds", "margin", "clearance", "motions", "seed")}
+        given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
         with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
             chosen = forcegp.excitation(
                 robot or forcegp.load_posterior(str(self.run_folder)),
                 **given,
+                margin=self.limit_share,
+                motions=self.tries,
                 limits=limits,
-                start=None if self.start is None else numbers_of(self.start, complaint),
-                surfaces=parse_contacts(self.surface) if self.surface else None,
+                start=list(self.posture) or None,
+                surfaces=parse_contacts(self.avoid) if self.avoid else None,
                 task=None if self.task is None else forcegp.Dataset.load(self.task),
                 progress=report,
             )

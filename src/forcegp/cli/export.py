@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
-from forcegp.cli.command import MODEL, Command, Debug, Json
+from forcegp.cli.command import MODEL, Command, unless_given
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
 
@@ -21,7 +21,7 @@ class Export(Command):
     for CasADi's external and acados' generic functions. It is compiled and compared with the model before it is there.
     casadi: CasADi functions with all derivatives, for casadi.Function.load (pip install 'forcegp[casadi]').
 
-    For instance:
+    For example:
       forcegp export run --to c --out deployed --covariance
       forcegp export run --to casadi --out planner --steps 0.02
       forcegp export run --to c --out mpc --jacobian --steps 0.02 --integrator implicit-midpoint
@@ -31,22 +31,20 @@ class Export(Command):
     """The folder that `forcegp fit --out` wrote."""
     to: Literal["c", "casadi"]
     """What to write."""
-    out: Annotated[Path, arg(metavar="DIR")]
+    out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
     covariance: bool = False
     """With the covariance of the acceleration, which makes the program some 2 MB larger."""
     jacobian: bool = False
     """With derivatives in q, v and u. Compilers take some ten seconds for them."""
-    steps: Annotated[float | None, arg(metavar="DT")] = None
+    steps: Annotated[float | None, unless_given("DT", "without", float)] = None
     """With x+ = f(x, u), a step of DT seconds."""
-    integrator: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: symplectic-euler)")] = None
-    """Of that step: symplectic-euler, rk4 or implicit-midpoint (stiff friction)."""
+    integrator: Annotated[str | None, unless_given("NAME", "symplectic-euler", str)] = None
+    """How the step of --steps is computed: symplectic-euler, rk4 or implicit-midpoint (stiff friction)."""
     unchecked: bool = False
     """Do not compile the program and compare it with the model."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Write and show."""

@@ -15,7 +15,6 @@ import forcegp.inference
 import forcegp.models
 import forcegp.priors
 import forcegp.robots
-from forcegp.cli.command import Debug, Json
 from forcegp.cli.model_choice import (
     POINTS,
     ModelOptions,
@@ -36,17 +35,14 @@ class Fit(ModelOptions):
     The dataset carries its robot and contacts, so nothing else is needed; --robot, --contact and --known-force
     override it.
 
-    For instance:
+    For example:
       forcegp fit train.h5 --points 100 --out run
-      forcegp fit train.h5 --prior tool-friction --prior joint-friction --points 100 --out run
+      forcegp fit train.h5 --prior tool-friction,joint-friction --points 100 --out run
       forcegp fit train.h5 --model independent-gp --points 100 --out baseline
       forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
       forcegp fit raw.h5 --learn-from weak-form --window 0.1 --points 100 --out run
       forcegp fit log.h5 --identified identified --prior joint-friction --points 400 --motions 1 --out run
     """
-
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit and save."""

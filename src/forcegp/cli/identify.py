@@ -10,18 +10,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
-from rich.text import Text
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import arg
 
 import forcegp
 import forcegp.analytical
 import forcegp.inference
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, listed, unless_given
 from forcegp.cli.fit import fit_summary, fit_with_progress, motion_report, refined_with_progress
 from forcegp.cli.input_options import SYSTEM_FILE
-from forcegp.cli.learning_options import friction_laws, parse_learn, with_learned_forces
+from forcegp.cli.learning_options import PARTS, friction_laws, parse_learn, with_learned_forces
 from forcegp.cli.model_choice import FitOptions, resolved_noise
 from forcegp.cli.terminal import NONE, Terminal, columns, with_option_names
 from forcegp.errors import InvalidInput, NonPhysicalInertia
@@ -31,15 +30,15 @@ from forcegp.errors import InvalidInput, NonPhysicalInertia
 class IdentifyOptions(FitOptions):
     """What to identify, by which model, and from how many rows."""
 
-    learn: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LINK:PARTS|FORCE", help_behavior_hint="")] = ()
-    """What to estimate (repeatable): LINK:PARTS with parts out of mass, com (centre of mass) and inertia, or
-    viscous-joint-friction, coulomb-joint-friction, armature: of all joints, or of FORCE:JOINT,JOINT; from the URDF's
-    coefficients, or from FORCE=START. The next two models estimate all of it instead."""
+    learn: Annotated[tuple[str, ...], listed("LINK:PARTS|FORCE,...", goes_on=PARTS)] = ()
+    """What to estimate. LINK:PARTS: out of mass, com (centre of mass) and inertia. FORCE or FORCE:JOINT,JOINT:
+    viscous-joint-friction, coulomb-joint-friction or armature, of all joints or of these. They begin at the URDF's
+    coefficients, or at FORCE=START. The models least-squares and consistent estimate all of it instead."""
     model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
     """structured: Gaussian processes model the unknown forces. analytical: there are none but noise.
     least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
     """
-    friction: Annotated[str, arg(metavar="NAME,NAME")] = "viscous,coulomb"
+    friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset, direction (viscous
     friction that differs by it); none for no friction."""
     rotors: Literal["armature", "rotor", "none"] = "armature"
@@ -51,9 +50,9 @@ class IdentifyOptions(FitOptions):
     """With the last two models: count outliers by their absolute value."""
     test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none", Path)] = None
     """With the last two models: score on this recording, too."""
-    motions: Annotated[float | None, unless_given("SECONDS", "none", float)] = None
-    """With consistent: after that, refine all of it on the recorded positions, over windows so long. See
-    docs/motions.md."""
+    motions: Annotated[float | None, unless_given("S", "none", float)] = None
+    """With consistent: refine all of it in the end on the recorded positions, over windows so long. See
+    docs/how-to/motions.md."""
     prior_strength: Annotated[float | None, unless_given("W", "0; 1 for the last two models", float)] = None
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
     points: Annotated[int, arg(metavar="N")] = 200
@@ -178,7 +177,7 @@ def _report_of_regression(
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(found.thickened)}.")
     if identified is not None:
         lines.append(f"Wrote {command.out / 'identified.urdf'}. Next: forcegp fit LOG.h5 --identified {command.out}")
-    return [*tables, *(Text(line) for line in lines)]
+    return [*tables, *lines]
 
 
 COEFFICIENT_NAMES = (
@@ -198,15 +197,12 @@ class Identify(IdentifyOptions):
     folder holds identified.urdf, identification.json, and the model as `forcegp fit` writes it, or system.json for
     --identified.
 
-    For instance:
+    For example:
       forcegp identify log.h5 --robot arm.urdf --model consistent --friction viscous,coulomb,offset --out identified
       forcegp identify log.h5 --robot arm.urdf --model consistent --motions 1 --out identified
       forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
-      forcegp identify log.h5 --learn tool:mass,com,inertia --learn viscous-joint-friction=0.1 --out identified
+      forcegp identify log.h5 --learn tool:mass,com,inertia,viscous-joint-friction=0.1 --out identified
     """
-
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Identify and save."""
@@ -280,7 +276,7 @@ def _report(command: Identify, found: forcegp.models.Identification, summary: Ma
     state = status if summary["converged"] else f"not converged: {status}"
     search = f"{summary['iterations']} iterations, {summary['cpu_seconds']:.1f} s CPU, {state}."
     last = f"Wrote {command.out / 'identified.urdf'}. Next: forcegp evaluate {command.out} TEST.h5"
-    return [table, Text(found.verdict), Text(search), Text(last)]
+    return [table, found.verdict, search, last]
 
 
 def _owner_and_part(name: str) -> tuple[str, str]:

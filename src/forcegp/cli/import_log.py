@@ -14,7 +14,7 @@ import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, URDF, Debug, Json, require_free_file, unless_given
+from forcegp.cli.command import LOG, MAPPING, URDF, require_free_file, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError, InvalidInput
@@ -31,12 +31,12 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 class Import(PreparationOptions, RobotOptions):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
-    State which columns are the time, the positions, velocities and forces of the joints, and their units; by flags or
-    in a YAML file (log.yaml or forcegp.yaml beside the log is found by itself). COLUMNS are names, patterns such as
-    pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
+    State which columns are the time, the positions, velocities and forces of the joints, and their units: by flags, or
+    in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS are names, patterns such
+    as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
     a --cutoff, --delay, --lag, --every or --trim, rows stay as they were logged.
 
-    For instance:
+    For example:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
       forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
@@ -48,22 +48,24 @@ class Import(PreparationOptions, RobotOptions):
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
-    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside", Path)] = None
-    """What the columns mean; flags replace its entries. Without it, log.yaml or forcegp.yaml beside the log is read."""
-    write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "no", Path)] = None
+    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
+        None
+    )
+    """What the columns mean; flags replace its entries."""
+    write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "not written", Path)] = None
     """Write the mapping that results from flags and --mapping."""
     time: Columns = None
     """Time stamps."""
-    step: Annotated[float | None, unless_given("S", "--time", float)] = None
+    step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
     """Seconds between two rows, for a log without time stamps."""
     q: Columns = None
     """Positions, one per joint."""
-    v: Columns = None
-    """Velocities; without any they are central differences of q."""
+    v: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of q", str)] = None
+    """Velocities, one per joint."""
     u: Columns = None
     """Forces or torques of the actuators; a constant such as 0 is for all joints."""
-    a: Columns = None
-    """Accelerations; without any they are central differences of v."""
+    a: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of v", str)] = None
+    """Accelerations, one per joint."""
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
     """Names of the joints in the order of the columns."""
     unit: Text = None
@@ -89,7 +91,7 @@ class Import(PreparationOptions, RobotOptions):
     resample: Literal["auto", "no"] = "auto"
     """auto: rows at uneven times are given even ones by a cubic spline. no: every stamp is kept."""
     rate: Annotated[float | None, unless_given("HZ", "the median", float)] = None
-    """Of the even times."""
+    """Rows per second of the even times."""
     start: Seconds = None
     """Leave out what comes earlier, in seconds from the first row of each episode."""
     end: Seconds = None
@@ -102,8 +104,6 @@ class Import(PreparationOptions, RobotOptions):
     """Refuse a log with more rows."""
     overwrite: bool = False
     """Replace the files if they exist."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, check and write."""

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from typing_extensions import override
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import arg
 
 import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import require_unchanged
-from forcegp.cli.command import IDENTIFIED, URDF, Command, numbers_of, unless_given
+from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -30,19 +30,13 @@ class RobotOptions(Command):
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
     """Use this robot instead of the dataset's."""
-    inertias: Annotated[Literal["strict", "nearest"], arg(metavar="strict|nearest")] = "strict"
+    inertias: Literal["strict", "nearest"] = "strict"
     """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
     inertia that a body can have, and warn how far it is."""
-    lock: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="JOINT=RAD", help_behavior_hint="(repeatable; default: as recorded)"),
-    ] = ()
-    """Hold a joint of the URDF at this position (rad or m), for instance a finger that was not recorded."""
-    armature: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="JOINT=VALUE", help_behavior_hint="(repeatable; default: as recorded, or 0)"),
-    ] = ()
-    """Rotor inertia seen at a joint, in kg m² (kg for a prismatic one)."""
+    lock: Annotated[tuple[str, ...], listed("JOINT=RAD,...", "as recorded")] = ()
+    """Hold joints of the URDF at these positions (rad or m), for instance a finger that was not recorded."""
+    armature: Annotated[tuple[str, ...], listed("JOINT=VALUE,...", "as recorded, or 0")] = ()
+    """Rotor inertias seen at joints, in kg m² (kg for a prismatic one)."""
     gravity: Annotated[str | None, unless_given("X,Y,Z", "as recorded, or 0,0,-9.81", str)] = None
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
@@ -181,6 +175,15 @@ def carried_over(
     return posterior.with_system(system)
 
 
+def require_same_joints(posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
+    """Refuse a recording of another robot: InvalidInput."""
+    if tuple(posterior.joint_names) != dataset.joint_names:
+        raise InvalidInput(
+            f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
+            f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class CutoffOptions(Command):
     """What every command asks that filters a log."""
@@ -188,7 +191,7 @@ class CutoffOptions(Command):
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
     """Low-pass filter q and u without delay, and compute v and a anew. auto: near where the spectrum shows
     the end of the motion, as held-out torques decide."""
-    differentiate: Annotated[Literal["q", "v"], arg(metavar="q|v")] = "q"
+    differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
 
     def _preparation(self) -> forcegp.Preparation:

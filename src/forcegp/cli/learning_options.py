@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.checks
@@ -18,14 +18,19 @@ import forcegp.data
 import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
-from forcegp.cli.command import DATASET, BackendOptions, numbers_of, unless_given
+from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, listed, numbers_of, unless_given
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import ContactError, ContactWarning, InvalidInput
+from forcegp.errors import ContactError, ContactWarning, InvalidInput, require_known
 
 SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
 """Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
 
+PARTS = r"(?!((viscous|coulomb|load)-joint-friction|armature|rotor-inertia)(=.*)?$)[^:]*"
+"""What continues an entry of --learn: a part of a link or a joint, but no force."""
+MODEL_PARTS = rf"{FIELDS}|(viscous|coulomb|stribeck|load|offset|direction)(/motions)?"
+"""What continues the name of a model: FIELD=VALUE of a prior, or a law of friction."""
+CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
 
 
@@ -106,9 +111,9 @@ def _known_force(name: str, system: forcegp.MechanicalSystem) -> forcegp.mechani
     return kind.from_robot(system.robot) if hasattr(kind, "from_robot") else kind(*begin.get(name, ()))
 
 
-def friction_laws(words: str) -> tuple[str, ...]:
-    """`viscous,coulomb` as a tuple; `none` is no friction. Names are checked by `forcegp.analytical`."""
-    return tuple(word for word in (part.strip() for part in words.split(",")) if word and word != "none")
+def friction_laws(given: Sequence[str]) -> tuple[str, ...]:
+    """The laws; `none` is no friction. Names are checked by `forcegp.analytical`."""
+    return tuple(law for law in given if law != "none")
 
 
 RowsChoice = Literal["auto", "in-contact", "all"]
@@ -141,7 +146,8 @@ def findings_in_one_line(
     return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
 
 
-KnownForceName = Literal["actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction"]
+KNOWN = ("actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-joint-friction")
+"""What --known-force takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,23 +170,17 @@ class LearningOptions(BackendOptions, RobotOptions):
     jobs: Annotated[int | None, unless_given("J", "1, or all that --backend has", int)] = None
     """Restarts at once."""
     adam_steps: Annotated[int, arg(metavar="N")] = 0
-    """Adam steps before them."""
+    """Adam steps before the L-BFGS iterations."""
     hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
     """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
-    contact: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="FRAME@x,y,z:SURFACE", help_behavior_hint="(repeatable; default: the dataset's)"),
-    ] = ()
-    """A point that stays on a surface, instead of the dataset's contacts; m, in the axes of the link FRAME.
+    contact: Annotated[tuple[str, ...], listed(CONTACTS, "the dataset's", goes_on=NUMBERS)] = ()
+    """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME.
     SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
     none is no contact at all."""
-    known_force: Annotated[
-        UseAppendAction[tuple[KnownForceName, ...]],
-        arg(metavar="NAME", help_behavior_hint="(repeatable; default: the dataset's)"),
-    ] = ()
+    known_force: Annotated[tuple[str, ...], listed("NAME,...", "the dataset's")] = ()
     """The complete list of known forces, instead of the dataset's: actuation, rigid-body-bias,
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
-    rows: Annotated[RowsChoice, arg(metavar="auto|in-contact|all")] = "auto"
+    rows: RowsChoice = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     checks: Annotated[bool, arg(help_behavior_hint="")] = True
@@ -213,6 +213,8 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.contact:
             system = system.with_contacts(contacts)
         if self.known_force:
+            for name in self.known_force:
+                require_known("force", name, "--known-force", KNOWN)
             names = dict.fromkeys(self.known_force)
             system = replace(system, known_forces=tuple(_known_force(name, system) for name in names))
         return system

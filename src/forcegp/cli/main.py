@@ -3,40 +3,26 @@
 import contextlib
 import difflib
 import errno
+import importlib
 import io
 import os
-import shutil
+import re
+import shlex
 import signal
 import sys
-import textwrap
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from itertools import takewhile
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
-from forcegp import __version__
-from forcegp.cli.auto import Auto
-from forcegp.cli.check import Check
-from forcegp.cli.command import Command
-from forcegp.cli.compare import Compare
-from forcegp.cli.demo import Demo
-from forcegp.cli.evaluate import Evaluate
-from forcegp.cli.excite import Excite
-from forcegp.cli.export import Export
-from forcegp.cli.fit import Fit
-from forcegp.cli.identify import Identify
-from forcegp.cli.import_log import Import
-from forcegp.cli.monitor import Monitor
-from forcegp.cli.payload import Payload
-from forcegp.cli.prepare import Prepare
-from forcegp.cli.reproduce import Reproduce
-from forcegp.cli.rollout import Rollout
-from forcegp.cli.simulate import Simulate
+from forcegp.cli.command import Command, Listed
+from forcegp.cli.help_pages import command_page, flag_of, front_page, show
 from forcegp.cli.terminal import Terminal, with_option_names
-from forcegp.cli.validate import Validate
 from forcegp.errors import ForceGPError, InvalidInput, NotEnoughMemory
 
 DESCRIPTION = """Learn the forces that nobody modelled, inside the rigid-body dynamics that are known.
@@ -50,101 +36,135 @@ or step by step:
   forcegp fit train.h5 --points 100 --out run
   forcegp evaluate run test.h5 --plots figures
 
-Every command has --help, --json and --debug. forcegp --version prints the version."""
+Every command has --help, --json and --debug, and writes its lists with commas, as in --models a,b."""
 
-COMMANDS: dict[str, tuple[type[Command], str]] = {
-    "auto": (Auto, "from logs and a URDF to a validated model, in one command"),
-    "demo": (Demo, "the whole story in a minute: simulate, learn, evaluate, draw"),
-    "simulate": (Simulate, "make a dataset with ground truth"),
-    "import": (Import, "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot"),
-    "check": (Check, "what would spoil a model of this log, and what to do about it"),
-    "prepare": (Prepare, "filter and differentiate a raw log, and report what that costs"),
-    "fit": (Fit, "learn the unknown forces from a dataset"),
-    "compare": (Compare, "which kind of unknown force the data support"),
-    "identify": (Identify, "estimate masses, inertias and friction coefficients, and their standard errors"),
-    "payload": (Payload, "mass, centre of mass and inertia of what the robot holds"),
-    "evaluate": (Evaluate, "score a fitted model on another dataset"),
-    "validate": (Validate, "models side by side on rows of a log that none of them has seen"),
-    "rollout": (Rollout, "predict whole motions and compare them with the recorded ones"),
-    "monitor": (Monitor, "when a robot was touched, where and how hard, from a log without force sensor"),
-    "excite": (Excite, "the next motion to record: the one that teaches most"),
-    "export": (Export, "write a fitted model as a C program"),
-    "reproduce": (Reproduce, "every figure and number of the paper, from one command"),
+COMMANDS: Mapping[str, str] = {
+    "auto": "from logs and a URDF to a validated model, in one command",
+    "demo": "the whole story in a minute: simulate, learn, evaluate, draw",
+    "simulate": "make a dataset with ground truth",
+    "import": "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot",
+    "check": "what would spoil a model of this log, and what to do about it",
+    "prepare": "filter and differentiate a raw log, and report what that costs",
+    "fit": "learn the unknown forces from a dataset",
+    "compare": "which kind of unknown force the data support",
+    "identify": "estimate masses, inertias and friction coefficients, and their standard errors",
+    "payload": "mass, centre of mass and inertia of what the robot holds",
+    "evaluate": "score a fitted model on another dataset",
+    "validate": "models side by side on rows of a log that none of them has seen",
+    "view": "a recording and its learned forces in 3D, in the browser",
+    "rollout": "predict whole motions and compare them with the recorded ones",
+    "monitor": "when a robot was touched, where and how hard, from a log without force sensor",
+    "excite": "the next motion to record: the one that teaches most",
+    "export": "write a fitted model as a C program",
+    "reproduce": "every figure and number of the paper, from one command",
 }
-"""A new command is a file with a subclass of Command, and an entry here."""
+"""A new command is an entry here, and a module of that name with a subclass of Command of that name."""
+MODULES = {"import": "import_log"}
+"""Names that Python does not allow for a module."""
+RENAMED: Mapping[str, Mapping[str, str]] = {
+    "compare": {"prior": "priors"},
+    "excite": {"start": "posture", "motions": "tries", "margin": "limit-share", "surface": "avoid"},
+    "reproduce": {"seeds": "seed-list"},
+    "rollout": {"start": "start-rows"},
+    "simulate": {"contact": "contact-model", "episodes": "trajectories", "friction": "tool-friction"},
+}
+"""Former names of options, which mean something else in other commands, and are still those of arguments in Python."""
+NOT_NUMBERS = {
+    r"invalid literal for int\(\) with base 10": "a whole number",
+    "could not convert string to float": "a number",
+}
+"""What Python calls a text that is no number, and what would be one."""
+SHELLS = ("bash", "zsh", "fish")
+
+
+def command_class(name: str) -> type[Command]:
+    """The class of a command; only its own module is imported, so that --help and errors come at once."""
+    module = importlib.import_module(f"forcegp.cli.{MODULES.get(name, name)}")
+    return getattr(module, name.capitalize())
 
 
 def parse_arguments(words: Sequence[str]) -> Command:
-    """The command that the words ask for. `--help` prints and raises SystemExit(0).
+    """The command that the words ask for. --help and --print-completion print and raise SystemExit(0).
 
     Raises InvalidInput, with a message of one line, for words that make no command.
     """
-    if words and words[0] in COMMANDS:
-        kind, _ = COMMANDS[words[0]]
-        return _parse(kind, words[1:], prog=f"forcegp {words[0]}")
-    if words and not words[0].startswith("-"):
-        close = difflib.get_close_matches(words[0], COMMANDS, n=1)
-        hint = f" Did you mean {close[0]}?" if close else ""
-        raise InvalidInput(f"there is no command {words[0]!r}.{hint} Available subcommands: {', '.join(COMMANDS)}.")
-    kinds: Any = None
-    for name, (kind, summary) in COMMANDS.items():
-        kind = Annotated[kind, subcommand(name, description=summary, prefix_name=False)]
-        kinds = kind if kinds is None else kinds | kind
-    return _parse(kinds, words, prog="forcegp", description=DESCRIPTION)
+    first, *others = words or [""]
+    if first in COMMANDS:
+        kind = command_class(first)
+        if {"-h", "--help"} & set(others):
+            show(command_page(first, kind))
+            raise SystemExit(0)
+        return _parse(first, kind, others)
+    if first in ("-h", "--help"):
+        show(front_page(DESCRIPTION, COMMANDS))
+        raise SystemExit(0)
+    if first == "--print-completion":
+        _print_completion(others)
+    close = difflib.get_close_matches(first, COMMANDS, n=1)
+    hint = f" Did you mean {close[0]}?" if close else " Options follow the command." if first.startswith("-") else ""
+    what = f"there is no command {first!r}.{hint}" if first else "no command was given."
+    raise InvalidInput(f"{what} Available subcommands: {', '.join(COMMANDS)}. See forcegp --help.")
 
 
-def _parse(kind: Any, words: Sequence[str], prog: str, description: str | None = None) -> Command:
-    complaint, shown, width = (
-        io.StringIO(),
-        _Shown(io.BytesIO(), sys.stdout.encoding or "utf-8", "replace"),
-        min(WIDEST, shutil.get_terminal_size().columns),
-    )
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(width)  # which tyro reads
+def _parse(name: str, kind: type[Command], words: Sequence[str]) -> Command:
+    lists = _checked_options(name, kind, words)
+    complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(shown):
-            return tyro.cli(kind, prog=prog, description=description, args=words, config=(FlagCreatePairsOff,))
-    except SystemExit as end:
-        if not end.code:
-            names = "{" + ",".join(COMMANDS) + "}"
-            print("\n".join(wrapped(shown.text().replace(names, "COMMAND"), width)))
-            raise
-        raise InvalidInput(f"{one_line(complaint.getvalue())} See {prog} --help.") from None
-    finally:
-        del os.environ["COLUMNS"]
-        os.environ |= {} if before is None else {"COLUMNS": before}
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, prog=f"forcegp {name}", args=words, config=(FlagCreatePairsOff,))
+    except SystemExit:
+        reason = one_line(complaint.getvalue())
+        unknown = re.match(r"Unrecognized options: ([^-].*?)\.(?= |$)", reason)
+        for flag, values in lists.items():
+            if unknown and len(values) > 1:
+                listed = shlex.quote(",".join(values[: 1 + len(unknown[1].split(", "))]))
+                raise InvalidInput(f"{flag} takes one list, written with commas: {flag} {listed}") from None
+        for pattern, kind_of_number in NOT_NUMBERS.items():
+            reason = re.sub(rf"Error parsing (.*?): {pattern}: (.*)\.$", rf"\1 is \2; give {kind_of_number}.", reason)
+        raise InvalidInput(f"{reason} See forcegp {name} --help.") from None
 
 
-class _Shown(io.TextIOWrapper):
-    """What would go to stdout: tyro draws the boxes and colors that fit there."""
-
-    def isatty(self) -> bool:
-        return sys.__stdout__ is not None and sys.__stdout__.isatty()
-
-    def text(self) -> str:
-        """All of it so far."""
-        self.flush()
-        self.seek(0)
-        return self.read()
-
-
-WIDEST = 100
-"""Columns of a help page at most."""
-
-
-def wrapped(text: str, width: int) -> Iterator[str]:
-    """The lines of a help page within so many columns: paragraphs at words, commands so that they can be pasted."""
-    options: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
-    for line in text.rstrip("\n").split("\n"):
-        if len(line) <= width or line.lstrip()[:1] in BOX:
-            yield line
-        elif line.startswith(" "):
-            yield from " \\\n".join(textwrap.wrap(line, width - 2, subsequent_indent="      ", **options)).split("\n")
-        else:
-            yield from textwrap.wrap(line, width, **options)
+def _checked_options(name: str, kind: type[Command], words: Sequence[str]) -> dict[str, list[str]]:
+    """The words that follow each option that takes a list. Raises InvalidInput for unknown and repeated options."""
+    hints = get_type_hints(kind, include_extras=True)
+    flags = {flag: hints[field.name] for field in fields(kind) if (flag := flag_of(field, hints[field.name]))}
+    lists = {flag for flag, hint in flags.items() if any(isinstance(each, Listed) for each in get_args(hint))}
+    given: dict[str, list[str]] = {}
+    for place, word in enumerate(takewhile("--".__ne__, words)):
+        flag, _, value = word.partition("=")
+        flag = flag.replace("_", "-")
+        if not flag.startswith("--"):
+            continue
+        if flag[2:] in RENAMED.get(name, {}):
+            raise InvalidInput(f"{flag} of forcegp {name} is now --{RENAMED[name][flag[2:]]}.")
+        if flag not in flags:
+            close = difflib.get_close_matches(flag, flags, n=1)
+            hint = f" Did you mean {close[0]}?" if close else ""
+            raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
+        values = [value] if value else list(takewhile(lambda each: not each.startswith("-"), words[place + 1 :]))
+        if flag in given:
+            entries = shlex.quote(",".join([*given[flag][:1], *values[:1]]))
+            once = f"write one list: {flag} {entries}" if flag in lists else "give it once"
+            raise InvalidInput(f"{flag} is given twice; {once}.")
+        given[flag] = values
+    return {flag: values for flag, values in given.items() if flag in lists}
 
 
-BOX = ("\x1b", "│", "╭", "╰", "├", "|", "+")  # what begins a line of a box, which has its width
+def _print_completion(words: Sequence[str]) -> None:
+    if len(words) != 1 or words[0] not in SHELLS:
+        raise InvalidInput(f"--print-completion takes the name of a shell: {', '.join(SHELLS)}.")
+    kinds: Any = None
+    for name, summary in COMMANDS.items():
+        kind: Any = Annotated[command_class(name), subcommand(name, description=summary, prefix_name=False)]
+        kinds = kind if kinds is None else kinds | kind
+    with contextlib.redirect_stdout(io.StringIO()) as script, contextlib.suppress(SystemExit):
+        tyro.cli(kinds, prog="forcegp", args=["--tyro-write-completion", words[0], "-"], config=(FlagCreatePairsOff,))
+    # a newline within a description would end it, and complete its next words as if they were options
+    text = re.sub(r"(?m)^.*COMPLETION_SPEC = .*$", lambda line: re.sub(r"\\+n *", " ", line[0]), script.getvalue())
+    for name, summary in COMMANDS.items():
+        text = text.replace(f"'{name}': {{'description': '{name}'", f"'{name}': {{'description': '{summary}'")
+    print(text, end="")
+    raise SystemExit(0)
 
 
 def one_line(box: str) -> str:
@@ -188,6 +208,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
+        from forcegp import __version__  # 30 ms that only this needs
+
         print(f"forcegp {__version__}")
         return OK
     debug, command = "--debug" in given, None
@@ -210,7 +232,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except ForceGPError as error:
-        return _fail(with_option_names(str(error), command.options if command else ()), USER_ERROR, debug)
+        message = with_option_names(str(error), command.options if command else ())
+        for argument, option in RENAMED.get(command.name if command else "", {}).items():
+            message = re.sub(rf"^{argument} is ", f"--{option} is ", message)
+        return _fail(message, USER_ERROR, debug)
     except OSError as error:
         return _fail(f"{error}{_REMEDIES.get(error.errno or 0, '')}", USER_ERROR, debug)
     except MemoryError as error:

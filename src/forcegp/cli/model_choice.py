@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import arg
 
 import forcegp
 import forcegp.data
 import forcegp.models
 import forcegp.priors
-from forcegp.cli.command import unless_given
+from forcegp.cli.command import FIELDS, listed, unless_given
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.errors import InvalidInput
 
@@ -23,6 +23,8 @@ LearnFrom = Literal["accelerations", "weak-form"]
 
 POINTS, NETWORK_POINTS = 200, 10_000
 POINTS_HINT = f"{POINTS}; all for functions of one or two inputs, as friction of the joints; networks {NETWORK_POINTS}"
+PREFERRED = "joint-friction, in contact tool-friction, unless left-out rows prefer joint or a sum"
+PRIORS = "NAME[:FIELD=VALUE,...],..."
 WINDOW = 0.1
 """Length of a window where none is given, in s."""
 ITERATIONS = 200
@@ -33,7 +35,7 @@ ITERATIONS_HINT = f"{ITERATIONS}; networks 5000, ensembles 3000"
 class FitOptions(LearningOptions):
     """What every command asks that writes one fitted model."""
 
-    out: Annotated[Path, arg(metavar="RUN")] = field()
+    out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder to write."""
 
     def _write(self, posterior: forcegp.models.Posterior, more: Mapping[str, str] | None = None) -> None:
@@ -57,35 +59,31 @@ class ModelOptions(FitOptions):
     points: Annotated[int | None, unless_given("N", POINTS_HINT, int)] = None
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N as far as
     --engine is exact."""
-    engine: Annotated[Literal["auto", "exact", "inducing"], arg(metavar="NAME")] = "auto"
+    engine: Literal["auto", "exact", "inducing"] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points.
     auto: by the number of points, the
-    features and the free memory, and reports why. See docs/large-data.md."""
+    features and the free memory, and reports why. See docs/how-to/large-data.md."""
     learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
     """Find the hyper-parameters on N of the points; the posterior is that of all points."""
     mean: Annotated[Literal["analytical", "zero"] | None, unless_given("analytical|zero", "analytical")] = None
     """analytical: the processes learn what the known forces lack. zero: they learn the known forces, too."""
-    prior: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="NAME[:FIELD=VALUE,...]", help_behavior_hint="(repeatable, they add up; default: forcegp looks)"),
-    ] = ()
-    """What the unknown forces may be. joint: a force at every joint, on (q, v, u). joint-friction: on its own velocity.
-    tool-friction: tangential forces at the contact, on its velocity. contact-friction: isotropic; load-friction:
-    the same, proportional to the normal force. joint-ripple, tool-forces, payload:frame=LINK. See docs/forces.md.
-    By default joint-friction, in contact tool-friction, unless stretches of time left out show joint, or the sum of
-    both, to be better."""
-    learn_from: Annotated[LearnFrom, arg(metavar="accelerations|weak-form")] = "accelerations"
+    prior: Annotated[tuple[str, ...], listed(PRIORS, PREFERRED, goes_on=FIELDS)] = ()
+    """What the unknown forces may be: one or several priors, which add up. joint: a force at every joint, on (q, v, u).
+    joint-friction: on its own velocity. tool-friction: tangential forces at the contact, on its velocity.
+    contact-friction: isotropic. load-friction: the same, proportional to the normal force. Further joint-ripple,
+    tool-forces, payload:frame=LINK. See docs/how-to/forces.md."""
+    learn_from: LearnFrom = "accelerations"
     """accelerations: of the dataset. weak-form: from raw positions over short windows, of
-    which --points are taken; nothing is differentiated. See docs/without-accelerations.md."""
-    window: Annotated[float | None, unless_given("SECONDS", f"{WINDOW}", float)] = None
-    """Length of the windows."""
-    motions: Annotated[float | None, unless_given("SECONDS", "none", float)] = None
-    """After that, refine friction, inertias and the unknown forces on the recorded positions, over windows so long. See
-    docs/motions.md."""
+    which --points are taken; nothing is differentiated. See docs/how-to/without-accelerations.md."""
+    window: Annotated[float | None, unless_given("S", f"{WINDOW}", float)] = None
+    """Length of the windows of weak-form."""
+    motions: Annotated[float | None, unless_given("S", "none", float)] = None
+    """After the fit, refine friction, inertias and the unknown forces on the recorded positions, over windows so long.
+    See docs/how-to/motions.md."""
     iterations: Annotated[int | None, unless_given("N", ITERATIONS_HINT, int)] = None
     """Most L-BFGS iterations of each start, or training steps of a network."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
-    """Where to compute; see docs/gpu.md. The folder that is written can be used on any machine."""
+    """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
     measured_torque: bool = False
     """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""
 

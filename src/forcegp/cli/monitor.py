@@ -16,7 +16,8 @@ import forcegp.data
 import forcegp.evaluation
 import forcegp.recordings
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import LOG, MAPPING, MODEL, Command, Debug, Json, unless_given
+from forcegp.cli.command import LOG, MAPPING, MODEL, Command, unless_given
+from forcegp.cli.input_options import require_same_joints
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
 
@@ -32,7 +33,7 @@ class Monitor(Command):
     What moves the robot beyond the model is a contact where free motion of the same robot hardly ever shows as much.
     LOG is a dataset, or any log that forcegp import reads, with the signals of the joints of the model.
 
-    For instance:
+    For example:
       forcegp monitor run log.h5 --free-seconds 120 --out contacts
       forcegp monitor run shift.csv --free morning.csv --mapping columns.yaml --false-alarms 0.01 --out contacts
     """
@@ -47,16 +48,14 @@ class Monitor(Command):
     """A log in which nothing touches the robot, of 40 s or more, which the model did not learn from."""
     free_seconds: Annotated[float | None, unless_given("S", "--free")] = None
     """Nothing touches the robot in the first S seconds of LOG; they serve as --free, and are not looked at."""
-    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside, or by the names")] = None
+    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside the log, or by the names")] = None
     """What the columns of logs mean, as for forcegp import."""
     false_alarms: Annotated[float, arg(metavar="N")] = 0.1
     """How many false alarms an hour are accepted."""
     bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
-    """Of the low-pass filter on the torques: higher is sooner, lower sees smaller forces."""
+    """Cut-off of the low-pass filter on the torques: higher is sooner, lower sees smaller forces."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Calibrate, look, draw and show."""
@@ -124,11 +123,7 @@ class Monitor(Command):
                 except InvalidInput as error:
                     raise InvalidInput(f"{error} Or write a dataset of {path} by `forcegp import`.") from None
                 dataset = forcegp.Dataset.load(out)
-        if tuple(posterior.joint_names) != dataset.joint_names:
-            raise InvalidInput(
-                f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
-                f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
-            )
+        require_same_joints(posterior, dataset, path)
         return dataset
 
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.text import Text
 from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.analytical
 from forcegp.atomic_files import write_json, write_text
-from forcegp.cli.command import DATASET, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, listed, unless_given
 from forcegp.cli.input_options import SYSTEM_FILE, PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import friction_laws
 from forcegp.cli.terminal import Terminal, columns
@@ -30,7 +29,7 @@ class Payload(PreparationOptions, RobotOptions):
     The log is a motion in the air that turns every joint in both directions, of 20 s or more. Without --baseline, what
     the URDF's links lack counts as payload. With one, both logs share the links, which are estimated, too.
 
-    For instance:
+    For example:
       forcegp payload loaded.h5 --robot arm.urdf
       forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
     """
@@ -41,7 +40,7 @@ class Payload(PreparationOptions, RobotOptions):
     """A log of the same robot without the payload."""
     link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
     """What carries the payload, and in whose frame it is reported."""
-    friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,stribeck,offset"
+    friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "stribeck", "offset")
     """What is estimated of friction, as for forcegp identify."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter of a log that is not prepared yet. auto: of which parameters predict held-out torques best."""
@@ -51,8 +50,6 @@ class Payload(PreparationOptions, RobotOptions):
     """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, estimate, write and show."""
@@ -104,4 +101,4 @@ def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
     fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
     rows = [[joint, *(f"{found.joints[f'{field}.{joint}'][0]:.3g}" for field in fields)] for joint in joints]
     tables.append(columns("joints, in Nm, rad/s and kg m²", ["joint", *(f.replace("_", "\n") for f in fields)], rows))
-    return [*tables, Text(f"{found.rows} rows.")]
+    return [*tables, f"{found.rows} rows."]

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.text import Text
 from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import DATASET, Debug, Json, require_free_file, unless_given
+from forcegp.cli.command import DATASET, require_free_file, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, facts, shown
 from forcegp.errors import InvalidInput
@@ -26,7 +25,7 @@ class Prepare(PreparationOptions, RobotOptions):
 
     The low-pass filter runs forwards and backwards, so that nothing is delayed; v and a are computed anew.
 
-    For instance:
+    For example:
       forcegp prepare log.h5 --cutoff auto --every 10 --out data.h5 --plots spectra
       forcegp prepare log.h5 --cutoff 20 --delay auto --robot arm.urdf --trim 0.1 --out data.h5
     """
@@ -39,8 +38,6 @@ class Prepare(PreparationOptions, RobotOptions):
     """Also draw the spectra before and after, with the cut-off, into this folder."""
     overwrite: bool = False
     """Replace the file if it exists, and the folder if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, save, draw if asked to, and show."""
@@ -98,5 +95,5 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
     unit = dataset.units["a"]
     title = f"What it costs; noise in {unit if isinstance(unit, str) else 'the units of each joint'}, shares of power"
     tables.append(columns(title.replace("^2", "²"), header, rows))
-    tables.append(Text("Noise is that of differenced positions above the noise floor; – where the log shows no floor."))
+    tables.append("Noise is that of differenced positions above the noise floor; – where the log shows no floor.")
     return tables

@@ -14,8 +14,8 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, Debug, Json, numbers_of, unless_given
-from forcegp.cli.input_options import SystemChoice, carried_over
+from forcegp.cli.command import DATASET, MODEL, Command, listed, numbers_of, unless_given
+from forcegp.cli.input_options import SystemChoice, carried_over, require_same_joints
 from forcegp.cli.terminal import Terminal, columns, facts, number, percent, shown
 from forcegp.errors import InvalidInput
 
@@ -28,9 +28,11 @@ MOMENTS = (0.1, 0.25, 0.5, 1.0)
 class Rollout(Command):
     """Let a fitted model predict whole motions under recorded torques, and compare them with the recording.
 
-    The motions begin at rows of the dataset. For instance:
+    The motions begin at rows of the dataset.
+
+    For example:
       forcegp rollout run test.h5 --starts 10 --seconds 1 --baumgarte 10,1 --out rollout
-      forcegp rollout run test.h5 --start 0,240 --integrator projected --samples 20 --out rollout
+      forcegp rollout run test.h5 --start-rows 0,240 --integrator projected --samples 20 --out rollout
     """
 
     run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
@@ -39,7 +41,7 @@ class Rollout(Command):
     """A recording with equal time steps that the model has not seen (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: rollout.json, rollout.h5 and rollout.png."""
-    start: Annotated[str | None, unless_given("ROW[,ROW...]", "--starts")] = None
+    start_rows: Annotated[tuple[int, ...], listed("ROW,...", "--starts", of=int)] = ()
     """Begin at these rows of the dataset."""
     starts: Annotated[int | None, unless_given("N", "10")] = None
     """Begin at so many rows, spread evenly over the recording."""
@@ -50,15 +52,13 @@ class Rollout(Command):
     integrator: Annotated[str, arg(metavar="NAME")] = "symplectic-euler"
     """symplectic-euler (as in PyBullet), rk4, implicit-midpoint (stiff friction), projected (contacts hold exactly)."""
     baumgarte: Annotated[str, arg(metavar="OMEGA[,ZETA]|none")] = "none"
-    """Stabilisation of the contacts in the rollout, rad/s and damping ratio (default 1)."""
+    """Stabilisation of the contacts in the rollout, rad/s and damping ratio (1 if left out)."""
     samples: Annotated[int, arg(metavar="N")] = 0
     """Also roll out so many functions drawn from the model, for intervals. Time grows with it."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the functions."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Roll out, compare, draw and show."""
@@ -68,11 +68,7 @@ class Rollout(Command):
 
         posterior = forcegp.load_posterior(self.run_folder)
         dataset = forcegp.Dataset.load(self.data)
-        if tuple(posterior.joint_names) != dataset.joint_names:
-            raise InvalidInput(
-                f"{self.data} has joints {', '.join(dataset.joint_names)}; the model was trained on "
-                f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
-            )
+        require_same_joints(posterior, dataset, self.data)
         posterior = carried_over(terminal, posterior, dataset, self.system)
         for sentence in forcegp.evaluation.system_warnings(posterior, dataset):
             terminal.warn(sentence)
@@ -99,14 +95,9 @@ class Rollout(Command):
         return summary
 
     def _starts(self) -> int | list[int]:
-        if self.start is not None and self.starts is not None:
-            raise InvalidInput("--start and --starts were both given; give the rows or their number.")
-        if self.start is None:
-            return DEFAULT_STARTS if self.starts is None else self.starts
-        try:
-            return [int(row) for row in self.start.split(",")]
-        except ValueError:
-            raise InvalidInput(f"--start is {self.start!r}; give row numbers such as 0 or 0,240,480.") from None
+        if self.start_rows and self.starts is not None:
+            raise InvalidInput("--start-rows and --starts were both given; give the rows or their number.")
+        return list(self.start_rows) or (DEFAULT_STARTS if self.starts is None else self.starts)
 
     def _summary(
         self,

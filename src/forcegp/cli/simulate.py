@@ -16,28 +16,34 @@ import forcegp
 import forcegp.data
 import forcegp.simulation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import Command, Debug, Json, require_free_file
+from forcegp.cli.command import Command, require_free_file, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
+
+Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum"]
+ToolFriction = Literal["viscous", "coulomb", "stribeck"]
+JointFriction = Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"]
+TOOL_FRICTION = arg(help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
+JOINT_FRICTION = arg(help_behavior_hint="(default: none; stribeck for free arms)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, by default a plane and
-    viscous friction (Rath, Geist, Trimpe 2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
+    kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, as in Rath, Geist,
+    Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
     friction in every joint, without PyBullet. Equal seeds give equal motions; train and test need different ones.
 
-    For instance:
+    For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
-      forcegp simulate kuka-surface --friction stribeck --patch 4 --joint-friction stribeck --out rough.h5
+      forcegp simulate kuka-surface --tool-friction stribeck --patch 4 --joint-friction stribeck --out rough.h5
       forcegp simulate ur5-free --seconds 60 --seed 1 --out arm.h5
       forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
     """
 
-    scenario: Positional[Literal["kuka-surface", "ur5-free", "double-pendulum"]]
-    """What to simulate."""
+    scenario: Annotated[Positional[Scenario], arg(metavar="SCENARIO")]
+    """What to simulate: kuka-surface, ur5-free or double-pendulum."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     seconds: Annotated[float, arg(metavar="S")] = 200.0
@@ -46,29 +52,24 @@ class Simulate(Command):
     """Draws the way-points and, from a stream of its own, the noise."""
     noise: Annotated[float, arg(metavar="SIGMA")] = 0.1
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
-    episodes: Annotated[int, arg(metavar="N")] = 1
+    trajectories: Annotated[int, arg(metavar="N")] = 1
     """Number of independent trajectories, each from the start posture."""
-    friction: Annotated[Literal["viscous", "coulomb", "stribeck"] | None, arg(help_behavior_hint="")] = None
+    tool_friction: Annotated[ToolFriction | None, TOOL_FRICTION] = None
     """Friction of the tool, the force that nobody models: viscous, or in proportion to the normal force
-    coulomb or stribeck. Default: viscous; coulomb with --contact bullet, which has no other."""
-    friction_coefficient: Annotated[float | None, arg(metavar="F")] = None
-    """Viscous in N/(m/s), default 1; coulomb and stribeck: friction per normal force while sliding, default 0.3."""
-    joint_friction: Annotated[
-        Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"] | None,
-        arg(help_behavior_hint=""),
-    ] = None
-    """Friction of the joints that nobody models either: dry and viscous, with stribeck and exponential more near rest;
-    asymmetric, load, lugre and drift have no kernel of their own. Default: none; free arms stribeck."""
+    coulomb or stribeck. PyBullet's contact has no other than coulomb."""
+    friction_coefficient: Annotated[float | None, unless_given("F", "1 if viscous, else 0.3", float)] = None
+    """viscous: in N/(m/s). coulomb, stribeck: friction per normal force while sliding."""
+    joint_friction: Annotated[JointFriction | None, JOINT_FRICTION] = None
+    """Friction of the joints that nobody models either: dry and viscous, with stribeck and exponential more near rest.
+    asymmetric, load, lugre and drift have no kernel of their own."""
     patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """Makes friction so many times as large on the strip 0 < x < 0.25 m of the surface; 1 for none."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
     """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
-    contact: Literal["ideal", "bullet"] = "ideal"
+    contact_model: Literal["ideal", "bullet"] = "ideal"
     """ideal: the tool never leaves the surface. bullet: PyBullet's contact, which it leaves now and then."""
     overwrite: bool = False
     """Replace the file if it exists."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Simulate and save."""
@@ -79,7 +80,7 @@ class Simulate(Command):
             dataset.save(temporary)
         seconds = time.monotonic() - start
         terminal.show(
-            f"{self.out}: {len(dataset)} rows ({self.episodes} x {self.seconds:g} s), seed {self.seed}, "
+            f"{self.out}: {len(dataset)} rows ({self.trajectories} x {self.seconds:g} s), seed {self.seed}, "
             f"noise {self.noise:g} rad/s², simulated in {seconds:.1f} s"
         )
         return {
@@ -95,16 +96,16 @@ class Simulate(Command):
 
     def _config(self) -> dict[str, Any]:
         """The fields of the scenario's configuration that the options set."""
-        given = {name: getattr(self, name) for name in ("seconds", "seed", "noise", "episodes", "joint_friction")}
-        fields = {name: value for name, value in given.items() if value is not None}
+        given = {name: getattr(self, name) for name in ("seconds", "seed", "noise", "joint_friction")}
+        fields = {name: value for name, value in given.items() if value is not None} | {"episodes": self.trajectories}
         if self.scenario != "kuka-surface":
-            for word in self.words("friction", "friction_coefficient", "patch", "surface", "contact"):
+            for word in self.words("tool_friction", "friction_coefficient", "patch", "surface", "contact_model"):
                 raise InvalidInput(f"{word} means nothing to {self.scenario}, whose arm touches nothing; leave it out.")
             return {"arm": self.scenario, **fields}
-        fields |= {name: getattr(self, name) for name in ("friction", "surface", "contact")}
+        fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}
         fields["patch_factor"] = self.patch
         if self.friction_coefficient is not None:
-            dry = self.friction in ("coulomb", "stribeck") or self.contact == "bullet"
+            dry = self.tool_friction in ("coulomb", "stribeck") or self.contact_model == "bullet"
             fields["coulomb_coefficient" if dry else "viscous_coefficient"] = self.friction_coefficient
         return fields
 

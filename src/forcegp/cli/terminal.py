@@ -11,17 +11,14 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import Any, Protocol
-
-from rich import box
-from rich.console import Console, RenderableType
-from rich.measure import Measurement
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING, Any, Protocol
 
 import forcegp
 import forcegp.evaluation
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.table import Table
 
 _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
@@ -98,11 +95,15 @@ class Terminal:
     @cached_property
     def out(self) -> Console:
         """What the command found."""
+        from rich.console import Console
+
         return Console(highlight=False, soft_wrap=False)
 
     @cached_property
     def err(self) -> Console:
         """What happens meanwhile."""
+        from rich.console import Console
+
         return Console(stderr=True, highlight=False, soft_wrap=True)
 
     def __enter__(self) -> Terminal:
@@ -131,9 +132,12 @@ class Terminal:
                 stdout.write(text)
 
     def show(self, *renderables: RenderableType) -> None:
-        """Print the result; nothing with --json. A table that needs more columns than there are gets them."""
+        """Print the result, texts as they are; nothing with --json. A table gets the columns that it needs."""
         if not self.json:
-            for renderable in renderables:
+            from rich.console import Console
+            from rich.text import Text
+
+            for renderable in (Text(each) if isinstance(each, str) else each for each in renderables):
                 needed = _columns_needed(self.out, renderable)
                 console = self.out if needed <= self.out.width else Console(highlight=False, width=needed)
                 console.print(renderable)
@@ -141,7 +145,7 @@ class Terminal:
     def command(self, words: str) -> None:
         """A command to copy, in one line whatever the width."""
         if not self.json:
-            self.out.print(Text(words, style="bold"), soft_wrap=True)
+            self.out.print(words, style="bold", markup=False, soft_wrap=True)
 
     def note(self, text: str) -> None:
         """Report on stderr what was done."""
@@ -178,6 +182,8 @@ class Terminal:
         return report
 
     def _bar(self, what: str, may_end_early: bool) -> Iterator[ProgressCallback]:
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
         columns = (
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -198,6 +204,9 @@ class Terminal:
 
 def _columns_needed(console: Console, renderable: RenderableType) -> int:
     """Columns without which a table of numbers would cut them: a number without its end is a wrong number."""
+    from rich.measure import Measurement
+    from rich.table import Table
+
     if not isinstance(renderable, Table) or not any(column.no_wrap for column in renderable.columns):
         return 0
     wide = console.options.update(width=UNLIMITED)
@@ -226,6 +235,9 @@ PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_ed
 
 def facts(title: str, values: Mapping[str, str]) -> Table:
     """Names and values, one per line."""
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(title=title, box=None, show_header=False, **PLAIN)
     table.add_column(style="dim")
     table.add_column()
@@ -246,15 +258,19 @@ def columns(
 
     Texts of the first column are folded where they are `long_names`, all other cells never.
     """
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(title=title, box=box.SIMPLE_HEAD, collapse_padding=True, **PLAIN)
     for place, name in enumerate(header):
         folded = long_names and not place
-        table.add_column(name, justify="right" if place else "left", no_wrap=not folded, overflow="fold")
+        table.add_column(Text(name), justify="right" if place else "left", no_wrap=not folded, overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))  # as a str, "[Nm]" would be a style
     if last:
         table.add_section()
-        table.add_row(*last, style="bold")
+        table.add_row(*map(Text, last), style="bold")
     return table
 
 

@@ -8,39 +8,34 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
-from rich.text import Text
 from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.validation
-from forcegp.cli.command import DATASET, BackendOptions, Debug, Json, unless_given
+from forcegp.cli.command import DATASET, BackendOptions, Resuming, listed, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
-from forcegp.cli.learning_options import friction_laws
+from forcegp.cli.learning_options import MODEL_PARTS, friction_laws
 from forcegp.cli.terminal import NONE, Terminal, columns, number
-from forcegp.errors import InvalidInput
 
 SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")
 """Options that have the names of fields of `forcegp.Comparison`."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validate(BackendOptions, PreparationOptions, RobotOptions):
+class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     """Fit models side by side, score them on rows that are held out, and write one page about them.
 
     Every model learns from the same rows; what is held out is whole episodes, or blocks of time with a guard around
     them. A run that was interrupted goes on with the same command; one with more --models or --seeds computes only
     these. The page is report.md in the folder, the numbers are in results.json, and the recommended model, learned from
-    all rows, is in model; see docs/validation.md.
+    all rows, is in model; see docs/how-to/validation.md.
 
-    For instance:
+    For example:
       forcegp validate log.h5 --robot arm.urdf --split episodes:3,7 --cutoff 20 --trim 0.1 --every 5 --out results
-      forcegp validate log.h5 --split blocks:5:3,5 --guard 0.25 --models analytical joint-friction@identified --out few
+      forcegp validate log.h5 --split blocks:5:3,5 --guard 0.25 --models analytical,joint-friction@identified --out few
     """
-
-    interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
-    replaces: ClassVar[bool] = False
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset (HDF5), raw or prepared."""
@@ -52,14 +47,14 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     auto: a quarter of the episodes, or with one episode blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
     """Seconds of training rows left out beside held-out blocks."""
-    models: Annotated[tuple[str, ...], unless_given("NAME", "all but single networks")] = ()
+    models: Annotated[tuple[str, ...], listed("NAME,...", "all but single networks", goes_on=MODEL_PARTS)] = ()
     """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
     PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
     identified. NAME/motions: refined on the motions of the training rows."""
     identification: Annotated[str, arg(metavar="METHOD")] = "acceleration-all"
     """What @identified takes, and whose mass matrix turns errors of accelerations into forces: from all training rows
     acceleration-all or torque-all, from --points acceleration, torque or least-squares."""
-    friction: Annotated[str, arg(metavar="LAW,LAW...")] = "viscous,coulomb"
+    friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, offset and direction; or
     none."""
     every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
@@ -70,13 +65,13 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     margin: Annotated[float, arg(metavar="RATIO")] = 0.02
     """Models whose errors differ by less count as equal."""
     seeds: Annotated[int, arg(metavar="N")] = 5
-    """So many choices of these rows."""
-    horizon: Annotated[str, arg(metavar="S,S...")] = "0.1,0.2,0.5,1.0"
+    """So many choices of the rows that models learn from."""
+    horizon: Annotated[tuple[float, ...], listed("S,...", of=float)] = (0.1, 0.2, 0.5, 1.0)
     """Lengths of the motions that are predicted from held-out states, in s."""
     starts: Annotated[int, arg(metavar="N")] = 10
     """Motions from every held-out stretch of time."""
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
-    """Of these motions: rk4, symplectic-euler, implicit-midpoint or projected."""
+    """How motions are predicted: rk4, symplectic-euler, implicit-midpoint or projected."""
     restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
     """Starts of every search for hyper-parameters; the best is kept."""
     iterations: Annotated[int | None, unless_given("N", "200", int)] = None
@@ -90,16 +85,13 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
     """Pieces of work at once, each on one core."""
     overwrite: bool = False
     """Compute everything anew where the folder holds results."""
-    json: Json = False
-    debug: Debug = False
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Compute what is missing, and write the page."""
         backend = self._backend()
-        horizons = self._horizons()
         start = time.monotonic()
 
-        comparison = self._comparison(terminal, horizons)
+        comparison = self._comparison(terminal)
         with terminal.progress(f"validating: {len(comparison.splits)} split(s), {self.seeds} seed(s)") as report:
             validation = forcegp.validate(
                 comparison,
@@ -133,7 +125,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         )
         return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
 
-    def _comparison(self, terminal: Terminal, horizons: tuple[float, ...]) -> forcegp.Comparison:
+    def _comparison(self, terminal: Terminal) -> forcegp.Comparison:
         raw = forcegp.Dataset.load(self.data)
         system = self.chosen_system(raw, self.data)
         raw = replace(raw, system=system)
@@ -152,7 +144,7 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
             recording,
             system,
             forcegp.split_named(rows, self.split, self.guard),
-            horizons=horizons,
+            horizons=self.horizon,
             friction=friction_laws(self.friction),
             **{name: getattr(self, name) for name in SAME},
         )
@@ -167,12 +159,6 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
                 f"--guard {self.guard:g} s is shorter than two time constants of the filter ({2.0 * memory:.2g} s), so "
                 "rows on both sides of a border share measurements; give a longer one."
             )
-
-    def _horizons(self) -> tuple[float, ...]:
-        try:
-            return tuple(float(word) for word in self.horizon.split(","))
-        except ValueError:
-            raise InvalidInput(f"--horizon is {self.horizon!r}; give seconds with commas, as in 0.1,0.5,1.") from None
 
     def _source(self) -> dict[str, Any]:
         digest = hashlib.sha256(self.data.read_bytes()).hexdigest()
@@ -202,13 +188,13 @@ class Validate(BackendOptions, PreparationOptions, RobotOptions):
         header = ["model", "nRMSE", "force error", "NLPD", "in 95 %", "motion"]
         title = f"{self.data}: medians over {len(document['seeds'])} seed(s) and {len(document['splits'])} split(s)"
         failed = [
-            Text(f"{name} failed in {len(model['failures'])} run(s): {model['failures'][0]['error']}")
+            f"{name} failed in {len(model['failures'])} run(s): {model['failures'][0]['error']}"
             for name, model in document["models"].items()
             if model["failures"]
         ]
         answers = [
-            Text(f"By the {forcegp.validation.SCORES[score]} take {found['model']}: {found['why'].replace('**', '')}")
+            f"By the {forcegp.validation.SCORES[score]} take {found['model']}: {found['why'].replace('**', '')}"
             for score, found in document["winners"].items()
         ]
-        page = Text(f"The page: {self.out / 'report.md'}")
+        page = f"The page: {self.out / 'report.md'}"
         return [columns(title, header, rows, long_names=True), *failed, *answers, page]

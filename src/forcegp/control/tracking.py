@@ -115,7 +115,7 @@ class ComputedTorque(TrackingController):
     * model: `posterior.predictor()`, or a `MechanicalSystem` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
     * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
-      velocity dry friction follows the noise of v and every overshoot, one sample late (measured in docs/control.md).
+      velocity dry friction follows the noise of v and every overshoot, one sample late (docs/how-to/control.md).
     * gain_factor: a factor (nv,) on the stiffness from the standard deviations (nv,) of the model's acceleration in
       rad/s^2 (m/s^2): firm where the model is not sure, as in Beckers, Kulic, Hirche (2019), "Stable Gaussian process
       based tracking control". It needs a predictor with covariance.

@@ -222,7 +222,7 @@ class Dataset(Summary):
         return self.select_episodes(rest), test
 
     def save(self, path: str | Path) -> None:
-        """Write an HDF5 file (docs/data-format.md); an interrupted write leaves the old file, or none."""
+        """Write an HDF5 file (docs/how-to/data-format.md); an interrupted write leaves the old file, or none."""
         write_fields(Path(path), self._fields())
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""The dataset file: HDF5, version 1, described in docs/data-format.md.
+"""The dataset file: HDF5, version 1, described in docs/how-to/data-format.md.
 
 Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
 """

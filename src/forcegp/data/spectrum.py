@@ -4,7 +4,8 @@ Spectra are Welch's (1967, "The use of fast Fourier transform for the estimation
 all episodes. Positions are differenced first and the spectrum divided by the gain of the differences, so that the
 slow, strong motion does not leak into the band of the noise (prewhitening; Percival & Walden 1993, section 6.5).
 
-Why the knee of the differentiated spectrum, the floor above it and the cut-off belong together: docs/checking.md.
+Why the knee of the differentiated spectrum, the floor above it and the cut-off belong together:
+docs/how-to/checking.md.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """Windows: what a log shows of accelerations over short stretches of time, without differentiating it.
 
-With a test function phi of integral 1, y = int phi a dt comes from q or v alone (docs/without-accelerations.md): the
-weak form (Messenger & Bortz 2021, "Weak SINDy"). It is linear in the unknown forces, and exactly so; no filter comes
-before. White noise of the signal makes independent noise of y.
+With a test function phi of integral 1, y = int phi a dt comes from q or v alone
+(docs/how-to/without-accelerations.md): the weak form (Messenger & Bortz 2021, "Weak SINDy"). It is linear in the
+unknown forces, and exactly so; no filter comes before. White noise of the signal makes independent noise of y.
 """
 
 import warnings

@@ -3,7 +3,8 @@
 Imports are read from the source, not carried out. Followed are those into forcegp and into the module's own package;
 other libraries are not, their versions stand in `machine`. `from forcegp.data import Dataset` and
 `forcegp.data.Dataset` count the module that defines the name: packages re-export names from their modules, by imports
-or by a stub `__init__.pyi` for lazy ones. Comments, docstrings, line breaks and imports for type checkers do not count.
+or by a stub `__init__.pyi` for lazy ones. C texts and templates beside a module that names them count, too. Comments,
+docstrings, line breaks and imports for type checkers do not count.
 Only what a program decides while it runs escapes, names of modules put together from pieces for example.
 """
 
@@ -24,6 +25,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+NAMED_FILE = re.compile(r"[\w/.-]+\.(c|h|jinja)")  # "lanes.h": what a module reads from a file beside it
 OWN = __name__.partition(".")[0]
 NAMED_IN_TEXT = re.compile(rf"({OWN}(?:\.\w+)+)(?::\w+)?")  # "forcegp.experiments.fits:fit": tasks and scenarios
 Import = tuple[str, str | None]
@@ -187,7 +189,12 @@ def _source(file: Path) -> _Source:
         body = getattr(node, "body", None)
         if isinstance(body, list):
             body[:] = [part for part in body if not _is_text(part)]
-    return _Source(tree, hashlib.sha256(ast.dump(tree).encode()).hexdigest())
+    digest = hashlib.sha256(ast.dump(tree).encode())
+    texts = (node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    for name in sorted({text for text in texts if NAMED_FILE.fullmatch(text)}):
+        if (file.parent / name).is_file():
+            digest.update((file.parent / name).read_bytes())
+    return _Source(tree, digest.hexdigest())
 
 
 def _is_text(node: ast.AST) -> bool:

@@ -188,7 +188,7 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     velocity near rest, and little beyond. e is zero at visited velocities (`BeyondVisitedKernel`). Each of the three
     shares gets a third of `variance` at the start; w and w' start at 0.1, l at 1; all have log-normal priors about
     their start values, of a spread of 1, variances of 2. h is rough (Matern 1/2): smoother ones are as good where a law
-    bends slowly, and fail where it bends within a few cm/s (docs/forces.md).
+    bends slowly, and fail where it bends within a few cm/s (docs/how-to/forces.md).
     Source of the law: Olsson et al., "Friction models and friction compensation", Eur. J. Control (1998), section 2.
     """
     if dimension != 1:

@@ -97,7 +97,7 @@ def _why() -> str:
     if _gpus():
         return ""
     if torch.version.cuda is None and torch.version.hip is None:
-        return f" (torch {torch.__version__} is built for the CPU alone; docs/gpu.md names the build for GPUs)"
+        return f" (torch {torch.__version__} is built for the CPU alone; docs/how-to/gpu.md names the build for GPUs)"
     return " (torch finds no GPU: see the output of nvidia-smi)"
 
 

@@ -1,4 +1,5 @@
 from .free_arms import simulate_free_arm as simulate_free_arm
+from .kuka_motion import kuka_file as kuka_file
 from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface
 from .kuka_surface_config import (
     FreeArmConfig as FreeArmConfig,

@@ -28,6 +28,15 @@ TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
 
 
+def kuka_file() -> Path:
+    """The URDF of the arm, with meshes beside it, in PyBullet's data. Raises MissingExtra without PyBullet."""
+    try:
+        import pybullet_data
+    except ImportError as error:
+        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
+    return Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+
+
 def kuka_urdf(config: KukaSurfaceConfig) -> str:
     """The URDF with the inertia of link 7, the joint damping and the base height of a scenario.
 
@@ -35,11 +44,7 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     Dataset, and collisions are off. The base cannot move and is massless. The licence comment of the original stays at
     the head. Raises MissingExtra without PyBullet.
     """
-    try:
-        import pybullet_data
-    except ImportError as error:
-        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
-    path = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+    path = kuka_file()
     text = path.read_text(encoding="utf-8")
     root = ElementTree.fromstring(text)
     for unused in root.findall("material"):

@@ -3,7 +3,7 @@
 A name is an entry of `CANDIDATES`, a way to identify the system (`identified-torque`), or an expression of priors as in
 `forcegp fit --prior` with the system that its mean takes: `joint-friction` (as given), `joint@identified`. A way to
 identify may name friction laws of its own (`identified-torque:viscous,load`), and with `/motions` at its end a model is
-refined on the motions of all training rows (docs/motions.md). Add yours:
+refined on the motions of all training rows (docs/how-to/motions.md). Add yours:
 
     CANDIDATES["mine"] = Candidate("what it is", "black box", fit_mine)
 """

@@ -1,7 +1,0 @@
-"""`python -m forcegp.cli`: the same as the command `forcegp`."""
-
-import sys
-
-from forcegp.cli.main import main
-
-sys.exit(main())

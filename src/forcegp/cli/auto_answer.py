@@ -1,0 +1,117 @@
+"""What `forcegp auto` found, in ten lines and in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import forcegp
+import forcegp.analytical
+import forcegp.checks
+from forcegp.cli.terminal import number
+
+INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
+METHOD = "torque-all"
+NAMES = {"analytical": "the URDF", f"identified-{METHOD}": "identified", f"joint-friction@{METHOD}": "friction learned"}
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+
+
+def answer_lines(
+    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: forcegp.AnalyticalIdentification, held: str
+) -> list[tuple[str, str]]:
+    """What was found, in ten lines."""
+    names, values = dataset.joint_names, identified.values
+    import_, prepared = content["import"], content["preparation"]
+    deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
+    jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
+    seconds = content["seconds"]
+    rate = (len(dataset) - len(dataset.episodes)) / seconds
+    mistakes = ", ".join(_corrected(each) for each in content["mistakes"]) or "nothing"
+    late = prepared["delay"][0]
+    when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
+    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else "u shows no delay"
+    filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
+
+    def each(field: str, pattern: str = "{:.3g}") -> str:
+        return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in names)
+
+    units = [dataset.units[name] for name in ("q", "u")]
+    q, force = (unit if isinstance(unit, str) else " or ".join(dict.fromkeys(unit)) for unit in units)
+    models = content["models"]
+    scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
+    best = content["recommended"]
+    covered = models[best]["coverage_95"]
+    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
+    weak = ", ".join(name for name, _ in content["weak"][:3])
+    out = content["out"]
+    return [
+        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {len(names)} joints{jitter}"),
+        ("corrected", mistakes),
+        ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
+        ("dry friction", f"{each('coulomb')} {force}, near rest {each('breakaway')} more"),
+        ("viscous", f"{each('viscous')} {force} per {q}/s"),
+        ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
+        ("payload", held),
+        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
+        ("trust", f"{NAMES.get(best, best)}{intervals}"),
+        (
+            "record next",
+            f"forcegp excite {out}/model --seconds 10 --out next.csv"
+            + (f" (least is known of {weak})" if weak else ""),
+        ),
+        ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
+    ]
+
+
+def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
+    """Which model to trust, and how much better than the URDF it is on unseen time."""
+    models, best = content["models"], content["recommended"]
+    unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
+    scores = {
+        f"positions {_horizon(models[best])} ahead are wrong by {{:.2g}} {unit}": _motion,
+        "accelerations are wrong by {:.2g} of their standard deviation": _acceleration,
+    }
+    name = NAMES.get(best, best)
+    for pattern, score in scores.items():
+        own, urdf = score(models[best]), score(models.get("analytical"))
+        if own is not None:
+            against = "" if urdf is None or best == "analytical" else f", with the URDF alone by {urdf:.2g}"
+            if urdf is None and score is _motion and "analytical" in models:
+                against = "; with the URDF alone they diverge"
+            return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}."
+    return f"Trust the model “{name}”."
+
+
+def _horizon(model: Mapping[str, Any]) -> str:
+    motions = model.get("motions")
+    return f"{motions['horizons'][-1]:g} s" if motions and motions["horizons"] else ""
+
+
+def _motion(model: Mapping[str, Any] | None) -> float | None:
+    motions = None if model is None else model.get("motions")
+    last = motions["rms"][-1] if motions and motions["rms"] else None
+    return None if last is None else last["median"]
+
+
+def _acceleration(model: Mapping[str, Any] | None) -> float | None:
+    error = None if model is None else model.get("nrmse")
+    return None if error is None else error["median"]
+
+
+def payload_text(payload: forcegp.analytical.PayloadEstimate) -> str:
+    """Mass with its 95 % interval and place; or that there is none."""
+    mass, error = payload.mass, 1.96 * payload.standard_errors["mass"]
+    if mass < max(SURE / 1.96 * error, LEAST_PAYLOAD):
+        return f"none ({mass:.2g} ± {error:.1g} kg)"
+    center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
+    return f"{mass:.3g} ± {error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
+
+
+def _corrected(mistake: Mapping[str, Any]) -> str:
+    """`q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected."""
+    flags = forcegp.checks.import_flags(mistake["correction"])
+    return flags.replace("--unit ", "").replace("--", "") or mistake["subject"]
+
+
+def _score(model: Mapping[str, Any]) -> str:
+    return f"{number(_motion(model))} / {number(_acceleration(model))}"

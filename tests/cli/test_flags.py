@@ -1,0 +1,170 @@
+"""The grammar of the command line: one list syntax, one meaning for each name, one way to give an option."""
+
+import re
+import shlex
+from typing import Annotated, get_args, get_origin, get_type_hints
+
+import pytest
+
+from forcegp.cli.command import FIELDS, NUMBERS, split_list
+from forcegp.cli.help_pages import command_page
+from forcegp.cli.learning_options import MODEL_PARTS, PARTS
+from forcegp.cli.main import COMMANDS, RENAMED, command_class, parse_arguments
+from forcegp.errors import InvalidInput
+
+FIT = "fit x.h5 --out run"
+
+
+def refused(words):
+    with pytest.raises(InvalidInput) as error:
+        parse_arguments(shlex.split(words))
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "field", "entries"),
+    [
+        ("validate x.h5 --out r --models analytical,ensemble", "models", ("analytical", "ensemble")),
+        (
+            "validate x.h5 --out r --models a@identified:viscous,load,joint:inputs=q/v,kernel=k,b/motions",
+            "models",
+            ("a@identified:viscous,load", "joint:inputs=q/v,kernel=k", "b/motions"),
+        ),
+        (f"{FIT} --prior tool-friction,joint-friction", "prior", ("tool-friction", "joint-friction")),
+        (f"{FIT} --prior payload:frame=tool,x=1,joint", "prior", ("payload:frame=tool,x=1", "joint")),
+        (f"{FIT} --prior 'a:kernel=(k + deep(x, y)),b'", "prior", ("a:kernel=(k + deep(x, y))", "b")),
+        ("compare x.h5 --priors 'a,a + b'", "priors", ("a", "a + b")),
+        (
+            f"{FIT} --contact tool@0,-1e-3,0.1:plane:0,0,1,.055,link_2:sphere:0,0,0,1",
+            "contact",
+            ("tool@0,-1e-3,0.1:plane:0,0,1,.055", "link_2:sphere:0,0,0,1"),
+        ),
+        ("excite run --out f --limits velocity=1,1,2,torque=5", "limits", ("velocity=1,1,2", "torque=5")),
+        (
+            "identify x.h5 --out r --learn hand:mass,com,armature:pan,lift=0.1,coulomb-joint-friction",
+            "learn",
+            ("hand:mass,com", "armature:pan,lift=0.1", "coulomb-joint-friction"),
+        ),
+        (f"{FIT} --lock a=1,b=-0.5", "lock", ("a=1", "b=-0.5")),
+        ("identify x.h5 --out r --friction none", "friction", ("none",)),
+        ("reproduce fig3 --points 10,20 --seed-list 7", "points", (10, 20)),
+        ("rollout run x.h5 --out r --start-rows 0,240", "start_rows", (0, 240)),
+        ("validate x.h5 --out r --horizon 0.1,1", "horizon", (0.1, 1.0)),
+        ("import x.csv --out f.h5 --q 'Winkel_A{1..6}' --u 'a,b'", "u", "a,b"),
+    ],
+)
+def test_lists_are_written_with_commas(words, field, entries):
+    assert getattr(parse_arguments(shlex.split(words)), field) == entries
+
+
+def test_what_a_list_prints_is_read_again():
+    command = parse_arguments(shlex.split(f"{FIT} --prior payload:frame=a,b=1,joint --lock a=1,b=2 --gravity=-1,0,0"))
+    words = command.words("prior", "lock", "gravity")
+    assert words == ["--prior", "payload:frame=a,b=1,joint", "--lock", "a=1,b=2", "--gravity=-1,0,0"]
+    again = parse_arguments([*shlex.split(FIT), *words])
+    assert again == command
+
+
+def test_what_continues_an_entry():
+    continues = {
+        NUMBERS: ("0", "-1.5", ".5", "1e-3", "0.1:plane:0"),
+        FIELDS: ("inputs=q/v", "kernel = x"),
+        PARTS: ("mass", "com", "pan", "lift=0.1", "armature_1"),
+        MODEL_PARTS: ("load", "load/motions", "inputs=v"),
+    }
+    begins = {
+        NUMBERS: ("tool", "0_link:plane:0", "velocity=1"),
+        FIELDS: ("joint", "payload:frame=x", "a + b"),
+        PARTS: ("hand:mass", "armature", "viscous-joint-friction=0.1"),
+        MODEL_PARTS: ("analytical", "joint-friction@identified", "payload:frame=x"),
+    }
+    assert [(p, each) for p, found in continues.items() for each in found if not re.fullmatch(p, each)] == []
+    assert [(p, each) for p, found in begins.items() for each in found if re.fullmatch(p, each)] == []
+
+
+def test_forces_and_laws_of_lists_are_those_of_the_library():
+    from forcegp.analytical import LAWS
+    from forcegp.mechanics import KNOWN_FORCES
+
+    learned = {name for name, kind in KNOWN_FORCES.items() if kind.learned is not None}
+    assert all(not re.fullmatch(PARTS, name) for name in learned)
+    assert all(re.fullmatch(MODEL_PARTS, law) for law in LAWS)
+
+
+@pytest.mark.parametrize("text", ["", "a,", ",a", "a,,b", " , "])
+def test_empty_entries_are_refused(text):
+    with pytest.raises(ValueError, match="empty entry"):
+        split_list(text)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("validate x.h5 --out r --models a b c", "--models takes one list, written with commas: --models a,b,c"),
+        ("validate --models a b x.h5 --out r", "--models takes one list, written with commas: --models a,b"),
+        ("reproduce fig3 --points 50 100", "--points takes one list, written with commas: --points 50,100"),
+        (f"{FIT} --prior a --prior b", "--prior is given twice; write one list: --prior a,b"),
+        (f"{FIT} --prior=a --seed 1 --prior 'b + c'", "--prior is given twice; write one list: --prior 'a,b + c'"),
+        (f"{FIT} --known_force a --known-force b", "--known-force is given twice; write one list"),
+        (f"{FIT} --seed 1 --seed 2", "--seed is given twice; give it once"),
+        ("reproduce fig3 --points 10,x", "'10,x' is no list of whole numbers, as 1,2 is."),
+        ("validate x.h5 --out r --horizon 1,,2", "'1,,2' holds an empty entry"),
+        (f"{FIT} --pionts 3", "forcegp fit has no option --pionts. Did you mean --points? See forcegp fit --help."),
+        (f"{FIT} --seed a", "--seed is 'a'; give a whole number. See forcegp fit --help."),
+        (f"{FIT} --force-noise 1,5", "--force-noise is '1,5'; give a number. See forcegp fit --help."),
+        ("fit --pionts", "has no option --pionts. Did you mean --points?"),
+        ("fit --data x.h5 --out run", "has no option --data."),
+        ("fit x.h5 --checks --out run", "has no option --checks. Did you mean --no-checks?"),
+        ("--json", "Options follow the command"),
+        ("", "no command was given"),
+    ],
+)
+def test_what_is_no_list_is_refused_with_the_list(words, message):
+    assert message in refused(words)
+    assert "\n" not in refused(words)
+
+
+@pytest.mark.parametrize(("command", "old"), [(name, old) for name, names in RENAMED.items() for old in names])
+def test_former_names_are_refused_with_the_new_ones(command, old):
+    new = RENAMED[command][old]
+    assert refused(f"{command} --{old} 1") == f"--{old} of forcegp {command} is now --{new}."
+    assert new.replace("-", "_") in command_class(command).__dataclass_fields__
+    assert any(old in command_class(other).__dataclass_fields__ for other in COMMANDS), "no other command has the name"
+
+
+VALUES_OF_OTHER_KINDS = {"out": "a file or a folder, which the command names"}
+"""Options whose value is of one kind for some commands and of another for others, and why."""
+
+
+def test_a_name_means_the_same_for_all_commands():
+    """The value of an option has the same unit and the same type wherever the option is."""
+    found: dict[str, dict[str, set[str]]] = {}
+    for command in COMMANDS:
+        page = command_page(command, command_class(command))
+        types = get_type_hints(command_class(command))
+        for flag, value in re.findall(r"^  --([a-z-]+)((?: \S+)?)(?:$|  )", page, re.MULTILINE):
+            name = flag.replace("-", "_")
+            quantity = "|".join(re.findall(r"[A-Z@]+", value)) or ("words" if value else "switch")
+            single = quantity if not re.fullmatch(r"([A-Z]\|?)+", quantity) else quantity.partition("|")[0]
+            kind = "switch" if types.get(name) is bool else single
+            found.setdefault(name, {}).setdefault(kind, set()).add(command)
+    differing = {name: kinds for name, kinds in found.items() if len(kinds) > 1 and name not in VALUES_OF_OTHER_KINDS}
+    assert differing == {}
+    assert len(found) > 100
+
+
+def test_an_option_has_one_type():
+    """Apart from whether it is optional, and from lists, which have entries of that type."""
+
+    def base(hint):
+        if get_origin(hint) is Annotated:
+            hint = get_args(hint)[0]
+        parts = {part for part in get_args(hint) if part not in (type(None), ...)} or {hint}
+        return {part if isinstance(part, type) else str for part in parts}
+
+    types: dict[str, set[type]] = {}
+    for command in COMMANDS:
+        for name, hint in get_type_hints(command_class(command)).items():
+            if name in command_class(command).__dataclass_fields__:
+                types.setdefault(name, set()).update(base(hint))
+    assert {name: kinds for name, kinds in types.items() if len(kinds) > 1} == {"noise": {str, float}}
