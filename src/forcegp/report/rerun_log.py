@@ -19,7 +19,7 @@ def write_rerun(path: str | Path, recorded: RecordedScene, *, overwrite: bool = 
     Raises MissingExtra without rerun-sdk, InvalidInput where the file is there or its folder is not.
     """
     try:
-        import rerun as rr
+        import rerun as rr  # pyright: ignore[reportMissingImports]  # an extra that `make check` does not install
     except ImportError as error:
         raise MissingExtra("a log for rerun needs rerun-sdk: pip install 'forcegp[rerun]'") from error
     with atomic_file(path, overwrite=overwrite) as temporary:
