@@ -83,8 +83,6 @@ WRONG = {
         errors.UnsupportedJoint,
         ["joint 'hinge'", "'revolut'", "Did you mean 'revolute'"],
     ),
-    "floating": (changed('"revolute"', '"floating"'), errors.UnsupportedJoint, ["joint 'hinge'", "type 'fixed'"]),
-    "planar": (changed('"revolute"', '"planar"'), errors.UnsupportedJoint, ["joint 'hinge'", "two prismatic"]),
     "mimic": (
         changed("<axis", '<mimic joint="other" multiplier="2"/><axis'),
         errors.UnsupportedJoint,

@@ -206,6 +206,17 @@ def axis_inertia_vanishes(pseudo: np.ndarray) -> bool:
     return bool(second_moments[:2].sum() <= SINGULAR * second_moments.sum())
 
 
+def turns_with_inertia(kind: str, pseudo: np.ndarray) -> bool:
+    """Whether a body (pseudo-inertia (4, 4)) under a planar, spherical or floating joint resists every turn.
+
+    A spherical joint turns it about the origin; the others leave it free to turn about its centre of mass.
+    """
+    first, mass = pseudo[:3, 3], pseudo[3, 3]
+    second = pseudo[:3, :3] - (0.0 if kind == "spherical" else np.outer(first, first) / mass)
+    least = second[0, 0] + second[1, 1] if kind == "planar" else np.linalg.eigvalsh(second)[1]
+    return bool(least > SINGULAR * pseudo.diagonal()[:3].sum())
+
+
 def log_cholesky_of_link(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, link: str) -> Tensor:
     """Log-Cholesky parameters (10,) of a link, called ``link`` in errors.
 

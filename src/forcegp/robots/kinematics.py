@@ -17,6 +17,7 @@ vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the bat
 differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated differentiation apply.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,6 +28,7 @@ from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.arguments import Inertials, JointValues, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD, Tree
+from forcegp.robots.manifold import Group, pose
 from forcegp.robots.structure import RobotStructure
 
 Bodies = Float[Tensor, "n 4 4 batch"]
@@ -56,10 +58,13 @@ def over_tree(matrix: Float[Tensor, "n n"], values: Float[Tensor, "n rows column
 
 def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Bodies:
     """Pose T of every body frame in the world."""
-    local = torch.addcmul(tree.rest, tree.sine, q.sin()[:, None, None])
-    local = torch.addcmul(local, tree.cosine, q.cos()[:, None, None])
+    single = q if tree.positions is None else q[tree.positions]
+    local = torch.addcmul(tree.rest, tree.sine, single.sin()[:, None, None])
+    local = torch.addcmul(local, tree.cosine, single.cos()[:, None, None])
     if not tree.all_revolute:
-        local = torch.addcmul(local, tree.slide, q[:, None, None])
+        local = torch.addcmul(local, tree.slide, single[:, None, None])
+    if tree.groups:
+        local = torch.cat(_replaced(tree, local, lambda group: product(tree.rest[group.rows], _group_pose(group, q))))
     pose = local[tree.levels[0].joints]
     laid = [pose]
     for level in tree.levels[1:]:
@@ -78,7 +83,35 @@ def joint_twists(tree: Tree, poses: Bodies) -> tuple[Vectors, Twists]:
         moment = tree.revolute * moment + (1.0 - tree.revolute) * axis
         axis = tree.revolute * axis
     vectors = torch.cat([axis, moment], dim=1)
+    if tree.groups:
+        vectors = torch.cat(_replaced(tree, vectors, lambda group: _group_vectors(group, poses[group.rows.stop - 1])))
     return vectors, (tree.twist_basis @ vectors).unflatten(1, (3, 4))
+
+
+def _replaced(tree: Tree, values: Tensor, of_group: Callable[[Group], Tensor]) -> list[Tensor]:
+    """Values of the joints in order, where those of groups are `of_group`."""
+    parts, last = [], 0
+    for group in tree.groups:
+        own = of_group(group)
+        parts += [values[last : group.rows.start].expand(-1, *own.shape[1:]), own]
+        last = group.rows.stop
+    return [*parts, values[last:]]
+
+
+def _group_pose(group: Group, q: Float[Tensor, "nq batch"]) -> Float[Tensor, "1 4 4 batch"]:
+    rotation, origin = pose(group.kind, q[group.places].mT)
+    upper = torch.cat([rotation, origin[..., None]], -1).movedim(0, -1)
+    last = q.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, q.shape[-1])
+    return torch.cat([upper, last])[None]
+
+
+def _group_vectors(group: Group, body: Float[Tensor, "4 4 batch"]) -> Float[Tensor, "rows 6 batch"]:
+    """[w; v] per unit velocity of the body in its own axes."""
+    rotation, origin = body[:3, :3], body[:3, 3]
+    axes = rotation.movedim(1, 0)  # (3, 3, batch), one axis in the world each
+    moments = torch.linalg.cross(origin.expand_as(axes), axes, dim=1)
+    linear = torch.cat([torch.zeros_like(axes), axes], dim=1)
+    return torch.cat([linear, torch.cat([axes, moments], dim=1)])[list(group.motion.free)]
 
 
 def body_accelerations(
@@ -166,7 +199,7 @@ class Kinematics:
 
     @classmethod
     def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> "Kinematics":
-        """Kinematics at checked q and v (*batch, nv) of equal shape."""
+        """Kinematics at checked q (*batch, nq) and v (*batch, nv)."""
         batch = q.shape[:-1]
         poses = body_poses(robot.tree, _columns(q, batch))
         vectors, twists = joint_twists(robot.tree, poses)

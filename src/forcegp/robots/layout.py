@@ -4,10 +4,14 @@ Movable joints are numbered depth first, children in the order in which their jo
 visits children alphabetically; map by joint name when comparing.) Each movable joint i moves *body* i: its child link
 and every link fixed to it. Body i's frame is the child link's frame turned so that its z axis is the joint axis, which
 makes every joint a rotation about or a translation along z.
+
+A joint of several degrees of freedom stands for as many of these rows, one after the other, which all move together
+(:mod:`forcegp.robots.manifold`). The last of them carries the links; the bodies of the others are empty.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -36,10 +40,18 @@ from forcegp.robots.inertia import (
     rotation_of_z_onto,
     skew,
     transform,
+    turns_with_inertia,
 )
-from forcegp.robots.urdf import MOVABLE, JointDescription, RobotDescription
+from forcegp.robots.manifold import MOTIONS, Group
+from forcegp.robots.urdf import MOVABLE, JointDescription, RobotDescription, free_joint
 
 WORLD = -1
+BASE = "base"
+"""Name of the joint between the world and a base that moves."""
+OUTSIDE = "(world)"
+"""What carries such a base; no link of the robot."""
+Base = Literal["fixed", "floating", "planar", "spherical"]
+"""Whether the root link is bolted to the world, moves freely, in the plane z = 0, or turns about its origin."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +70,23 @@ class Layout:
     parents: tuple[int, ...]
     origins: tuple[np.ndarray, ...]  # body frame at q = 0 in the parent body's frame
     links: dict[str, Placement]
+    groups: tuple[Group, ...] = ()  # joints of several degrees of freedom
+
+    @property
+    def empty(self) -> frozenset[int]:
+        """Bodies that carry nothing: all but the last of each group."""
+        return frozenset(row for group in self.groups for row in range(group.rows.start, group.rows.stop - 1))
+
+    @property
+    def position_names(self) -> tuple[str, ...]:
+        """Names of the entries of q: those of the joints, and of the positions of groups."""
+        names: list[str] = []
+        last = 0
+        for group in self.groups:
+            names += [joint.name for joint in self.joints[last : group.rows.start]]
+            names += [f"{group.name}.{each}" for each in group.motion.positions]
+            last = group.rows.stop
+        return (*names, *(joint.name for joint in self.joints[last:]))
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -79,15 +108,21 @@ class Layout:
             )
 
 
-def lay_out(description: RobotDescription, locked: Mapping[str, float]) -> Layout:
+def lay_out(description: RobotDescription, locked: Mapping[str, float], base: Base = "fixed") -> Layout:
     """Order the joints, turn ``locked`` ones into fixed ones and merge fixed links into the bodies that carry them."""
     _check_locked(description, locked)
     root, children = _tree_of(description)
     joints: list[JointDescription] = []
     parents: list[int] = []
     origins: list[np.ndarray] = []
+    groups: list[Group] = []
     links = {root: Placement(WORLD, np.eye(4))}
     stack = list(reversed(children[root]))
+    if base not in get_args(Base):
+        raise InvalidInput(f"base is {base!r}; give one of {', '.join(get_args(Base))}.")
+    if base != "fixed":
+        links = {OUTSIDE: Placement(WORLD, np.eye(4))}
+        stack = [free_joint(BASE, base, OUTSIDE, root)]
     while stack:
         joint = stack.pop()
         above = links[joint.parent]
@@ -95,18 +130,32 @@ def lay_out(description: RobotDescription, locked: Mapping[str, float]) -> Layou
         if joint.type == "fixed" or joint.name in locked:
             links[joint.child] = Placement(above.body, offset @ _joint_motion(joint, locked.get(joint.name, 0.0)))
         else:
-            turn = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
-            links[joint.child] = Placement(len(joints), inverse(turn))
-            joints.append(joint)
-            parents.append(above.body)
-            origins.append(offset @ turn)
+            turn = np.eye(4)
+            rows = [joint]
+            if joint.type in MOTIONS:
+                first = sum(group.extra for group in groups) + len(joints)
+                group = Group(joint.name, joint.type, len(joints), first)
+                groups.append(group)
+                rows = [
+                    replace(
+                        joint, name=f"{joint.name}.{each}", type="continuous" if each.startswith("r") else "prismatic"
+                    )
+                    for each in group.motion.velocities
+                ]
+            if joint.type not in ("floating", "spherical"):
+                turn = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
+            links[joint.child] = Placement(len(joints) + len(rows) - 1, inverse(turn))
+            joints += rows
+            parents += [above.body] * len(rows)
+            origins += [offset @ turn] * len(rows)
         stack.extend(reversed(children[joint.child]))
     if not joints:
         raise RobotModelError(
             f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics; "
             f"use a URDF with at least one joint of type {', '.join(MOVABLE)} that is not locked."
         )
-    return Layout(tuple(joints), tuple(parents), tuple(origins), links)
+    links.pop(OUTSIDE, None)
+    return Layout(tuple(joints), tuple(parents), tuple(origins), links, tuple(groups))
 
 
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
@@ -186,7 +235,10 @@ def check_inertias(description: RobotDescription, layout: Layout, tree: "Tree") 
                 "take the nearest inertia that a body can have: `inertias='nearest'`."
             )
     bodies = tree.inertias[..., 0].numpy()
+    whole = {group.rows.stop - 1: group for group in layout.groups}
     for body, joint in enumerate(layout.joints):
+        if body in layout.empty:
+            continue
         carried = [name for name, placement in layout.links.items() if placement.body == body and name != joint.child]
         others = f" and the links fixed to it ({', '.join(map(repr, carried))})" if carried else ""
         if bodies[body, 3, 3] == 0.0:
@@ -194,7 +246,13 @@ def check_inertias(description: RobotDescription, layout: Layout, tree: "Tree") 
                 f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no mass; "
                 f"add an <inertial> element, make the joint fixed, or lock it with locked={{{joint.name!r}: 0.0}}."
             )
-        if joint.type != "prismatic" and tree.armature[body] == 0.0 and axis_inertia_vanishes(bodies[body]):
+        if body in whole:
+            if not turns_with_inertia(whole[body].kind, bodies[body]):
+                raise NonPhysicalInertia(
+                    f"{description.source}: link {joint.child!r}{others} turns with joint {whole[body].name!r} but has "
+                    "no rotational inertia about some axis; correct its <inertial> element."
+                )
+        elif joint.type != "prismatic" and tree.armature[body] == 0.0 and axis_inertia_vanishes(bodies[body]):
             raise NonPhysicalInertia(
                 f"{description.source}: link {joint.child!r}{others} turns with joint {joint.name!r} but has no "
                 "rotational inertia about its axis, so any force would accelerate it infinitely; correct its "
@@ -220,6 +278,8 @@ class Level:
 class Tree:
     """Constants of a tree with n movable joints, on one device. Index i is joint i and the body that it moves."""
 
+    groups: tuple[Group, ...]
+    positions: Tensor | None  # (n,) entry of q of each joint with one degree of freedom; None where that is i
     rest: Tensor  # (n, 4, 4, 1) and the next three: local transform = rest + sin q sine + cos q cosine + q slide
     sine: Tensor
     cosine: Tensor
@@ -229,11 +289,11 @@ class Tree:
     revolute: Tensor  # (n, 1, 1): 1 for revolute and continuous joints, 0 for prismatic ones
     all_revolute: bool
     is_chain: bool
-    descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i
-    ancestors: Tensor  # its transpose
-    is_above: Tensor  # (n, n, 1): descendants as truth values
+    descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i, and is not empty
+    ancestors: Tensor  # its transpose, with the empty bodies
+    is_above: Tensor  # (n, n, 1): the same as truth values, transposed
     related: Tensor  # (n, n, 1): 1 where one of the two joints moves the other
-    velocity_sum: Tensor  # (n, n): 2 ancestors - 1, body velocity plus that of the parent body
+    velocity_sum: Tensor  # (n, n): 2 ancestors - own joint, body velocity plus that of the parent body
     twist_basis: Tensor  # (12, 6): [w; v] -> [[w]x, v], row by row
     link_inertias: Tensor  # (links, 4, 4): pseudo-inertias of the moving links, in the frames of their bodies
     link_offsets: Tensor  # (links, 4, 4): poses of the moving links in those frames
@@ -255,7 +315,7 @@ class Tree:
 
         Numbers may differ by rounding (1e-9, relative), as after writing a URDF and reading it again.
         """
-        if self.rest.shape != other.rest.shape:
+        if self.rest.shape != other.rest.shape or self.groups != other.groups:
             return False
         constants = ("rest", "sine", "cosine", "slide", "descendants", "inertias", "gravity", "armature")
         return all(
@@ -269,10 +329,18 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     n = len(layout.joints)
     revolute = np.array([joint.type != "prismatic" for joint in layout.joints])
     rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
-    descendants = np.eye(n)
+    own = np.eye(n)
+    positions = np.arange(n)
+    for group in layout.groups:
+        own[group.rows, group.rows] = 1.0
+        positions[group.rows] = group.places.start
+        positions[group.rows.stop :] += group.extra
+    moves = own.copy()  # [i, j] = 1 where body j is moved by joint i
     for i, (parent, origin) in enumerate(zip(layout.parents, layout.origins, strict=True)):
         x, y, z, translation = origin.T
-        if revolute[i]:  # origin @ Rz(q)
+        if own[i].sum() > 1:
+            rest[i] = origin
+        elif revolute[i]:  # origin @ Rz(q)
             rest[i].T[2:] = z, translation
             sine[i].T[:2] = y, -x
             cosine[i].T[:2] = x, y
@@ -280,7 +348,9 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
             rest[i] = origin
             slide[i].T[3] = z
         if parent != WORLD:
-            descendants[:, i] += descendants[:, parent]
+            moves[:, i] += moves[:, parent]
+    descendants = moves.copy()
+    descendants[:, list(layout.empty)] = 0.0
     twist_basis = np.zeros((6, 3, 4))
     for k, axis in enumerate(np.eye(3)):
         twist_basis[k, :, :3] = skew(axis)
@@ -295,13 +365,15 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
             link_inertias[k] = placement.offset @ local @ placement.offset.T
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
-    related = np.maximum(descendants, descendants.T)
+    related = np.maximum(moves, moves.T)
     levels, order = _levels(layout.parents)
 
     def constant(array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float64)
 
     return Tree(
+        groups=layout.groups,
+        positions=torch.as_tensor(positions) if layout.groups else None,
         rest=constant(rest[..., None]),
         sine=constant(sine[..., None]),
         cosine=constant(cosine[..., None]),
@@ -312,10 +384,10 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         all_revolute=bool(revolute.all()),
         is_chain=bool(related.all()),
         descendants=constant(descendants),
-        ancestors=constant(descendants.T),
-        is_above=constant(descendants[..., None]) > 0,
+        ancestors=constant(moves.T),
+        is_above=constant(moves[..., None]) > 0,
         related=constant(related[..., None]),
-        velocity_sum=constant(2.0 * descendants.T - np.eye(n)),
+        velocity_sum=constant(2.0 * moves.T - own),
         twist_basis=constant(twist_basis.reshape(6, 12).T),
         link_inertias=constant(link_inertias),
         link_offsets=constant(np.stack([layout.links[name].offset for name in layout.moving])),

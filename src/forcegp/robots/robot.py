@@ -1,5 +1,6 @@
 """`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from forcegp.robots.arguments import (
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import check_inertias, compile_tree, lay_out
+from forcegp.robots.layout import Base, check_inertias, compile_tree, lay_out
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import InertiaChoice, read_text, replace_inertial, with_chosen_inertias, write_text
@@ -31,13 +32,14 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot(RobotStructure):
-    """A fixed-base tree of revolute, continuous, prismatic and fixed joints. Make one with :meth:`from_urdf`.
+    """A tree of joints on a fixed, floating or planar base. Make one with :meth:`from_urdf`.
 
     Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any
     leading batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth
-    first, branches in file order. Batch dimensions of all arguments broadcast. ``inertials`` maps names of moving links
-    to log-Cholesky parameters (..., 10) (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the
-    URDF.
+    first, branches in file order. On a base that moves, q has other entries than v (:mod:`forcegp.robots.manifold`):
+    `nq` of them, called :attr:`position_names`; :meth:`integrate` and :meth:`difference` add and subtract. Batch
+    dimensions of all arguments broadcast. ``inertials`` maps names of moving links to log-Cholesky parameters (..., 10)
+    (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the URDF.
 
     Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
     :class:`~forcegp.errors.UnknownName`.
@@ -53,6 +55,7 @@ class Robot(RobotStructure):
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
+        base: Base = "fixed",
     ) -> "Robot":
         """Read a URDF file.
 
@@ -64,7 +67,13 @@ class Robot(RobotStructure):
         remedy.
         """
         return cls.from_urdf_text(
-            read_text(path), source=str(path), gravity=gravity, armature=armature, locked=locked, inertias=inertias
+            read_text(path),
+            source=str(path),
+            gravity=gravity,
+            armature=armature,
+            locked=locked,
+            inertias=inertias,
+            base=base,
         )
 
     @classmethod
@@ -78,11 +87,12 @@ class Robot(RobotStructure):
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
+        base: Base = "fixed",
     ) -> "Robot":
         """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
         description = parse_urdf(text, source=source)
         locked = locked_positions(locked or {})
-        layout = lay_out(description, locked)
+        layout = lay_out(description, locked, base)
         text, description = with_chosen_inertias(inertias, text, description, layout)
         names = tuple(joint.name for joint in layout.joints)
         rotor_inertias = armature_values(armature, names, description.name)
@@ -125,7 +135,7 @@ class Robot(RobotStructure):
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
         armature = self.armature if armature is None else armature
         robot = Robot.from_urdf_text(
-            text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked
+            text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked, base=self.base
         )
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
@@ -141,10 +151,43 @@ class Robot(RobotStructure):
         if v is None:
             return Kinematics.of(self, q, None)
         v = self.checked_input("v", v)
-        if q.shape != v.shape:
+        if q.shape[:-1] != v.shape[:-1]:
             batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1]})
             q, v = q.expand(*batch, -1), v.expand(*batch, -1)
         return Kinematics.of(self, q, v)
+
+    def integrate(self, q: Float[Tensor, "*#batch nq"], step: JointValues) -> Float[Tensor, "... nq"]:
+        """q after the constant velocity ``step`` (..., nv) has acted for one second: ``q + step`` on a fixed base."""
+        return self.space.integrate(self.checked_input("q", q), self.checked_input("step", step))
+
+    def difference(self, q0: Float[Tensor, "*#batch nq"], q1: Float[Tensor, "*#batch nq"]) -> Float[Tensor, "... nv"]:
+        """The constant velocity (..., nv) that leads from ``q0`` to ``q1`` in one second, by the shorter turn."""
+        return self.space.difference(self.checked_input("q", q0), self.checked_input("q", q1))
+
+    def neutral(self) -> Float[Tensor, "nq"]:
+        """q with all joints at 0, whatever their limits are, and moving bases upright at the origin."""
+        return self.space.neutral().to(self.device)
+
+    def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
+        """q with quaternions, and pairs of cos and sin, divided by their lengths."""
+        return self.space.normalized(q)
+
+    def random(self, generator: torch.Generator, rows: int = 1) -> Float[Tensor, "rows nq"]:
+        """Positions drawn within the limits of the joints, else within half a turn or 1 m; turns of any direction."""
+        spread = torch.tensor([math.pi if joint.type != "prismatic" else 1.0 for joint in self.layout.joints])
+        lower, upper = (
+            torch.tensor([getattr(joint, side) for joint in self.layout.joints], dtype=torch.float64)
+            for side in ("lower", "upper")
+        )
+        lower, upper = torch.maximum(lower, -spread), torch.minimum(upper, spread)
+        share = torch.rand(rows, self.nv, dtype=torch.float64, generator=generator)
+        q = self.space.integrate(self.space.neutral(), lower + share * (upper - lower))
+        for group in self.layout.groups:  # directions of Gaussian vectors are uniform
+            turn = torch.randn(
+                rows, len(group.motion.positions[group.motion.turn]), dtype=torch.float64, generator=generator
+            )
+            q[:, group.places][:, group.motion.turn] = turn
+        return self.space.normalized(q).to(self.device)
 
     def mass_matrix(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""

@@ -12,7 +12,8 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.inertia import log_cholesky_of_link
-from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
+from forcegp.robots.layout import BASE, WORLD, Base, Layout, Tree, merged_inertias
+from forcegp.robots.manifold import ConfigurationSpace
 from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
 
@@ -86,18 +87,39 @@ class RobotStructure(Summary):
 
     @property
     def nv(self) -> int:
-        """Number of movable joints."""
+        """Number of degrees of freedom: the size of v, a and u."""
         return len(self.layout.joints)
 
     @property
+    def nq(self) -> int:
+        """Size of q: `nv`, and more where a base or joint turns freely (:mod:`forcegp.robots.manifold`)."""
+        return self.space.nq
+
+    @property
+    def space(self) -> ConfigurationSpace:
+        """The positions that q can have."""
+        return ConfigurationSpace(self.nv, self.layout.groups)
+
+    @property
+    def base(self) -> Base:
+        """Whether the root link is "fixed" in the world, "floating", or moves in a plane."""
+        first = next(iter(self.layout.groups), None)
+        return "fixed" if first is None or first.name != BASE else first.kind  # type: ignore[return-value]  # a kind of base
+
+    @property
+    def position_names(self) -> tuple[str, ...]:
+        """Names of the entries of q; `joint_names` where all joints have one degree of freedom."""
+        return self.layout.position_names
+
+    @property
     def joints(self) -> tuple[Joint, ...]:
-        """Movable joints in the order of q."""
+        """Movable joints in the order of v; a joint of several degrees of freedom as one for each."""
         names = [field.name for field in fields(Joint)]
         return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the movable joints in the order of q."""
+        """Names of the movable joints in the order of v, such as "base.x" for a degree of freedom of a base."""
         return tuple(joint.name for joint in self.layout.joints)
 
     @property
@@ -162,7 +184,13 @@ class RobotStructure(Summary):
     def facts(self) -> dict[str, object]:
         """Name, sizes and joints."""
         kinds = listed((f"{joint.name} ({joint.type})" for joint in self.layout.joints), most=7)
-        return {"name": repr(self.name), "nv": self.nv, "links": len(self.layout.links), "joints": kinds}
+        return {
+            "name": repr(self.name),
+            "nv": self.nv,
+            **({"nq": self.nq} if self.layout.groups else {}),
+            "links": len(self.layout.links),
+            "joints": kinds,
+        }
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
@@ -171,8 +199,14 @@ class RobotStructure(Summary):
         return body, offset.clone()
 
     def checked_input(self, name: str, value: object) -> Tensor:
-        """``value`` in float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv) on the robot's device."""
-        return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
+        """In float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv), or a possible q, on its device."""
+        if name != "q" or not self.layout.groups:
+            return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
+        q = checked_tensor(
+            name, value, self.nq, f"positions of {self.name}: {', '.join(self.position_names)}", self.device
+        )
+        self.space.check(q)
+        return q
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""

@@ -27,11 +27,7 @@ from forcegp.errors import (
 from forcegp.robots.inertia import rotation_from_rpy, transform
 
 FARTHEST = 1e9  # m; squares of larger numbers overflow
-MOVABLE = ("revolute", "continuous", "prismatic")
-UNSUPPORTED = {
-    "floating": "fix the base in the world (type 'fixed'): floating bases are not supported",
-    "planar": "replace it by two prismatic joints and one revolute joint with massive intermediate links",
-}
+MOVABLE = ("revolute", "continuous", "prismatic", "floating", "planar")
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,7 @@ class Joint:
     """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
 
     name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic'
+    type: str  # 'revolute' | 'continuous' | 'prismatic'; 'floating' | 'planar' | 'spherical' before they are laid out
     parent: str
     child: str
     axis: tuple[float, float, float]  # unit vector in the joint frame
@@ -66,6 +62,12 @@ class JointDescription(Joint):
 
     origin: np.ndarray
     mimics: str | None
+
+
+def free_joint(name: str, kind: str, parent: str, child: str) -> JointDescription:
+    """A joint without limits and friction, at the origin of its parent; one that is planar moves along x and y."""
+    limits = (-math.inf, math.inf, math.inf, math.inf)
+    return JointDescription(name, kind, parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
 
 
 @dataclass(frozen=True)
@@ -243,12 +245,10 @@ def _joint(
     element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place
 ) -> JointDescription:
     kind = _attribute(element, "type", place)
-    if kind not in (*MOVABLE, "fixed", *UNSUPPORTED):
+    if kind not in (*MOVABLE, "fixed"):
         close = difflib.get_close_matches(kind, (*MOVABLE, "fixed"), n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise UnsupportedJoint(f"{place} has the unknown type {kind!r}; allowed: {', '.join(MOVABLE)}, fixed.{hint}")
-    if kind in UNSUPPORTED:
-        raise UnsupportedJoint(f"{place} is of type {kind!r}, which is not supported; {UNSUPPORTED[kind]}.")
     ends = {}
     for end in ("parent", "child"):
         ends[end] = _attribute(_child(element, end, place), "link", place)

@@ -1,0 +1,330 @@
+"""Joints of several degrees of freedom, and positions that are points of a manifold instead of vectors.
+
+| joint | q | v |
+|---|---|---|
+| floating | position of the child link (m), quaternion x, y, z, w | linear, then angular velocity |
+| planar | x, y (m), cos and sin of the angle | linear velocity along x and y, angular velocity |
+| spherical | quaternion x, y, z, w | angular velocity |
+
+Velocities are those of the child link in its own axes, as in Pinocchio. So `q' = q V` with V constant in the body, and
+the motion under a constant v is the exponential of v: `integrate`, whose inverse is `difference`.
+
+Pose and twist share one order of coordinates here, [linear; angular]. Formulas of the exponential of SE(3) and of the
+derivative of its logarithm: Sola, Deray & Atchuthan, "A micro Lie theory for state estimation in robotics" (2018),
+appendices B and D; Hairer, Lubich & Wanner, "Geometric Numerical Integration" (2006), eq. III.4.1 and lemma III.4.2.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+
+LARGEST_NORM_ERROR = 1e-4
+"""By so much the length of a quaternion, or of (cos, sin), may differ from 1: logs are rounded."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A kind of joint with several degrees of freedom: which of the six velocities of its link are free."""
+
+    free: tuple[int, ...]
+    """Places of its velocities among [linear; angular]."""
+    positions: tuple[str, ...]
+    """Names of its entries of q."""
+    turn: slice
+    """Which of them are a quaternion, or cos and sin."""
+    neutral: tuple[float, ...]
+
+    @property
+    def velocities(self) -> tuple[str, ...]:
+        """Names of its entries of v."""
+        return tuple(("x", "y", "z", "rx", "ry", "rz")[k] for k in self.free)
+
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+MOTIONS = {
+    "floating": Motion((0, 1, 2, 3, 4, 5), ("x", "y", "z", *QUATERNION), slice(3, 7), (0.0,) * 6 + (1.0,)),
+    "planar": Motion((0, 1, 5), ("x", "y", "cos", "sin"), slice(2, 4), (0.0, 0.0, 1.0, 0.0)),
+    "spherical": Motion((3, 4, 5), QUATERNION, slice(0, 4), (0.0, 0.0, 0.0, 1.0)),
+}
+
+
+@dataclass(frozen=True)
+class Group:
+    """One such joint in a robot: its kind, and its first entries of v and of q."""
+
+    name: str
+    kind: str
+    row: int
+    place: int
+
+    @property
+    def motion(self) -> Motion:
+        """What its kind can do."""
+        return MOTIONS[self.kind]
+
+    @property
+    def rows(self) -> slice:
+        """Its entries of v."""
+        return slice(self.row, self.row + len(self.motion.free))
+
+    @property
+    def places(self) -> slice:
+        """Its entries of q."""
+        return slice(self.place, self.place + len(self.motion.positions))
+
+    @property
+    def extra(self) -> int:
+        """By how many q has more entries than v."""
+        return len(self.motion.positions) - len(self.motion.free)
+
+
+@dataclass(frozen=True)
+class ConfigurationSpace:
+    """What positions q a robot with `nv` degrees of freedom can have, and how velocities v change them."""
+
+    nv: int
+    groups: tuple[Group, ...] = ()
+
+    @property
+    def nq(self) -> int:
+        """Size of q."""
+        return self.nv + sum(group.extra for group in self.groups)
+
+    @property
+    def is_vector_space(self) -> bool:
+        """Whether positions add up: q has the size of v, and q' = v."""
+        return not self.groups
+
+    def integrate(self, q: Tensor, step: Tensor) -> Tensor:
+        """q (..., nq) after the constant velocity `step` (..., nv) has acted for one second; batches broadcast."""
+        if not self.groups:
+            return q + step
+        q, step = self._broadcast(q, step)
+        return self._joined(
+            lambda rows, places: q[..., places] + step[..., rows],
+            lambda group: integrated(group.kind, q[..., group.places], step[..., group.rows]),
+        )
+
+    def difference(self, start: Tensor, end: Tensor) -> Tensor:
+        """The velocity (..., nv) that leads from `start` to `end` in one second, by the shorter turn."""
+        if not self.groups:
+            return end - start
+        start, end = self._broadcast(start, end)
+        return self._joined(
+            lambda _, places: end[..., places] - start[..., places],
+            lambda group: difference(group.kind, start[..., group.places], end[..., group.places]),
+        )
+
+    def chart_velocity(self, step: Tensor, v: Tensor) -> Tensor:
+        """Rate (..., nv) of the `step` from a fixed position where the robot there moves with velocity `v`."""
+        if not self.groups:
+            return v
+        return self._joined(
+            lambda rows, _: v[..., rows],
+            lambda group: chart_velocity(group.kind, step[..., group.rows], v[..., group.rows]),
+        )
+
+    def neutral(self) -> Float[Tensor, "nq"]:
+        """q at 0 for every joint, bases upright at the origin."""
+        return self._joined(
+            lambda rows, _: torch.zeros(rows.stop - rows.start, dtype=torch.float64),
+            lambda group: torch.tensor(group.motion.neutral, dtype=torch.float64),
+        )
+
+    def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
+        """q with quaternions, and (cos, sin), of length 1."""
+
+        def unit(group: Group) -> Tensor:
+            own, turn = q[..., group.places], group.motion.turn
+            return torch.cat([own[..., : turn.start], _unit(own[..., turn]), own[..., turn.stop :]], -1)
+
+        return self._joined(lambda _, places: q[..., places], unit)
+
+    def check(self, q: Float[Tensor, "*batch nq"]) -> None:
+        """Raise InvalidInput, naming the entries, where a quaternion, or cos and sin, is far from length 1.
+
+        Inside `torch.func.vmap` no number can be looked at; there only the direction counts (:func:`pose`).
+        """
+        for group in self.groups:
+            turn = group.motion.turn
+            length = torch.linalg.vector_norm(q.detach()[..., group.places][..., turn], dim=-1).flatten()
+            try:
+                worst = float((length - 1.0).abs().max()) if len(length) else 0.0
+            except RuntimeError:
+                return
+            if not worst <= LARGEST_NORM_ERROR:
+                names = ", ".join(f"{group.name}.{name}" for name in group.motion.positions[turn])
+                raise InvalidInput(
+                    f"q has ({names}) of length {float(length[(length - 1.0).abs().argmax()]):.4g}; a turn has length "
+                    "1: check the order of the columns, or divide by the length with robot.normalized(q)."
+                )
+
+    def _broadcast(self, *tensors: Tensor) -> list[Tensor]:
+        batch = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in tensors))
+        return [tensor.expand(*batch, -1) for tensor in tensors]
+
+    def _joined(self, singles: Callable[[slice, slice], Tensor], of_group: Callable[[Group], Tensor]) -> Tensor:
+        """Parts of all joints in order: `singles` of entries of v and q between the groups, and each group."""
+        parts, row, place = [], 0, 0
+        for group in self.groups:
+            parts += [singles(slice(row, group.row), slice(place, group.place)), of_group(group)]
+            row, place = group.rows.stop, group.places.stop
+        return torch.cat([*parts, singles(slice(row, self.nv), slice(place, self.nq))], -1)
+
+
+def pose(kind: str, q: Float[Tensor, "*batch positions"]) -> tuple[Tensor, Tensor]:
+    """Rotation (..., 3, 3) and translation (..., 3) of the child link. The length of a quaternion does not count."""
+    motion = MOTIONS[kind]
+    turn = q[..., motion.turn]
+    turn = turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+    zero, one = torch.zeros_like(q[..., 0]), torch.ones_like(q[..., 0])
+    if kind == "planar":
+        c, s = turn.unbind(-1)
+        rows = [c, -s, zero, s, c, zero, zero, zero, one]
+        return torch.stack(rows, -1).unflatten(-1, (3, 3)), torch.stack([q[..., 0], q[..., 1], zero], -1)
+    x, y, z, w = turn.unbind(-1)
+    rows = [
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        *(2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+        *(2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+    ]
+    origin = q[..., :3] if kind == "floating" else torch.stack([zero, zero, zero], -1)
+    return torch.stack(rows, -1).unflatten(-1, (3, 3)), origin
+
+
+def integrated(kind: str, q: Float[Tensor, "*batch positions"], step: Float[Tensor, "*batch velocities"]) -> Tensor:
+    """q after the constant body velocity `step` has acted for one second."""
+    motion = MOTIONS[kind]
+    linear, angular = _parts(motion, step)
+    square = (angular * angular).sum(-1, keepdim=True)
+    rotation, origin = pose(kind, q)
+    a, b = _versine(square), _rest(square)
+    twice = torch.linalg.cross(angular, torch.linalg.cross(angular, linear))
+    moved = linear + a * torch.linalg.cross(angular, linear) + b * twice
+    origin = origin + (rotation @ moved[..., None])[..., 0]
+    if kind == "planar":
+        turn = rotation[..., :2, 0]
+        angle = angular[..., 2]
+        c, s = angle.cos(), angle.sin()
+        turned = torch.stack([turn[..., 0] * c - turn[..., 1] * s, turn[..., 0] * s + turn[..., 1] * c], -1)
+        return torch.cat([origin[..., :2], turned], -1)
+    quarter = 0.25 * square  # quaternions turn by half the angle
+    half = torch.cat([0.5 * _sine(quarter) * angular, 1.0 - quarter * _versine(quarter)], -1)
+    turned = quaternion_product(_unit(q[..., motion.turn]), half)
+    return torch.cat([origin, turned], -1) if kind == "floating" else turned
+
+
+def difference(kind: str, start: Float[Tensor, "*batch positions"], end: Float[Tensor, "*batch positions"]) -> Tensor:
+    """The body velocity that leads from `start` to `end` in one second, by the shorter turn."""
+    motion = MOTIONS[kind]
+    (first, from_), (_, to) = pose(kind, start), pose(kind, end)
+    if kind == "planar":
+        (c0, s0), (c1, s1) = (_unit(value[..., motion.turn]).unbind(-1) for value in (start, end))
+        zero = torch.zeros_like(c0)
+        angular = torch.stack([zero, zero, torch.atan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1)], -1)
+    else:
+        conjugate = _unit(start[..., motion.turn]) * start.new_tensor([-1.0, -1.0, -1.0, 1.0])
+        turn = quaternion_product(conjugate, _unit(end[..., motion.turn]))
+        turn = torch.where(turn[..., 3:] < 0.0, -turn, turn)
+        angular = 2.0 * _arc((turn[..., :3] ** 2).sum(-1, keepdim=True), turn[..., 3:]) * turn[..., :3]
+    square = (angular * angular).sum(-1, keepdim=True)
+    linear = (first.mT @ (to - from_)[..., None])[..., 0]
+    once = torch.linalg.cross(angular, linear)
+    linear = linear - 0.5 * once + _cotangent(square) * torch.linalg.cross(angular, once)
+    return torch.cat([linear, angular], -1)[..., list(motion.free)]
+
+
+def chart_velocity(
+    kind: str, step: Float[Tensor, "*batch velocities"], v: Float[Tensor, "*batch velocities"]
+) -> Tensor:
+    """d step / dt where `q0 integrated by step` moves with body velocity v: ad / (1 - exp(-ad)) v.
+
+    The series stops at the tenth power of ad: its error is below 1e-11 |v| for steps that turn by less than .5 rad.
+    """
+    motion = MOTIONS[kind]
+    own, moved = _parts(motion, step), _parts(motion, v)
+    total = torch.cat(moved, -1)
+    for coefficient in _BERNOULLI:
+        moved = _bracket(own, moved)
+        if coefficient:
+            total = total + coefficient * torch.cat(moved, -1)
+    return total[..., list(motion.free)]
+
+
+_BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
+"""Of x / (1 - exp(-x)), from the first power on."""
+
+
+def _bracket(left: tuple[Tensor, Tensor], right: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """ad of SE(3), [linear; angular]."""
+    cross = torch.linalg.cross
+    return cross(left[1], right[0]) + cross(left[0], right[1]), cross(left[1], right[1])
+
+
+def quaternion_product(left: Float[Tensor, "*batch 4"], right: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Of quaternions x, y, z, w: the turn `right` in the axes that `left` has turned."""
+    (a, s), (b, t) = (left[..., :3], left[..., 3:]), (right[..., :3], right[..., 3:])
+    return torch.cat([s * b + t * a + torch.linalg.cross(a, b), s * t - (a * b).sum(-1, keepdim=True)], -1)
+
+
+def _unit(turn: Tensor) -> Tensor:
+    return turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+
+
+def _parts(motion: Motion, step: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear and angular velocity (..., 3) of a step in the free directions."""
+    zero = torch.zeros_like(step[..., 0])
+    own = iter(step.unbind(-1))
+    six = torch.stack([next(own) if k in motion.free else zero for k in range(6)], -1)
+    return six[..., :3], six[..., 3:]
+
+
+SMALL = 0.05
+"""Squares of angles below which series are summed: there the closed forms cancel, and their gradients end at 0."""
+_SINE = (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
+_VERSINE = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
+_REST = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
+_COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000)
+_ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
+
+
+def _smooth(
+    square: Tensor, series: Sequence[float], closed: Callable[[Tensor], Tensor], small: float = SMALL
+) -> Tensor:
+    """A function of t^2 that is smooth at 0: `closed` of t, or below `small` the power series in t^2."""
+    large = square > small
+    total = torch.full_like(square, series[-1])
+    for coefficient in reversed(series[:-1]):
+        total = total * square + coefficient
+    # the branch that is not taken has a finite gradient, too
+    return torch.where(large, closed(torch.where(large, square, 1.0).sqrt()), total)
+
+
+def _sine(square: Tensor) -> Tensor:
+    """sin t / t."""
+    return _smooth(square, _SINE, lambda t: t.sin() / t)
+
+
+def _versine(square: Tensor) -> Tensor:
+    """(1 - cos t) / t^2."""
+    return _smooth(square, _VERSINE, lambda t: 2.0 * ((0.5 * t).sin() / t) ** 2)
+
+
+def _rest(square: Tensor) -> Tensor:
+    """(t - sin t) / t^3."""
+    return _smooth(square, _REST, lambda t: (t - t.sin()) / t**3)
+
+
+def _cotangent(square: Tensor) -> Tensor:
+    """(1 - t/2 cot(t/2)) / t^2."""
+    return _smooth(square, _COTANGENT, lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
+
+
+def _arc(sine_square: Tensor, cosine: Tensor) -> Tensor:
+    """arc / sin(arc) of the squared sine and the cosine of an arc up to a right angle."""
+    return _smooth(sine_square, _ARCSINE, lambda sine: torch.atan2(sine, cosine) / sine, small=1e-3)

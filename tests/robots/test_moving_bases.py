@@ -1,0 +1,214 @@
+"""Floating, planar and spherical joints against Pinocchio, and the manifold of their positions."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+
+from forcegp.errors import InvalidInput
+from forcegp.robots import Robot
+
+LIMBS = """<robot name="crab">
+  <link name="trunk">
+    <inertial><origin xyz="0.02 -0.03 0.05" rpy="0.2 0.1 -0.3"/><mass value="6"/>
+      <inertia ixx="0.06" ixy="0.002" ixz="-0.004" iyy="0.09" iyz="0.003" izz="0.1"/></inertial>
+  </link>
+  <joint name="a_hip" type="revolute">
+    <origin xyz="0.2 0.1 0" rpy="0.3 0 0.1"/><parent link="trunk"/><child link="a_thigh"/>
+    <axis xyz="1 2 -0.5"/><limit lower="-1" upper="2" velocity="3" effort="40"/>
+  </joint>
+  <link name="a_thigh">
+    <inertial><origin xyz="0.15 0 0.05" rpy="0 0 0.4"/><mass value="1.2"/>
+      <inertia ixx="0.005" ixy="0.001" ixz="0" iyy="0.028" iyz="0" izz="0.027"/></inertial>
+  </link>
+  <joint name="a_knee" type="revolute">
+    <origin xyz="0.3 0 0"/><parent link="a_thigh"/><child link="a_foot"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" velocity="3" effort="40"/>
+  </joint>
+  <link name="a_foot">
+    <inertial><origin xyz="0.01 0.02 0.03"/><mass value="0.6"/>
+      <inertia ixx="0.001" ixy="0" ixz="0.0001" iyy="0.0012" iyz="0" izz="0.0008"/></inertial>
+  </link>
+  <joint name="b_slide" type="prismatic">
+    <origin xyz="-0.2 0.1 0" rpy="0 0.7 0.2"/><parent link="trunk"/><child link="b_foot"/>
+    <axis xyz="0 1 1"/><limit lower="0" upper="0.5" velocity="1" effort="20"/>
+  </joint>
+  <link name="b_foot">
+    <inertial><origin xyz="0 0.01 0.02" rpy="0 1 0"/><mass value="0.4"/>
+      <inertia ixx="0.001" ixy="0.0001" ixz="0" iyy="0.0012" iyz="0" izz="0.0005"/></inertial>
+  </link>
+</robot>"""
+CARRIER = """<robot name="carrier">
+  <link name="ground"/>
+  <joint name="rail" type="prismatic">
+    <origin xyz="0.1 0.2 0.3" rpy="0.1 0.5 -0.2"/><parent link="ground"/><child link="sled"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="20"/>
+  </joint>
+  <link name="sled">
+    <inertial><origin xyz="0 0.01 0.02"/><mass value="2"/>
+      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.012" iyz="0" izz="0.008"/></inertial>
+  </link>
+  <joint name="loose" type="floating">
+    <origin xyz="-0.1 0.1 0.2" rpy="0.4 0 0.3"/><parent link="sled"/><child link="body"/>
+  </joint>
+  <link name="body">
+    <inertial><origin xyz="0.02 -0.03 0.05" rpy="0.2 0.1 -0.3"/><mass value="6"/>
+      <inertia ixx="0.06" ixy="0.002" ixz="-0.004" iyy="0.09" iyz="0.003" izz="0.1"/></inertial>
+  </link>
+  <joint name="arm" type="revolute">
+    <origin xyz="0.3 0 0"/><parent link="body"/><child link="hand"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" velocity="1" effort="20"/>
+  </joint>
+  <link name="hand">
+    <inertial><origin xyz="0.1 0.02 0.03"/><mass value="0.6"/>
+      <inertia ixx="0.001" ixy="0" ixz="0.0001" iyy="0.0012" iyz="0" izz="0.0008"/></inertial>
+  </link>
+</robot>"""
+ROOTS = {
+    "floating": pin.JointModelFreeFlyer,
+    "planar": pin.JointModelPlanar,
+    "spherical": pin.JointModelSpherical,
+    "fixed": None,
+}
+ROWS = 4
+
+
+class Pair:
+    """A robot of ours and Pinocchio's, with states in both orders."""
+
+    def __init__(self, base):
+        text = CARRIER if base == "fixed" else LIMBS
+        self.robot = Robot.from_urdf_text(text, base=base)
+        root = ROOTS[base]
+        self.model = pin.buildModelFromXML(text, root()) if root else pin.buildModelFromXML(text)
+        self.data = self.model.createData()
+        generator = torch.Generator().manual_seed(3)
+        self.q = self.robot.random(generator, ROWS)
+        self.v, self.a, self.tau = (
+            torch.randn(ROWS, self.robot.nv, dtype=torch.float64, generator=generator) for _ in range(3)
+        )
+        positions = {"planar": ["x", "y", "cos", "sin"], "spherical": ["qx", "qy", "qz", "qw"]}
+        velocities = {"planar": ["x", "y", "rz"], "spherical": ["rx", "ry", "rz"]}
+        free = ["x", "y", "z", "qx", "qy", "qz", "qw"], ["x", "y", "z", "rx", "ry", "rz"]
+        # places in Pinocchio's q and v of our entries
+        self.to_q = self._places(self.robot.position_names, positions.get(base, free[0]), "idx_q")
+        self.to_v = self._places(self.robot.joint_names, velocities.get(base, free[1]), "idx_v")
+
+    def _places(self, names, parts, first):
+        split = [name.partition(".") for name in names]
+        joints = [self.model.joints[self._joint(name)] for name, _, _ in split]
+        return [
+            getattr(joint, first) + (parts.index(part) if part else 0)
+            for joint, (*_, part) in zip(joints, split, strict=True)
+        ]
+
+    def _joint(self, name):
+        return self.model.getJointId("root_joint" if name == "base" else name)
+
+    def states(self):
+        for k in range(ROWS):
+            q, v, a, tau = np.zeros(self.model.nq), *np.zeros((3, self.model.nv))
+            q[self.to_q] = self.q[k].numpy()
+            for given, own in ((v, self.v), (a, self.a), (tau, self.tau)):
+                given[self.to_v] = own[k].numpy()
+            yield k, q, v, a, tau
+
+
+@pytest.fixture(scope="module", params=ROOTS)
+def pair(request):
+    return Pair(request.param)
+
+
+def close(found, expected, scale=1.0):
+    expected = torch.as_tensor(np.array(expected))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * max(1.0, float(expected.abs().max())) * scale)
+
+
+def test_mass_matrix_bias_and_both_dynamics(pair):
+    M, bias = pair.robot.mass_matrix_and_bias(pair.q, pair.v)
+    tau = pair.robot.inverse_dynamics(pair.q, pair.v, pair.a)
+    a = pair.robot.forward_dynamics(pair.q, pair.v, pair.tau)
+    gravity = pair.robot.gravity_forces(pair.q)
+    order = pair.to_v
+    for k, q, v, acceleration, force in pair.states():
+        expected = pin.crba(pair.model, pair.data, q)
+        expected = np.triu(expected) + np.triu(expected, 1).T
+        close(M[k], expected[np.ix_(order, order)])
+        close(bias[k], pin.nonLinearEffects(pair.model, pair.data, q, v)[order])
+        close(gravity[k], pin.computeGeneralizedGravity(pair.model, pair.data, q)[order])
+        close(tau[k], pin.rnea(pair.model, pair.data, q, v, acceleration)[order])
+        close(a[k], pin.aba(pair.model, pair.data, q, v, force)[order], 10.0)
+
+
+def test_poses_jacobians_and_their_rates(pair):
+    frame = pair.robot.link_names[-1]
+    pose, jacobian = pair.robot.frame_pose(pair.q, frame), pair.robot.frame_jacobian(pair.q, frame)
+    drift = pair.robot.frame_bias_acceleration(pair.q, pair.v, frame)
+    number, axes = pair.model.getFrameId(frame), pin.LOCAL_WORLD_ALIGNED
+    for k, q, v, _, _ in pair.states():
+        pin.forwardKinematics(pair.model, pair.data, q, v, 0 * v)
+        pin.updateFramePlacements(pair.model, pair.data)
+        close(pose[k], pair.data.oMf[number].homogeneous)
+        close(jacobian[k], pin.computeFrameJacobian(pair.model, pair.data, q, number, axes)[:, pair.to_v])
+        close(drift[k], pin.getFrameClassicalAcceleration(pair.model, pair.data, number, axes).vector)
+
+
+def test_integrate_and_difference(pair):
+    moved, back = pair.robot.integrate(pair.q, pair.v), pair.robot.difference(pair.q, pair.q.flip(0))
+    flipped = [q for _, q, *_ in pair.states()][::-1]
+    for k, q, v, _, _ in pair.states():
+        expected = pin.integrate(pair.model, q, v)[pair.to_q]
+        inside = torch.linalg.vector_norm(moved[k] - torch.as_tensor(expected))
+        other = expected.copy()
+        turn = [place for place, name in enumerate(pair.robot.position_names) if ".q" in name]
+        other[turn] *= -1.0  # the same turn
+        assert min(inside, torch.linalg.vector_norm(moved[k] - torch.as_tensor(other))) < 1e-11
+        close(back[k], pin.difference(pair.model, q, flipped[k])[pair.to_v], 10.0)
+
+
+def test_small_and_no_steps_come_back(pair):
+    for size in (0.0, 1e-9, 1e-4, 0.1, 0.5):  # turns below half a turn come back
+        step = size * pair.v
+        end = pair.robot.integrate(pair.q, step)
+        torch.testing.assert_close(pair.robot.difference(pair.q, end), step, rtol=1e-9, atol=1e-13)
+        torch.testing.assert_close(pair.robot.normalized(end), end, rtol=0, atol=1e-14)
+
+
+def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
+    def moved(step, k):
+        return pair.robot.forward_dynamics(pair.robot.integrate(pair.q[k], step), pair.v[k], pair.tau[k])
+
+    order = np.ix_(pair.to_v, pair.to_v)
+    for k, q, v, _, tau in pair.states():
+        pin.computeABADerivatives(pair.model, pair.data, q, v, tau)
+        found = torch.func.jacrev(moved)(torch.zeros(pair.robot.nv, dtype=torch.float64), k)
+        close(found, pair.data.ddq_dq[order], 100.0)
+
+
+def test_the_chart_is_that_of_the_exponential(pair):
+    """d/dt integrate(q0, step(t)) has the body velocity v, by central differences."""
+    step, v, dt = 0.3 * pair.v, pair.a, 1e-5
+    rate = pair.robot.space.chart_velocity(step, v)
+    ends = [pair.robot.integrate(pair.q, step + sign * dt * rate) for sign in (-1, 1)]
+    found = pair.robot.difference(*ends) / (2 * dt)
+    torch.testing.assert_close(found, v, rtol=0, atol=3e-8 * float(v.abs().max()))
+
+
+def test_turns_of_other_length_are_refused():
+    robot = Robot.from_urdf_text(LIMBS, base="floating")
+    q = robot.neutral()
+    assert robot.position_names[:7] == ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
+    q[3:7] *= 0.7
+    with pytest.raises(InvalidInput, match=r"base\.qx, base\.qy.*length 0\.7.*normalized"):
+        robot.mass_matrix(q)
+    robot.mass_matrix(robot.normalized(q))
+
+
+def test_energy_is_invariant_to_where_the_base_is():
+    """Gravity forces turn with the base; the mass matrix in body axes does not change at all."""
+    robot = Robot.from_urdf_text(LIMBS, base="floating")
+    generator = torch.Generator().manual_seed(0)
+    q = robot.random(generator, 2)
+    q[1, 7:] = q[0, 7:]
+    M = robot.mass_matrix(q)
+    torch.testing.assert_close(M[0], M[1], rtol=1e-12, atol=1e-12)
