@@ -19,6 +19,7 @@ from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
 from forcegp.robots import Kinematics
+from forcegp.robots.manifold import ConfigurationSpace
 
 POSITION_TOLERANCE = 1e-12
 """A position counts as on the surface within this distance, |c| / |s_p|, in m."""
@@ -61,8 +62,9 @@ class ConstraintManifold:
         surface, whatever the scale of the function that describes it (|s_p| = 1 for signed distances). States that do
         not converge are returned as such, for the caller to judge.
         """
+        space = self.system.robot.space
         given_finite = torch.isfinite(q).all(-1)
-        q = torch.where(given_finite[:, None], q, 0.0)
+        q = torch.where(given_finite[:, None], q, space.neutral().to(q.device) if space.groups else 0.0)
         kinematics = self.system.robot.kinematics(q)
         _, inverse_lower = factors(self.system.mass_matrix(kinematics))
         iteration, differentiable = 0, torch.is_grad_enabled() and q.requires_grad
@@ -78,7 +80,7 @@ class ConstraintManifold:
                 moving, differentiable = on_surface & finite, False
             A_white = torch.where(finite[:, None, None], A @ inverse_lower.mT, 0.0)
             white = _pseudo_inverse(A_white) @ torch.where(finite[:, None], c, 0.0)[..., None]
-            q = torch.where(moving[:, None], q - (inverse_lower.mT @ white)[..., 0], q)
+            q = torch.where(moving[:, None], space.integrate(q, -(inverse_lower.mT @ white)[..., 0]), q)
             kinematics = self.system.robot.kinematics(q)
             iteration += 1
 
@@ -241,8 +243,10 @@ class Step:
 
 
 class Integrator(ABC):
-    """A one-step method for q'' = a(q, q')."""
+    """A one-step method for v' = a(q, v), where q' = v or, on a manifold, v is the velocity in body axes."""
 
+    space: ConfigurationSpace
+    """How positions change; on a manifold steps are those of Lie group methods."""
     failure: ClassVar[str] = ""
     """Why a step can have no end, for a warning."""
 
@@ -257,31 +261,43 @@ class Integrator(ABC):
         """The state `dt` seconds later."""
 
 
+VECTORS = ConfigurationSpace(0)
+"""Positions that add up; their number does not matter."""
+
+
 @dataclass(frozen=True, eq=False)
 class SymplecticEuler(Integrator):
     """v+ = v + dt a(q, v), q+ = q + dt v+: first order, one evaluation; what PyBullet and Rath et al. (2021) do."""
+
+    space: ConfigurationSpace = VECTORS
 
     @override
     def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
         a = acceleration(q, v)
         v = v + dt * a
-        return Step(q + dt * v, v, a, _all(q))
+        return Step(self.space.integrate(q, dt * v), v, a, _all(q))
 
 
 @dataclass(frozen=True, eq=False)
 class RungeKutta4(Integrator):
-    """The classical method of fourth order, four evaluations (Hairer, Norsett & Wanner 1993, table II.1.2)."""
+    """The classical method of fourth order, four evaluations (Hairer, Norsett & Wanner 1993, table II.1.2).
+
+    On a manifold for the step from q in the chart of the exponential (Munthe-Kaas 1999; Hairer, Lubich & Wanner 2006,
+    section IV.8.2), of the same order.
+    """
+
+    space: ConfigurationSpace = VECTORS
 
     @override
     def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
+        def rates(step: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+            return self.space.chart_velocity(step, at), acceleration(self.space.integrate(q, step), at)
+
         a1 = acceleration(q, v)
-        v2 = v + 0.5 * dt * a1
-        a2 = acceleration(q + 0.5 * dt * v, v2)
-        v3 = v + 0.5 * dt * a2
-        a3 = acceleration(q + 0.5 * dt * v2, v3)
-        v4 = v + dt * a3
-        a4 = acceleration(q + dt * v3, v4)
-        q_next = q + dt / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+        r2, a2 = rates(0.5 * dt * v, v + 0.5 * dt * a1)
+        r3, a3 = rates(0.5 * dt * r2, v + 0.5 * dt * a2)
+        r4, a4 = rates(dt * r3, v + dt * a3)
+        q_next = self.space.integrate(q, dt / 6.0 * (v + 2.0 * r2 + 2.0 * r3 + r4))
         return Step(q_next, v + dt / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1, _all(q))
 
 
@@ -290,16 +306,29 @@ class ImplicitMidpoint(Integrator):
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
     Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method, for
-    which torch has to be able to differentiate the acceleration.
+    which torch has to be able to differentiate the acceleration. On a manifold by
+    the Cayley transform, with which a tumbling body in free fall keeps its energy and momentum exactly.
     """
 
+    space: ConfigurationSpace = VECTORS
     failure = "Newton's method found no solution of the implicit step"
 
     @override
     def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
         half = 0.5 * dt
-        middle, found = find_roots(lambda at: at - v - half * acceleration(q + half * at, at), v)
-        return Step(q + dt * middle, 2.0 * middle - v, acceleration(q, v), found)
+
+        def moved(at: Tensor, share: float) -> Tensor:
+            return self.space.integrate(q, share * self.space.midpoint_step(dt * at))
+
+        def residual(at: Tensor) -> Tensor:
+            middle = moved(at, 0.5)
+            a = acceleration(middle, at)
+            if self.space.groups:
+                a = self.space.midpoint_acceleration(dt * at, a, acceleration(middle, torch.zeros_like(at)))
+            return at - v - half * a
+
+        middle, found = find_roots(residual, v)
+        return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,6 +342,7 @@ class Projected(Integrator):
     """
 
     manifold: ConstraintManifold
+    space: ConfigurationSpace = VECTORS
     failure = "no position on the surfaces of the contacts near the predicted one"
 
     @override
@@ -322,21 +352,21 @@ class Projected(Integrator):
     @override
     def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
         a = acceleration(q, v)
-        at = self.manifold.project_position(q + dt * v + 0.5 * dt**2 * a)
+        at = self.manifold.project_position(self.space.integrate(q, dt * v + 0.5 * dt**2 * a))
         # Where it failed, the step is refused anyway: go on from the old position, at which models can be asked.
         reached = torch.where(at.converged[:, None], at.q, q)
         predicted = torch.where(at.converged[:, None], self.manifold.project_velocity(at, v + dt * a), v)
         later = acceleration(reached, predicted)
-        halfway = (at.q - q) / dt  # v + dt a / 2 and the impulse of the position's correction
+        halfway = self.space.difference(q, at.q) / dt  # v + dt a / 2 and the impulse of the position's correction
         v_next = self.manifold.project_velocity(at, halfway + 0.5 * dt * later)
         return Step(at.q, v_next, a, at.converged)
 
 
 INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
-    "symplectic-euler": lambda system: SymplecticEuler(),
-    "rk4": lambda system: RungeKutta4(),
-    "implicit-midpoint": lambda system: ImplicitMidpoint(),
-    "projected": lambda system: Projected(ConstraintManifold(system)),
+    "symplectic-euler": lambda system: SymplecticEuler(system.robot.space),
+    "rk4": lambda system: RungeKutta4(system.robot.space),
+    "implicit-midpoint": lambda system: ImplicitMidpoint(system.robot.space),
+    "projected": lambda system: Projected(ConstraintManifold(system), system.robot.space),
 }
 """Integrators by the name that rollouts and the command line use."""
 

@@ -21,7 +21,7 @@ SPEED_LIMIT = 100.0
 
 
 Feedback = Callable[[int, Tensor, Tensor], Tensor]
-"""(k, q, v) -> what a controller adds to u[k], of the shape of q; asked once per step, at the state where it begins."""
+"""(k, q, v) -> what a controller adds to u[k], of the shape of u; asked once per step, at the state where it begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def integrate(
             rows.append(torch.where(good[:, None], x, math.nan))
         if not bool(alive.any()):
             for rows in (rows_q, rows_v, rows_a):
-                rows += [torch.full_like(q, math.nan)] * (steps - k - 1)
+                rows += [torch.full_like(rows[-1], math.nan)] * (steps - k - 1)
             break
         if progress is not None:
             progress(k + 1, steps)
@@ -110,7 +110,7 @@ def _at_finite_states(
     """a(q, v) under u, which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
 
     def guarded(q: Tensor, v: Tensor) -> Tensor:
-        finite = (torch.isfinite(q) & torch.isfinite(v)).all(-1, keepdim=True)
+        finite = torch.isfinite(q).all(-1, keepdim=True) & torch.isfinite(v).all(-1, keepdim=True)
         if bool(finite.all()):
             return acceleration(q, v, u)
         return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)

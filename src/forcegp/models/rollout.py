@@ -55,7 +55,7 @@ class Rollout:
     Fields
     ------
     time: (T+1,) in s, from 0.
-    q, v: (..., T+1, nv) in rad and rad/s (m and m/s); row 0 is the initial state, which `integrator="projected"` moves
+    q, v: (..., T+1, nv), q of a moving base (..., T+1, nq), in rad and rad/s (m and m/s); row 0 is the initial state, which `integrator="projected"` moves
         onto the constraint first. Angles are not wrapped.
     a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
     constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
@@ -141,7 +141,7 @@ def roll_out(
     method = integrator_named(integrator, model.system)
     require_type("grad", grad, bool)
     robot = model.system.robot
-    q, v, forces, batch = checked_start(robot.nv, robot.device, q0, v0, u, None if grad else "give grad=True")
+    q, v, forces, batch = checked_start((robot.nq, robot.nv, robot.nv), robot.device, q0, v0, u, None if grad else "give grad=True")
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
 
@@ -199,12 +199,12 @@ def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
     """Feedback that sees the caller's batch dimensions as one of (n, nv). Raises InvalidInput for other shapes."""
 
     def flat(k: int, q: Tensor, v: Tensor) -> Tensor:
-        shape = (*batch, q.shape[-1])
-        added = feedback(k, q.reshape(shape), v.reshape(shape))
+        shape = (*batch, v.shape[-1])
+        added = feedback(k, q.reshape(*batch, -1), v.reshape(shape))
         if not isinstance(added, Tensor) or added.shape != shape:
             given = tuple(added.shape) if isinstance(added, Tensor) else type(added).__name__
-            raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as its q and v.")
-        return added.reshape(q.shape)
+            raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as its v.")
+        return added.reshape(v.shape)
 
     return flat
 
@@ -213,28 +213,28 @@ def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunct
     """A function of (samples, n, nv) as one of (samples * n, nv)."""
 
     def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return function(*(x.reshape(samples, -1, x.shape[-1]) for x in (q, v, u))).reshape(q.shape)
+        return function(*(x.reshape(samples, -1, x.shape[-1]) for x in (q, v, u))).reshape(v.shape)
 
     return flat
 
 
 def checked_start(
-    nv: int, device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
+    sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
 ) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, nv), u (T, n, nv) as float64 tensors on the robot's device, and the batch dimensions.
+    """q0, v0 (n, size), u (T, n, size) of these sizes as float64 tensors on the robot's device, and the batch dimensions.
 
     Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
     """
     given = {name: real_tensor(name, values, device).to(device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
-    for name, values in given.items():
+    for size, (name, values) in zip(sizes, given.items(), strict=True):
         if values.requires_grad and torch.is_grad_enabled() and remedy is not None:
             raise InvalidInput(
                 f"{name} requires a gradient, which a rollout drops unless asked to keep it; {remedy}, or "
                 f"{name}.detach()."
             )
         least = 2 if name == "u" else 1
-        if values.dim() < least or values.shape[-1] != nv:
-            wanted = f"(..., T, {nv})" if name == "u" else f"(..., {nv})"
+        if values.dim() < least or values.shape[-1] != size:
+            wanted = f"(..., T, {size})" if name == "u" else f"(..., {size})"
             raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
         require_finite(name, values)
     q, v, forces = given.values()
@@ -248,8 +248,8 @@ def checked_start(
         raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q0 and v0 per motion.") from None
     if not batch.numel():
         raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
-    q, v = (x.expand(*batch, -1).reshape(-1, nv) for x in (q, v))
-    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, nv).movedim(1, 0).contiguous()
+    q, v = (x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in (q, v))
+    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, forces.shape[-1]).movedim(1, 0).contiguous()
     return q, v, forces, batch
 
 

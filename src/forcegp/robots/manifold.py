@@ -129,6 +129,37 @@ class ConfigurationSpace:
             lambda group: chart_velocity(group.kind, step[..., group.rows], v[..., group.rows]),
         )
 
+    def midpoint_step(self, step: Tensor) -> Tensor:
+        """The step (..., nv) of the implicit midpoint rule whose body velocity times dt is `step` (:func:`cayley`)."""
+        if not self.groups:
+            return step
+
+        def turned(group: Group) -> Tensor:
+            own = step[..., group.rows]
+            return cayley(group.kind, _stretch(group.motion, own) * own)
+
+        return self._joined(lambda rows, _: step[..., rows], turned)
+
+    def midpoint_acceleration(self, step: Tensor, a: Tensor, still: Tensor) -> Tensor:
+        """The acceleration (..., nv) that belongs to :meth:`midpoint_step`, from those at the middle: `a`, and at rest.
+
+        What the velocity adds (a - still) acts for the stretched step; the rest, such as gravity, for the step as it
+        is, with what the middle hides of it across the axis of the turn given back. So a free body falls exactly.
+        """
+
+        def corrected(group: Group) -> Tensor:
+            own, rest = step[..., group.rows], still[..., group.rows]
+            stretch = _stretch(group.motion, own)
+            _, angular = _parts(group.motion, stretch * own)
+            square = (angular * angular).sum(-1, keepdim=True)
+            share = 0.25 / (1.0 + torch.sqrt(1.0 + 0.25 * square))  # (sqrt(1 + t^2/4) - 1) / t^2
+            parts = _parts(group.motion, rest)
+            across = [-torch.linalg.cross(angular, torch.linalg.cross(angular, part)) for part in parts]
+            hidden = (share * torch.cat(across, -1))[..., list(group.motion.free)]
+            return rest + hidden + stretch * (a[..., group.rows] - rest)
+
+        return self._joined(lambda rows, _: a[..., rows], corrected)
+
     def neutral(self) -> Float[Tensor, "nq"]:
         """q at 0 for every joint, bases upright at the origin."""
         return self._joined(
@@ -256,6 +287,31 @@ def chart_velocity(
     return total[..., list(motion.free)]
 
 
+def cayley(kind: str, step: Float[Tensor, "*batch velocities"]) -> Tensor:
+    """The step whose exponential is the Cayley transform (1 - ad/2)^-1 (1 + ad/2) of `step`, equal to third order.
+
+    It turns by 2 atan(t/2) for an angle t, about the same axis. The implicit midpoint rule in body axes keeps quadratic
+    invariants, and with this transform p+ = Ad* p for the momentum p of a free body: energy and momentum stay exactly
+    what they are (Lewis & Simo, "Conserving algorithms for the dynamics of Hamiltonian systems on Lie groups",
+    J. Nonlinear Sci. 1994; that 6 x 6 Cayley transforms are in SE(3): Selig, "Cayley maps for SE(3)", 2007).
+    """
+    motion = MOTIONS[kind]
+    linear, angular = _parts(motion, step)
+    square = (angular * angular).sum(-1, keepdim=True)
+    along = (linear * angular).sum(-1, keepdim=True) * angular
+    linear = _arctangent(square) * linear + _advance(square) * along
+    return torch.cat([linear, _arctangent(square) * angular], -1)[..., list(motion.free)]
+
+
+def _stretch(motion: Motion, step: Tensor) -> Tensor:
+    """By how much a step has to be longer for its Cayley transform to carry the centre of mass as far as it is fast.
+
+    2 / (1 + sqrt(1 - t^2)) for a turn of t; turns of almost 1 rad and more are stretched no further.
+    """
+    _, angular = _parts(motion, step)
+    return 2.0 / (1.0 + torch.sqrt((1.0 - (angular * angular).sum(-1, keepdim=True)).clamp_min(0.04)))
+
+
 _BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
 """Of x / (1 - exp(-x)), from the first power on."""
 
@@ -290,6 +346,8 @@ _SINE = (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
 _VERSINE = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
 _REST = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
 _COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000)
+_ARCTANGENT = tuple((-0.25) ** n / (2 * n + 1) for n in range(9))
+_ADVANCE = tuple((-0.25) ** n * 2 * n / (2 * n + 1) for n in range(1, 10))
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 
 
@@ -323,6 +381,16 @@ def _rest(square: Tensor) -> Tensor:
 def _cotangent(square: Tensor) -> Tensor:
     """(1 - t/2 cot(t/2)) / t^2."""
     return _smooth(square, _COTANGENT, lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
+
+
+def _arctangent(square: Tensor) -> Tensor:
+    """2 atan(t/2) / t."""
+    return _smooth(square, _ARCTANGENT, lambda t: 2.0 * torch.atan(0.5 * t) / t)
+
+
+def _advance(square: Tensor) -> Tensor:
+    """(1 / (1 + t^2/4) - 2 atan(t/2) / t) / t^2: how much less a screw advances than it turns."""
+    return _smooth(square, _ADVANCE, lambda t: (1.0 / (1.0 + 0.25 * t * t) - 2.0 * torch.atan(0.5 * t) / t) / t**2)
 
 
 def _arc(sine_square: Tensor, cosine: Tensor) -> Tensor:
