@@ -68,6 +68,7 @@ def identify_analytical(
         given = require_type("dataset", dataset, Dataset).system if system is None else system
         system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
         require_rows("dataset", dataset, system.robot.joint_names, "the robot")
+        system.robot.require_vectors("regressions on torques")
         for name, given, allowed in (
             ("inertias", inertias, ("consistent", "free")),
             ("likelihood", likelihood, ("torque", "acceleration")),

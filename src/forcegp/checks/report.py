@@ -17,6 +17,7 @@ from forcegp.checks.excitation import (
 )
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings, sampling_findings
+from forcegp.checks.moving_base import base_findings
 from forcegp.checks.parameters import parameter_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
@@ -167,6 +168,7 @@ def check(
     if system is not None:
         robot = require_type("system", system, MechanicalSystem).robot
         require_rows("dataset", dataset, robot.joint_names, robot.name)
+        robot.require_vectors("checks of torques and filters")
     preparation = Preparation(cutoff="auto") if preparation is None else preparation
     inputs = CheckInput.of(dataset, system, require_type("preparation", preparation, Preparation))
     findings, comparison = _findings(inputs, system)
@@ -191,6 +193,8 @@ def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tup
     system = dataset.system if system is None else system
     if system is not None:
         require_rows("dataset", dataset, system.robot.joint_names, system.robot.name)
+        if system.robot.layout.groups:
+            return _sorted([each for each in base_findings(dataset, system) if each.severity != "ok"])
     findings, _ = _findings(CheckInput.quick(dataset, system), system)
     said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
     if dataset.nv > 1:  # friction of one joint can look like a delay

@@ -297,6 +297,7 @@ def excitation(
         raise InvalidInput(f"model is a {type(model).__name__}; give a Robot, a MechanicalSystem or a fitted model.")
     system = MechanicalSystem(model) if isinstance(model, Robot) else model
     system = system.system if isinstance(system, Posterior) else system
+    system.robot.require_vectors("planned motions")
     robot, rng = system.robot, np.random.default_rng(whole_number("seed", seed, 0))
     for name, value, most in (("seconds", seconds, LONGEST), ("margin", margin, 1.0), ("clearance", clearance, 1e9)):
         if not isinstance(value, int | float) or not 0.0 < value <= most:

@@ -99,7 +99,7 @@ class _PointMotion(NamedTuple):
 
 def _point_motions(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[_PointMotion]:
     q, v, u, a = tensors(dataset)
-    state = forcegp.mechanics.State.of(system.robot, q, v, u)
+    state = system.state(q, v, u)
     sigma = torch.zeros(dataset.nv) if dataset.noise_std is None else torch.tensor(dataset.noise_std)
     motions = []
     for contact in system.contacts:

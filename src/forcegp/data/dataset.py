@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any, ClassVar, overload
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from typing_extensions import override
 
 import forcegp.mechanics
+import forcegp.robots
 from forcegp.data.dataset_fields import (
     FrozenDict,
     arrays_of,
@@ -42,7 +44,8 @@ class Dataset(Summary):
 
     Fields
     ------
-    q, v, u: (rows, nv) positions, velocities and actuator forces [units].
+    q, v, u: (rows, nv) positions, velocities and actuator forces [units]. Where the base moves, q has the columns
+        `system.robot.position_names`, and u the columns `system.inputs`.
     a: (rows, nv) measured acceleration, with its noise.
     time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
     joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `system.robot`.
@@ -90,10 +93,13 @@ class Dataset(Summary):
                 put(name, robot.joint_names if name == "joint_names" else units_for(robot))
         names = _joint_names(self.joint_names, self.system)
         put("joint_names", names)
-        put("q", finite_columns("q", self.q, names))
+        positions, actuators = self._columns_of("q"), self._columns_of("u")
+        put("q", finite_columns("q", self.q, positions))
         rows = len(self.q)
-        for name in ("v", "u", "a"):
-            put(name, finite_columns(name, getattr(self, name), names, rows))
+        for name, columns in (("v", names), ("u", actuators), ("a", names)):
+            put(name, finite_columns(name, getattr(self, name), columns, rows))
+        if self.system is not None and positions != names:
+            _check_turns(self.system.robot, self.q)
         put("time", finite_columns("time", self.time, None, rows))
         put("episode", integer_column("episode", np.zeros(rows, int) if self.episode is None else self.episode, rows))
         put("units", validated_units(self.units, names))
@@ -144,7 +150,9 @@ class Dataset(Summary):
         Raises MissingExtra without pandas.
         """
         truth = {f"truth.{name}": values for name, values in self.truth.items()}
-        return frame_of({**self._columns(), **truth}, self.joint_names)
+        return frame_of(
+            {**self._columns(), **truth}, {name: self._columns_of(name) for name in "quva"} | {"": self.joint_names}
+        )
 
     @staticmethod
     def from_pandas(frame: Any, system: forcegp.mechanics.MechanicalSystem | None = None, **more: Any) -> Dataset:
@@ -153,13 +161,14 @@ class Dataset(Summary):
         `more` are other fields, for example `units` and `noise_std`. Raises DatasetError for columns that are missing
         or not valid, MissingExtra without pandas.
         """
-        given: dict[str, Any] = {**arrays_of(frame), "system": system, **more}
+        own = {} if system is None else {"q": system.robot.position_names, "u": system.inputs}
+        given: dict[str, Any] = {**arrays_of(frame, own), "system": system, **more}
         return Dataset(**given)
 
     def _columns(self) -> dict[str, np.ndarray]:
         names = ("time", "episode", "q", "v", "u", "a", "noise_std")
         stated = {name: getattr(self, name) for name in names}
-        by_row = {"noise_std": None if self.noise_std is None else np.broadcast_to(self.noise_std, self.q.shape)}
+        by_row = {"noise_std": None if self.noise_std is None else np.broadcast_to(self.noise_std, self.v.shape)}
         return {name: values for name, values in {**stated, **by_row}.items() if values is not None}
 
     def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
@@ -167,8 +176,14 @@ class Dataset(Summary):
 
     @property
     def nv(self) -> int:
-        """Number of joints."""
-        return self.q.shape[1]
+        """Number of degrees of freedom."""
+        return self.v.shape[1]
+
+    def _columns_of(self, name: str) -> tuple[str, ...]:
+        """Names of the columns of an array; q and u can have their own where the base moves."""
+        if self.system is not None and name == "q":
+            return self.system.robot.position_names
+        return self.system.inputs if self.system is not None and name == "u" else self.joint_names
 
     @property
     def episodes(self) -> tuple[int, ...]:
@@ -237,6 +252,14 @@ class Dataset(Summary):
 
     def _fields(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
+
+
+def _check_turns(robot: forcegp.robots.Robot, q: np.ndarray) -> None:
+    """Raise DatasetError for quaternions of a length other than 1."""
+    try:
+        robot.space.check(torch.tensor(q))
+    except InvalidInput as error:
+        raise DatasetError(str(error)) from None
 
 
 def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSystem | None) -> tuple[str, ...]:

@@ -168,28 +168,38 @@ def _per_quantity(per_joint: Sequence[Mapping[str, str]]) -> FrozenDict:
 TRUTH = "truth."
 
 
-def frame_of(arrays: Mapping[str, np.ndarray], joint_names: tuple[str, ...]) -> Any:
-    """Arrays (rows,) and (rows, columns) by name. Raises MissingExtra without pandas."""
+def frame_of(arrays: Mapping[str, np.ndarray], names: Mapping[str, tuple[str, ...]]) -> Any:
+    """Arrays (rows,) and (rows, columns) by name; `names` of the columns of some, "" of the others.
+
+    Raises MissingExtra without pandas.
+    """
     pandas = _pandas()
     columns = {}
     for name, values in arrays.items():
         if values.ndim == 1:
             columns[name] = values
             continue
-        labels = joint_names if values.shape[1] == len(joint_names) else range(values.shape[1])
+        own = names.get(name, names[""])
+        labels = own if values.shape[1] == len(own) else range(values.shape[1])
         columns |= {f"{name}.{label}": values[:, k] for k, label in enumerate(labels)}
     return pandas.DataFrame(columns)
 
 
-def arrays_of(frame: Any) -> dict[str, Any]:
-    """Arguments of a Dataset from the columns of `frame_of`, the joints in the order of q."""
+def arrays_of(frame: Any, own: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    """Arguments of a Dataset from the columns of `frame_of`, the joints in the order of v.
+
+    `own` names the columns of q and u where these are not the joints.
+    """
     _pandas()
-    joints = tuple(column[2:] for column in map(str, frame.columns) if column.startswith("q."))
+    joints = tuple(column[2:] for column in map(str, frame.columns) if column.startswith("v."))
     columns: dict[str, dict[str, np.ndarray]] = {}
     for column in map(str, frame.columns):
-        ends = [joint for joint in joints if column.endswith(f".{joint}")]  # names may hold dots
-        label = max(ends, key=len, default=column.rpartition(".")[2] if column.startswith(TRUTH) else "")
-        columns.setdefault(column.removesuffix(f".{label}"), {})[label] = frame[column].to_numpy()
+        name, _, label = column.partition(".")
+        if column.startswith(TRUTH):  # both names may hold dots
+            ends = [joint for joint in joints if column.endswith(f".{joint}")]
+            label = max(ends, key=len, default=column.rpartition(".")[2])
+            name = column.removesuffix(f".{label}")
+        columns.setdefault(name, {})[label] = frame[column].to_numpy()
     missing = [name for name in ("q", "v", "u", "a", "time") if name not in columns]
     if missing:
         raise DatasetError(
@@ -198,10 +208,11 @@ def arrays_of(frame: Any) -> dict[str, Any]:
         )
     arrays: dict[str, Any] = {"joint_names": joints, "truth": {}}
     for name, parts in columns.items():
-        labels = joints if set(parts) == set(joints) else tuple(parts)
+        wanted = own.get(name, joints)
+        labels = wanted if set(parts) == set(wanted) else tuple(parts)
         values = parts[""] if "" in parts else np.column_stack([parts[label] for label in labels])
-        if name in ("q", "v", "u", "a", "noise_std") and labels != joints:
-            raise DatasetError(f"the frame has {name} of {', '.join(parts)}, but q of {', '.join(joints)}.")
+        if name in ("q", "v", "u", "a", "noise_std") and labels != wanted:
+            raise DatasetError(f"the frame has {name} of {', '.join(parts)}, but v of {', '.join(joints)}.")
         (arrays["truth"] if name.startswith(TRUTH) else arrays)[name.removeprefix(TRUTH)] = values
     return arrays
 

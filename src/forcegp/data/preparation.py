@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.data.dataset import Dataset
+from forcegp.data.dataset_arguments import require_vectors
 from forcegp.data.delay import estimate_delay, shifted
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
 from forcegp.data.held_out_cutoff import held_out_cutoff
@@ -94,6 +95,7 @@ class Preparation:
 
     def rows(self, dataset: Dataset) -> Dataset:
         """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
+        require_vectors(dataset, "filters")
         chosen = self.resolved(dataset)
         return _filtered(chosen, dataset).rows(_kept(chosen, dataset))
 
@@ -103,6 +105,7 @@ class Preparation:
         `truth` and `noise_std` are dropped as `low_pass` and `differentiated` drop them. Raises DatasetError for rows
         that are out of order, sampled unevenly or too few, and InvalidInput for a cut-off above half the sample rate.
         """
+        require_vectors(dataset, "filters")
         chosen, reasons = _resolve(self, dataset)
         filtered = _filtered(chosen, dataset)
         kept = _kept(chosen, dataset)

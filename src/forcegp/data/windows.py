@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from scipy.special import beta
 
 from forcegp.data.dataset import Dataset
+from forcegp.data.dataset_arguments import require_vectors
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
 from forcegp.data.row_selection import farthest_point_sampling
@@ -132,6 +133,7 @@ class WeakForm:
         Raises DatasetError for rows in another order, positions that jump by a turn and logs without a window;
         InvalidInput for more points than windows, windows of too few rows and more nodes than rows.
         """
+        require_vectors(dataset, "windows of positions")
         rows = _window_rows(dataset, self)
         _warn_of_filtered(dataset)
         if points is not None:

@@ -1,6 +1,6 @@
 from .gauss_principle import (
     AffineMap as AffineMap, Baumgarte as Baumgarte, ConstrainedDynamics as ConstrainedDynamics, Contact as Contact,
-    State as State,
+    State as State, fixed_frame as fixed_frame, fixed_point as fixed_point,
 )
 from .known_forces import (
     KNOWN_FORCES as KNOWN_FORCES, Actuation as Actuation, Armature as Armature, ConstantJointForce as
@@ -10,7 +10,7 @@ from .known_forces import (
     StribeckJointFriction, ViscousJointFriction as ViscousJointFriction,
 )
 from .surfaces import (
-    Cylinder as Cylinder, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere, Surface as Surface,
-    surface_axes as surface_axes,
+    Cylinder as Cylinder, Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
+    Surface as Surface, surface_axes as surface_axes,
 )
 from .system import MechanicalSystem as MechanicalSystem

@@ -8,7 +8,7 @@ read from the one small pseudo-inverse A~^+, which also covers redundant constra
 H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,9 +17,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.mechanics.surfaces import Surface
+from forcegp.mechanics.surfaces import Held, Surface
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch, finite_vector
+from forcegp.robots.arguments import Inertials, broadcast_batch, checked_tensor, finite_vector
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,14 @@ class Baumgarte:
 class Contact:
     """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
 
-    `point` is given in m in the axes of the link frame `frame`.
+    `point` is given in m in the axes of the link frame `frame`. With a `switch` the constraint acts only in rows whose
+    input of that name, a last column of u, is 1, and not where it is 0: the stance of a foot.
     """
 
     frame: str
     point: tuple[float, float, float]
     surface: Surface
+    switch: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
@@ -55,6 +57,8 @@ class Contact:
                 f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, Cylinder, "
                 "ImplicitSurface ..."
             )
+        if self.switch is not None and not (isinstance(self.switch, str) and self.switch):
+            raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")
         point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")
         object.__setattr__(self, "point", tuple(point.tolist()))
 
@@ -88,32 +92,74 @@ class Contact:
         if baumgarte is not None:
             rate = (gradient * velocity).sum(-1)
             b = b - 2.0 * baumgarte.zeta * baumgarte.omega * rate - baumgarte.omega**2 * self.surface.value(p)
-        return A, b, gradient
+        if self.switch is None:
+            return A, b, gradient
+        acts = (state.u[..., state.inputs.index(self.switch)] > 0.5).to(b.dtype)
+        return acts[..., None] * A, acts * b, gradient  # a row of zeros has no multiplier and constrains nothing
+
+
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def fixed_point(
+    frame: str, point: tuple[float, float, float] = (0.0, 0.0, 0.0), switch: str | None = None
+) -> tuple[Contact, Contact, Contact]:
+    """A point of the robot that does not move, such as a foot: its multipliers are the force on it in N, world axes."""
+    return tuple(Contact(frame, point, Held(axis), switch) for axis in AXES)  # type: ignore[return-value]  # three
+
+
+def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tuple[Contact, ...]:
+    """A link that neither moves nor turns, such as a flat foot: three of its points are held.
+
+    The points are its origin and those `size` m along its x and y axes. Of these nine constraints six are independent
+    in every position, and redundant ones are legal: the multipliers are the smallest that hold it.
+    """
+    points = ((0.0, 0.0, 0.0), (size, 0.0, 0.0), (0.0, size, 0.0))
+    return tuple(contact for point in points for contact in fixed_point(frame, point, switch))
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Positions, velocities and actuator forces (..., nv) of equal shape, and the inertial parameters that hold there.
+    """Positions, velocities and inputs of equal batch, and the inertial parameters that hold there.
 
-    `inertials` maps link names to log-Cholesky parameters (..., 10), or is None for those of the URDF.
+    `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators: u itself where each
+    joint has one. `inertials` maps link names to log-Cholesky parameters (..., 10), or is None for those of the URDF.
     """
 
-    q: Float[Tensor, "*batch nv"]
+    q: Float[Tensor, "*batch nq"]
     v: Float[Tensor, "*batch nv"]
-    u: Float[Tensor, "*batch nv"]
+    u: Float[Tensor, "*batch nu"]
     robot: Robot
     kinematics: Kinematics
     inertials: Mapping[str, Tensor] | None = None
+    inputs: tuple[str, ...] = ()
+    delivered_by: Callable[[Tensor], Tensor] | None = None
+
+    @property
+    def delivered(self) -> Float[Tensor, "*batch nv"]:
+        """Joint forces of the actuators in Nm or N."""
+        return self.u if self.delivered_by is None else self.delivered_by(self.u)
 
     @classmethod
     def of(
-        cls, robot: Robot, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
+        cls,
+        robot: Robot,
+        q: Tensor,
+        v: Tensor,
+        u: Tensor,
+        inertials: Inertials | None = None,
+        inputs: tuple[str, ...] = (),
+        delivered_by: Callable[[Tensor], Tensor] | None = None,
     ) -> "State":
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
-        q, v, u = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v), ("u", u)))
+        q, v = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v)))
+        if delivered_by is None:
+            u = robot.checked_input("u", u)
+        else:
+            u = checked_tensor("u", u, len(inputs), f"one value per input: {', '.join(inputs)}", robot.device)
         batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
         q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
-        return cls(q, v, u, robot, robot.kinematics(q, v), inertials)
+        return cls(q, v, u, robot, robot.kinematics(q, v), inertials, inputs, delivered_by)
 
 
 REDUNDANCY_TOLERANCE = 1e-9

@@ -60,7 +60,10 @@ class KnownForce(ABC):
             raise InvalidInput(
                 f"{what} is {given!r}; give a number, one per joint, or a mapping from joint names."
             ) from None
-        values = (values.expand(robot.nv) if values.dim() == 0 else values).clone()  # which keeps the graph
+        if values.dim() == 0:  # one number for every joint, but not for bases that move
+            driven = [joint in robot.single_joint_names or name in self.positive for joint in robot.joint_names]
+            values = values * torch.tensor(driven, dtype=values.dtype, device=values.device)
+        values = values.clone()  # which keeps the graph
         if values.shape != (robot.nv,):
             raise InvalidInput(
                 f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
@@ -79,11 +82,45 @@ class KnownForce(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Actuation(KnownForce):
-    """What the actuators deliver: u itself."""
+    """What the actuators deliver: `matrix` u with `matrix` (nv, nu), one column per actuator, called `names`.
+
+    Without a matrix there is one actuator per joint of one degree of freedom, u = its force; bases that move have none.
+    Couplings and differentials are columns with several entries, without unit or in rad/rad.
+    """
+
+    matrix: Sequence[Sequence[float]] | Tensor | None = None
+    names: tuple[str, ...] = ()
+
+    @override
+    def bound_to(self, robot: Robot) -> "Actuation":
+        if self.matrix is None:
+            free = {row for group in robot.layout.groups for row in range(*group.rows.indices(robot.nv))}
+            if not free:
+                return Actuation(None, robot.joint_names)
+            driven = [row for row in range(robot.nv) if row not in free]
+            matrix = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)[:, driven]
+            return Actuation(matrix, tuple(robot.joint_names[row] for row in driven))
+        try:
+            matrix = torch.as_tensor(self.matrix, dtype=torch.float64, device=robot.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise InvalidInput(f"Actuation matrix is {self.matrix!r}; give {robot.nv} rows of numbers.") from None
+        names = tuple(self.names) or tuple(f"actuator_{k + 1}" for k in range(matrix.shape[-1] if matrix.dim() else 0))
+        if matrix.dim() != 2 or len(matrix) != robot.nv or not bool(torch.isfinite(matrix).all()):
+            raise InvalidInput(
+                f"Actuation matrix has shape {tuple(matrix.shape)}; {robot.name} needs finite numbers in {robot.nv} "
+                f"rows, one per degree of freedom: {', '.join(robot.joint_names)}."
+            )
+        if len(names) != matrix.shape[1] or len(set(names)) != len(names):
+            raise InvalidInput(f"Actuation names are {names}; give {matrix.shape[1]} different ones, one per column.")
+        return Actuation(matrix, names)
+
+    def delivered(self, u: Tensor) -> Tensor:
+        """Joint forces (..., nv) of the actuator forces u (..., nu)."""
+        return u if self.matrix is None else u @ torch.as_tensor(self.matrix).mT
 
     @override
     def force(self, state: State) -> Tensor:
-        return state.u
+        return state.delivered
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +211,7 @@ class LoadJointFriction(KnownForce):
     @override
     def force(self, state: State) -> Tensor:
         mu, c, w = (torch.as_tensor(getattr(self, name)) for name in self.per_joint)  # tensors once they are bound
-        return -(c + mu * state.u.abs()) * torch.tanh(state.v / w)
+        return -(c + mu * state.delivered.abs()) * torch.tanh(state.v / w)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +254,7 @@ class Armature(KnownForce):
 
     @override
     def force(self, state: State) -> Tensor:
-        return torch.zeros_like(state.q)
+        return torch.zeros_like(state.v)
 
     @override
     def added_inertia(self) -> Tensor:
@@ -256,7 +293,7 @@ class RotorInertia(KnownForce):
 
     @override
     def force(self, state: State) -> Tensor:
-        return torch.zeros_like(state.q)
+        return torch.zeros_like(state.v)
 
     @override
     def added_inertia(self) -> Tensor:
@@ -286,5 +323,8 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
         raise InvalidInput(f"a {type(force).__name__} cannot be stored; files carry {', '.join(KNOWN_FORCES)}")
     stored: dict[str, Any] = {"type": name}
     for f in fields(force):  # type: ignore[arg-type]  # every entry of KNOWN_FORCES is a dataclass
-        stored[f.name] = torch.as_tensor(getattr(force, f.name)).tolist()
+        value = getattr(force, f.name)
+        if isinstance(force, Actuation) and force.matrix is None:
+            continue  # files of robots that are driven in every joint stay as they were
+        stored[f.name] = list(value) if f.name == "names" else torch.as_tensor(value).tolist()
     return stored

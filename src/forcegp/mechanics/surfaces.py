@@ -91,6 +91,31 @@ class Plane(Surface):
         return p.new_zeros(*p.shape[:-1], 3, 3)
 
 
+@dataclass(frozen=True)
+class Held(Surface):
+    """No place but a direction: a point on it does not move along `normal`, wherever it stands.
+
+    Its value is 0 everywhere, so nothing pulls the point back, and the multiplier is the force along `normal` in N.
+    """
+
+    normal: Vector
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "normal", _direction("Held normal", self.normal)[0])
+
+    @override
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return torch.zeros_like(p[..., 0])
+
+    @override
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return _tensor(self.normal, p).expand(p.shape)
+
+    @override
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        return p.new_zeros(*p.shape[:-1], 3, 3)
+
+
 class _Round(Surface):
     """All points at distance `radius` from a centre or an axis."""
 
@@ -179,7 +204,7 @@ class ImplicitSurface(Surface):
         return value
 
 
-SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder}
+SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder, "held": Held}
 """Surfaces that files can carry, by the name they have there."""
 
 

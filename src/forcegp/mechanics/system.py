@@ -56,6 +56,8 @@ class MechanicalSystem(Summary):
                 raise InvalidInput(f"{name} is {given!r}; give a sequence of {kind.__name__} objects.")
             object.__setattr__(self, name, values)
         object.__setattr__(self, "known_forces", tuple(force.bound_to(self.robot) for force in self.known_forces))
+        if sum(isinstance(force, Actuation) for force in self.known_forces) > 1:
+            raise InvalidInput("known_forces lists Actuation twice; u acts once: put both into one matrix.")
         for contact in self.contacts:
             body, _ = self.robot.frame(contact.frame)
             if body < 0:
@@ -74,6 +76,31 @@ class MechanicalSystem(Summary):
             "baumgarte": self.baumgarte or "none",
         }
 
+    @property
+    def actuation(self) -> Actuation:
+        """How u acts; that of one actuator per joint where no known force is an Actuation."""
+        own = (force for force in self.known_forces if isinstance(force, Actuation))
+        return next(own, None) or Actuation().bound_to(self.robot)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the columns of u: the actuators, then the switches of contacts (1 where they act, else 0)."""
+        switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)
+        return (*self.actuation.names, *switches)
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Sizes of q, v and u."""
+        return self.robot.nq, self.robot.nv, len(self.inputs)
+
+    def state(self, q: Tensor, v: Tensor, u: Tensor, inertials: Inertials | None = None) -> State:
+        """Checked states (q, v, u), each with its own size. Raises InvalidInput."""
+        actuation, inputs = self.actuation, self.inputs
+        count = len(actuation.names)
+        plain = actuation.matrix is None and len(inputs) == count
+        delivered_by = None if plain else lambda u: actuation.delivered(u[..., :count])
+        return State.of(self.robot, q, v, u, inertials, inputs, delivered_by)
+
     def dynamics(
         self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
     ) -> ConstrainedDynamics:
@@ -82,9 +109,9 @@ class MechanicalSystem(Summary):
         Differentiable in all arguments. `inertials` maps link names to log-Cholesky parameters (..., 10). Contact
         points are kinematic: no inertial parameter moves them.
         """
-        state = State.of(self.robot, q, v, u, inertials)
+        state = self.state(q, v, u, inertials)
         M = self.mass_matrix(state.kinematics, inertials)
-        Q_K = torch.zeros_like(state.q)
+        Q_K = torch.zeros_like(state.v)
         for force in self.known_forces:
             Q_K = Q_K + force.force(state)
         A, b, normals = self._constraint(state)
@@ -107,7 +134,7 @@ class MechanicalSystem(Summary):
     def _constraint(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """A (..., m, nv), b (..., m) and the surface gradients (..., m, 3)."""
         if not self.contacts:
-            *batch, nv = state.q.shape
+            *batch, nv = state.v.shape
             return state.q.new_zeros(*batch, 0, nv), state.q.new_zeros(*batch, 0), state.q.new_zeros(*batch, 0, 3)
         rows, right, normals = zip(
             *(contact.constraint(state, self.baumgarte) for contact in self.contacts), strict=True
@@ -116,8 +143,11 @@ class MechanicalSystem(Summary):
 
     def check_states(self, q: Float[Tensor, "N nv"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nv"]) -> None:
         """Raise ContactError, naming row and contact, where contacts cannot constrain or contradict each other."""
-        A, b, _ = self._constraint(State.of(self.robot, q, v, u))
+        A, b, _ = self._constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
+        for index, contact in enumerate(self.contacts):
+            if contact.switch is not None:  # where it does not act it needs no direction
+                size[..., index] += 1.0 - (u[..., self.inputs.index(contact.switch)] > 0.5).to(size.dtype)
         bad = torch.nonzero(~(size > 1e-12))
         if len(bad):
             row, index = (int(entry) for entry in bad[0])
@@ -190,9 +220,14 @@ class MechanicalSystem(Summary):
             "urdf": self.robot.urdf_text,
             "gravity": self.robot.gravity.tolist(),
             "armature": self.robot.armature.tolist(),
+            **({} if self.robot.base == "fixed" else {"base": self.robot.base}),
             "locked": dict(self.robot.locked),
             "contacts": [
-                {"frame": contact.frame, "point": list(contact.point), "surface": surface_to_dict(contact.surface)}
+                {
+                    **{"frame": contact.frame, "point": list(contact.point)},
+                    **({} if contact.switch is None else {"switch": contact.switch}),
+                    "surface": surface_to_dict(contact.surface),
+                }
                 for contact in self.contacts
             ],
             "known_forces": [known_force_to_dict(force) for force in self.known_forces],
@@ -223,11 +258,15 @@ class MechanicalSystem(Summary):
                 gravity=stored["gravity"],
                 armature=stored["armature"],
                 locked=stored["locked"],
+                base=stored.get("base", "fixed"),
             )
             if contacts is None:
                 contacts = [
                     Contact(
-                        entry["frame"], tuple(entry["point"]), object_from_dict("surface", SURFACES, entry["surface"])
+                        entry["frame"],
+                        tuple(entry["point"]),
+                        object_from_dict("surface", SURFACES, entry["surface"]),
+                        entry.get("switch"),
                     )
                     for entry in stored["contacts"]
                 ]

@@ -56,6 +56,7 @@ def casadi_function(
         ) from None
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(f"no program can be written of a {posterior.description}; export a StructuredGP.")
+    posterior.system.robot.require_vectors("CasADi functions")
     code = exported_code(posterior)
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]

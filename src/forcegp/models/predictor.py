@@ -214,7 +214,7 @@ class Predictor(Summary):
         most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(
-            self.nv, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
+            (self.nv, self.nv, self.nv), self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
         )
         method = integrator_named(integrator, self.posterior.system)
         check_time_step(dt)

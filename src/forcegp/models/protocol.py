@@ -186,17 +186,18 @@ class Posterior(MotionModel, Summary, ABC):
 
         Raises InvalidInput for wrong shapes or values that are not finite.
         """
-        nv = self.system.robot.nv
+        sizes = self.system.sizes
         device = self.system.robot.device
-        given = [_tensor(name, values, nv, device) for name, values in (("q", q), ("v", v), ("u", u))]
+        named = zip("qvu", (q, v, u), sizes, strict=True)
+        given = [_tensor(name, values, size, device) for name, values, size in named]
         try:
-            states = torch.broadcast_tensors(*given)
+            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given))
         except RuntimeError:
             shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", given, strict=True))
             raise InvalidInput(
                 f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state."
             ) from None
-        return [x.reshape(-1, nv) for x in states], states[0].shape[:-1]
+        return [x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in given], batch
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
         """What `rollout` integrates, under this stabilisation.
@@ -399,11 +400,11 @@ def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Te
     return {name: value.to(device) for name, value in tensors.items()}
 
 
-def _tensor(name: str, values: Array, nv: int, device: torch.device) -> Tensor:
+def _tensor(name: str, values: Array, size: int, device: torch.device) -> Tensor:
     tensor = real_tensor(name, values, device)
-    if tensor.dim() == 0 or tensor.shape[-1] != nv:
+    if tensor.dim() == 0 or tensor.shape[-1] != size:
         raise InvalidInput(
-            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {nv}, one value per joint."
+            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one value per joint."
         )
     require_finite(name, tensor)
     return tensor

@@ -55,8 +55,8 @@ class Rollout:
     Fields
     ------
     time: (T+1,) in s, from 0.
-    q, v: (..., T+1, nv), q of a moving base (..., T+1, nq), in rad and rad/s (m and m/s); row 0 is the initial state, which `integrator="projected"` moves
-        onto the constraint first. Angles are not wrapped.
+    q, v: (..., T+1, nv) in rad and rad/s (m and m/s), q of a base that moves (..., T+1, nq); row 0 is the initial state,
+        which `integrator="projected"` moves onto the constraint first. Angles are not wrapped.
     a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
     constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
         signed distances).
@@ -141,7 +141,7 @@ def roll_out(
     method = integrator_named(integrator, model.system)
     require_type("grad", grad, bool)
     robot = model.system.robot
-    q, v, forces, batch = checked_start((robot.nq, robot.nv, robot.nv), robot.device, q0, v0, u, None if grad else "give grad=True")
+    q, v, forces, batch = checked_start(model.system.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
 
@@ -150,7 +150,7 @@ def roll_out(
     def run(function: AccelerationFunction, copies: tuple[int, ...], what: str, before: int) -> Rollout:
         shape, count = (*copies, *batch), math.prod(copies)
         start = q.repeat(count, 1), v.repeat(count, 1)
-        control = None if feedback is None else _flat_feedback(feedback, shape)
+        control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
         report = None if counted is None else counted(before)
         given = (method, function, *start, forces.repeat(1, count, 1), dt)
         loops = None
@@ -195,16 +195,16 @@ def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, 
     return None
 
 
-def _flat_feedback(feedback: Feedback, batch: Sequence[int]) -> Feedback:
+def _flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedback:
     """Feedback that sees the caller's batch dimensions as one of (n, nv). Raises InvalidInput for other shapes."""
 
     def flat(k: int, q: Tensor, v: Tensor) -> Tensor:
-        shape = (*batch, v.shape[-1])
-        added = feedback(k, q.reshape(*batch, -1), v.reshape(shape))
+        shape = (*batch, size)
+        added = feedback(k, q.reshape(*batch, -1), v.reshape(*batch, -1))
         if not isinstance(added, Tensor) or added.shape != shape:
             given = tuple(added.shape) if isinstance(added, Tensor) else type(added).__name__
-            raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as its v.")
-        return added.reshape(v.shape)
+            raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as u.")
+        return added.reshape(-1, size)
 
     return flat
 
@@ -221,7 +221,7 @@ def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunct
 def checked_start(
     sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
 ) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, size), u (T, n, size) of these sizes as float64 tensors on the robot's device, and the batch dimensions.
+    """q0, v0 (n, size), u (T, n, size) as float64 tensors on the robot's device, and the batch dimensions.
 
     Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
     """
@@ -272,7 +272,7 @@ def stepped(
 ) -> Float[Tensor, "n state"]:
     """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
     method = _method(system, dt, integrator)
-    q, v, u = x.chunk(3, dim=-1)
+    q, v, u = x.split(system.sizes, dim=-1)
     step = method.step(lambda q, v: mean(q, v, u), q, v, dt)
     if not bool(step.found.all()):
         row = int((~step.found).nonzero()[0])

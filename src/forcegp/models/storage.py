@@ -299,10 +299,11 @@ def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> No
         states[NOISE] = rows.noise_std
         if not bool((rows.noise_std > 0).all()):
             raise FileFormatError(f"{file} is damaged: {prefix}noise_std has values that are not positive")
-    shape = (rows.q.shape[0], model.system.robot.nv) if rows.q.dim() == 2 else None
+    sizes = dict(zip("qvu", model.system.sizes, strict=True))
+    count = rows.q.shape[0] if rows.q.dim() == 2 else -1
     for name, value in states.items():
         _check_numbers(file, prefix + name, value)
-        if value.shape != shape:
+        if value.shape != (count, sizes.get(name, model.system.robot.nv)):
             raise FileFormatError(f"{file} is damaged: {prefix}{name} has shape {tuple(value.shape)}")
     if rows.weights is not None:
         _check_numbers(file, prefix + WEIGHTS, rows.weights)

@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownJoint, require_known, usable_arguments
-from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem, State
 from forcegp.priors.basic_kernels import periodic
 from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling
 from forcegp.priors.kernels import check_kernel
@@ -67,27 +67,27 @@ class JointForces(ExpressedKernels):
 
     @override
     def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
-        u = dynamics.state.u
-        return torch.eye(u.shape[-1], dtype=u.dtype, device=u.device).expand_as(dynamics.H)
+        H = dynamics.H
+        return torch.eye(H.shape[-1], dtype=H.dtype, device=H.device).expand_as(H)
 
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state = dynamics.state
-        columns = {"q": state.q, "v": state.v, "u": state.u}
+        posture = state.robot.posture(state.q)
+        columns = {"q": posture, "v": state.v, "u": driven(state)}
         if self.angles == "sin-cos":
             turns = _turns(state.robot)
-            q = state.q
-            columns["q"] = torch.cat([q[..., ~turns], q[..., turns].sin(), q[..., turns].cos()], dim=-1)
+            waves = posture[..., turns].sin(), posture[..., turns].cos()
+            columns["q"] = torch.cat([posture[..., ~turns], *waves], dim=-1)
         z = torch.cat([columns[name] for name in self.inputs], dim=-1)
-        return (z,) * state.u.shape[-1]
+        return (z,) * state.v.shape[-1]
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
-        joints = robot.joint_names
-        named = {name: joint_labels(name, name, joints, robot) for name in INPUTS}
+        named = state_labels(robot)
         if self.angles == "sin-cos":
             turns = _turns(robot).tolist()
-            turning = [joint for joint, turn in zip(joints, turns, strict=True) if turn]
+            turning = [name for name, turn in zip(robot.posture_names, turns, strict=True) if turn]
             sliding = [label for label, turn in zip(named["q"], turns, strict=True) if not turn]
             waves = [f"{wave} q of {joint}" for wave in ("sin", "cos") for joint in turning]
             named["q"] = (*sliding, *waves)
@@ -114,8 +114,25 @@ def as_names(given: object) -> tuple[Any, ...]:
     return tuple(given) if isinstance(given, Iterable) else ()
 
 
+def state_labels(robot: Robot) -> dict[str, tuple[str, ...]]:
+    """Names with units of the features that q, v and u give: the posture, all velocities, `driven` forces."""
+    joints, singles = robot.joint_names, robot.single_joint_names
+    positions = joint_labels("q", "q", singles, robot)
+    bases = robot.posture_names[: len(robot.posture_names) - len(singles)]
+    forces = joint_labels("u", "u", singles or joints, robot)
+    return {"q": (*bases, *positions), "v": joint_labels("v", "v", joints, robot), "u": forces}
+
+
+def driven(state: State) -> Float[Tensor, "*batch joints"]:
+    """Forces of the actuators at all joints of one degree of freedom; at the base of a robot that has none."""
+    rows = joint_indices(None, state.robot)
+    return state.delivered[..., rows] if rows and state.robot.layout.groups else state.delivered
+
+
 def _turns(robot: Robot) -> Tensor:
-    return torch.tensor([joint.type != "prismatic" for joint in robot.joints], device=robot.device)
+    """Which entries of the posture are angles."""
+    angles = {joint.name for joint in robot.joints if joint.type != "prismatic"} & {*robot.single_joint_names}
+    return torch.tensor([name in angles for name in robot.posture_names], device=robot.device)
 
 
 @dataclass(frozen=True)
@@ -177,7 +194,7 @@ class PerJointPrior(ForcePrior):
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
-        return robot.joint_names if self.joints is None else self.joints
+        return robot.single_joint_names if self.joints is None else self.joints
 
     @override
     def check(self, system: MechanicalSystem) -> None:
@@ -193,8 +210,11 @@ class PerJointPrior(ForcePrior):
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state = dynamics.state
-        x = {"q": state.q, "v": state.v}[self.depends_on]
-        return tuple(x[..., index, None] for index in joint_indices(self.joints, state.robot))
+        if self.depends_on == "v":
+            return tuple(state.v[..., index, None] for index in joint_indices(self.joints, state.robot))
+        singles = state.robot.single_joint_names
+        position = state.robot.space.singles(state.q)
+        return tuple(position[..., singles.index(name), None] for name in self.latent_names(state.robot))
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
@@ -217,11 +237,11 @@ def chosen_joints(prior: str, given: object) -> tuple[str, ...] | None:
 
 
 def joint_indices(joints: Sequence[str] | None, robot: Robot) -> list[int]:
-    """Positions of the joints (None: all). Raises UnknownJoint for a name that the robot does not have."""
+    """Places in v of the joints, None: all of one degree of freedom. Raises UnknownJoint for a name of none."""
     names = robot.joint_names
     for joint in joints or ():
         require_known("joint", joint, robot.name, names, UnknownJoint)
-    return list(range(len(names))) if joints is None else [names.index(joint) for joint in joints]
+    return [names.index(joint) for joint in (robot.single_joint_names if joints is None else joints)]
 
 
 @dataclass(frozen=True)

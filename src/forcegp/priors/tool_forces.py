@@ -12,7 +12,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem, surface_axes
 from forcegp.priors.force_prior import ExpressedKernels, Scaling
-from forcegp.priors.joint_forces import chosen_inputs, joint_labels
+from forcegp.priors.joint_forces import chosen_inputs, driven, state_labels
 from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
 
@@ -197,9 +197,9 @@ class ToolForces(ExpressedKernels):
             "angular-velocity": lambda: _along(axes, velocity[..., 3:]),
             "position": lambda: _along(tangents, where.position) if self.axes == "surface" else where.position,
             "load": lambda: nominal_normal_force(dynamics, self.contact)[..., None],
-            "q": lambda: state.q,
+            "q": lambda: state.robot.posture(state.q),
             "v": lambda: state.v,
-            "u": lambda: state.u,
+            "u": lambda: driven(state),
         }
         z = torch.cat([columns[name]() for name in self.inputs], dim=-1)
         return (z,) * self._count
@@ -226,7 +226,7 @@ class ToolForces(ExpressedKernels):
             "angular-velocity": [f"tool angular velocity about {axis} [rad/s]" for axis in turning],
             "position": [f"tool position along {axis} [m]" for axis in (along if self.axes == "surface" else "xyz")],
             "load": ["nominal normal force [N]"],
-            **{name: joint_labels(name, name, robot.joint_names, robot) for name in ("q", "v", "u")},
+            **state_labels(robot),
         }
 
     @override

@@ -119,7 +119,7 @@ def recorded_scene(
             arrows = learned_forces(posterior, dynamics)
         else:
             dynamics = system.dynamics(q, v, u)
-            arrows = [_at_joints(system.robot, dynamics, "recorded u", dynamics.state.u, None)]
+            arrows = [_at_joints(system.robot, dynamics, "recorded u", dynamics.state.delivered, None)]
         paths = [contact.position(dynamics.state.kinematics).cpu().numpy() for contact in dynamics.contacts]
     poses = poses_of_links(system.robot, q, [shape.link for shape in drawn])
     time = rows.time - rows.time[0]
@@ -168,7 +168,7 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
 def _laws(system: MechanicalSystem, dynamics: ConstrainedDynamics) -> torch.Tensor | None:
     """The sum (rows, nv) of the known forces that are friction, springs or offsets; None where there are none."""
     forces = [force.force(dynamics.state) for force in system.known_forces if not isinstance(force, NOT_SHOWN)]
-    return torch.stack([force.expand_as(dynamics.state.q) for force in forces]).sum(0) if forces else None
+    return torch.stack([force.expand_as(dynamics.state.v) for force in forces]).sum(0) if forces else None
 
 
 def _place(term: ForcePrior, dynamics: ConstrainedDynamics) -> torch.Tensor:

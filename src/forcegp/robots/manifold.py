@@ -195,6 +195,10 @@ class ConfigurationSpace:
                     "1: check the order of the columns, or divide by the length with robot.normalized(q)."
                 )
 
+    def singles(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch singles"]:
+        """The positions of all joints of one degree of freedom."""
+        return self._joined(lambda _, places: q[..., places], lambda group: q[..., :0])
+
     def _broadcast(self, *tensors: Tensor) -> list[Tensor]:
         batch = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in tensors))
         return [tensor.expand(*batch, -1) for tensor in tensors]

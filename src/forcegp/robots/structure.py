@@ -13,12 +13,13 @@ from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink
 from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import BASE, WORLD, Base, Layout, Tree, merged_inertias
-from forcegp.robots.manifold import ConfigurationSpace
+from forcegp.robots.manifold import ConfigurationSpace, pose
 from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
+DOWN = ("down_x", "down_y", "down_z")
 ALIASES = {"center_of_mass": "com"}
 
 
@@ -123,6 +124,38 @@ class RobotStructure(Summary):
         return tuple(joint.name for joint in self.layout.joints)
 
     @property
+    def single_joint_names(self) -> tuple[str, ...]:
+        """Names of the joints of one degree of freedom: where there are actuators and friction."""
+        grouped = {row for group in self.layout.groups for row in range(*group.rows.indices(self.nv))}
+        return tuple(name for row, name in enumerate(self.joint_names) if row not in grouped)
+
+    @property
+    def posture_names(self) -> tuple[str, ...]:
+        """Names of the entries of :meth:`posture`."""
+        parts = {"floating": (*DOWN, "height"), "spherical": DOWN, "planar": ()}
+        names = [f"{group.name}.{part}" for group in self.layout.groups for part in parts[group.kind]]
+        return (*names, *self.single_joint_names)
+
+    def posture(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch postures"]:
+        """What of q forces may depend on: q itself on a fixed base.
+
+        Of a base that moves, the direction of gravity in its axes and its height in m along gravity: neither where it
+        stands nor where it looks changes a force.
+        """
+        if not self.layout.groups:
+            return q
+        strength = torch.linalg.vector_norm(self.tree.gravity)
+        down = self.tree.gravity / strength if bool(strength > 0.0) else q.new_tensor([0.0, 0.0, -1.0])
+        parts: list[Tensor] = []
+        for group in self.layout.groups:
+            rotation, origin = pose(group.kind, q[..., group.places])
+            if group.kind != "planar":
+                parts.append((rotation.mT @ down[:, None])[..., 0])
+            if group.kind == "floating":
+                parts.append(-(origin @ down)[..., None])
+        return torch.cat([*parts, self.space.singles(q)], -1)
+
+    @property
     def link_names(self) -> tuple[str, ...]:
         """Names of all links in file order."""
         return tuple(self.description.links)
@@ -221,6 +254,15 @@ class RobotStructure(Summary):
         for name in inertials:
             self.layout.require_moving(name, self.name)
         return {name: self.checked_parameters(name, parameters) for name, parameters in inertials.items()}
+
+    def require_vectors(self, what: str) -> None:
+        """Raise InvalidInput where positions do not add up; `what` needs that, in the plural: "filters"."""
+        if self.layout.groups:
+            group = self.layout.groups[0]
+            raise InvalidInput(
+                f"{what} need a base that is fixed; {self.name} has the {group.kind} joint {group.name!r}. Fitting, "
+                "predicting, identifying and rolling out work."
+            )
 
     def checked_parameters(self, link: str, parameters: object) -> Tensor:
         """In float64; :class:`~forcegp.errors.InvalidInput` unless they can be log-Cholesky parameters of ``link``."""

@@ -24,7 +24,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from forcegp.errors import InvalidInput
 from forcegp.robots.layout import WORLD
 from forcegp.robots.structure import RobotStructure
 
@@ -54,11 +53,7 @@ class UnrolledRobot:
 
     def __init__(self, robot: RobotStructure, *, rounding: float = ROUNDING) -> None:
         layout, tree = robot.layout, robot.tree
-        if layout.groups:
-            raise InvalidInput(
-                f"{robot.name} has the {layout.groups[0].kind} joint {layout.groups[0].name!r}, and programs are made "
-                "for joints of one degree of freedom only; use the robot, or the posterior, itself."
-            )
+        robot.require_vectors("compiled programs")
         self.robot, self.rounding = robot, rounding
         self.joints: tuple[UnrolledJoint, ...] = tuple(
             UnrolledJoint(

@@ -250,6 +250,7 @@ def _refine(
     posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None
 ) -> Structured:
     require_type("dataset", dataset, Dataset)
+    posterior.model.system.robot.require_vectors("refinements on motions")
     if isinstance(seconds, bool) or not (isinstance(seconds, int | float) and 0.0 < seconds < math.inf):
         raise InvalidInput(f"seconds is {seconds!r}; give the length of the windows as a positive number, such as 1.0.")
     if posterior.model.mean != "analytical":

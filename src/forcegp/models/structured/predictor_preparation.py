@@ -87,6 +87,7 @@ def prepared_predictor(
             f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
             "0.01, and an integer from 1."
         )
+    physics.system.robot.require_vectors("predictors")
     begin = time.perf_counter()
     nv, device = training.q.shape[-1], training.q.device
     if covariance == "auto":
