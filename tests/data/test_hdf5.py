@@ -82,6 +82,7 @@ def test_an_interrupted_save_leaves_what_was_there_and_nothing_else(tmp_path, ex
 
     class UnwritableSystem:  # the system is written last, when the rest is on the disk
         robot = system().robot
+        inputs = robot.joint_names
         contacts = ()
 
         def to_json(self) -> str:
