@@ -106,6 +106,16 @@ class AnalyticalIdentification(Summary):
         return dict(zip(self.names, np.linalg.norm(self._spread, axis=1).tolist(), strict=True))
 
     @cached_property
+    def centers_of_mass(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
+        """Of the bodies in the axes of their child links, and their standard errors (delta method), in m."""
+        masses, moments = self.parameters[:, :1], self.parameters[:, 1:4]
+        spread = self._spread[: self.parameters.size].reshape(*self.parameters.shape, -1)
+        centers = moments / masses
+        return centers, np.linalg.norm(
+            (spread[:, 1:4] - centers[..., None] * spread[:, :1]) / masses[..., None], axis=-1
+        )
+
+    @cached_property
     def _spread(self) -> np.ndarray:
         """S with S S^T the covariance of all numbers, as if only one row in a correlation time were independent."""
         time = correlation_time(self.fit.residual / self.fit.noise, self.episode)

@@ -16,12 +16,13 @@ import forcegp
 import forcegp.analytical
 import forcegp.inference
 import forcegp.models
+import forcegp.priors
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, listed, unless_given
+from forcegp.cli.command import DATASET, FIELDS, listed, unless_given
 from forcegp.cli.fit import fit_summary, fit_with_progress, motion_report, refined_with_progress
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import PARTS, friction_laws, parse_learn, with_learned_forces
-from forcegp.cli.model_choice import FitOptions, resolved_noise
+from forcegp.cli.model_choice import PRIORS, FitOptions, resolved_noise
 from forcegp.cli.terminal import NONE, Terminal, columns, with_option_names
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
@@ -38,6 +39,9 @@ class IdentifyOptions(FitOptions):
     """structured: Gaussian processes model the unknown forces. analytical: there are none but noise.
     least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
     """
+    prior: Annotated[tuple[str, ...], listed(PRIORS, "joint", goes_on=FIELDS)] = ()
+    """With structured: what the unknown forces may be, as in forcegp fit, for instance joint-friction or
+    payload:frame=LINK."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset, direction (viscous
     friction that differs by it); none for no friction."""
@@ -126,7 +130,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
 
 def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
     """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
-    given = {"learn": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
+    given = {"learn": (), "prior": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
     changed = [name for name, default in given.items() if getattr(command, name) != default]
     if changed:
         option = changed[0].replace("_", "-")
@@ -159,6 +163,22 @@ def _report_of_regression(
         header = ["joint", "force rms\nbefore [Nm]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
         tables.append(columns(f"{command.out}: residuals of the {name} data", header, rows))
     errors, values, units = found.standard_errors, found.values, found.units
+    centers, center_errors = found.centers_of_mass
+    weak_bodies = dict(found.weak_directions)
+    rows = []
+    for body, link in enumerate(forcegp.analytical.body_names(found.given.robot)):
+        mass, center, spread = f"{link}.m", 1e3 * centers[body], 1e3 * center_errors[body]
+        rows.append(
+            [
+                link,
+                f"{found.start[mass]:.4g}",
+                f"{values[mass]:.4g} ± {errors[mass]:.2g}",
+                ", ".join(f"{x:.1f} ± {e:.2g}" for x, e in zip(center, spread, strict=True)),
+                f"{10 - weak_bodies.get(link, 0):.0f} of 10",
+            ]
+        )
+    header = ["body", "mass [kg]\ngiven", "\nidentified", "centre of mass [mm]\nx, y, z", "directions\nin the data"]
+    tables.append(columns("bodies, ± standard errors; the URDF decides what the data do not hold", header, rows))
     rows = []
     for field in dict.fromkeys(name.partition(".")[0] for name in found.terms.names):
         rows.append([f"{field.replace('_', ' ')} [{units[f'{field}.{joints[0]}']}]"])
@@ -201,7 +221,7 @@ class Identify(IdentifyOptions):
       forcegp identify log.h5 --robot arm.urdf --model consistent --friction viscous,coulomb,offset --out identified
       forcegp identify log.h5 --robot arm.urdf --model consistent --motions 1 --out identified
       forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
-      forcegp identify log.h5 --learn tool:mass,com,inertia,viscous-joint-friction=0.1 --out identified
+      forcegp identify log.h5 --learn tool:mass,com,armature=0.1 --prior joint-friction --out identified
     """
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
@@ -212,6 +232,10 @@ class Identify(IdentifyOptions):
             raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
         if self.model in INERTIAS:
             return identify_by_regression(self, terminal)
+        if self.model == "analytical" and self.prior:
+            raise InvalidInput(
+                "--model analytical has no unknown forces; leave --prior out, or use --model structured."
+            )
         if self.motions is not None:
             raise InvalidInput("--motions goes with --model consistent; for the processes use forcegp fit --motions.")
         self.require_free(self.out)
@@ -222,8 +246,13 @@ class Identify(IdentifyOptions):
         system, added = with_learned_forces(self._system(dataset), learn)
         self._check(terminal, dataset, system)
         dataset, rows_note = self._rows(dataset, system)
-        prior = forcegp.NoForces() if self.model == "analytical" else forcegp.JointForces()
-        model = forcegp.StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
+        prior = "none" if self.model == "analytical" else " + ".join(self.prior or ("joint",))
+        model = forcegp.StructuredGP(
+            system,
+            forcegp.priors.named_prior(prior, system),
+            self.mean,
+            resolved_noise(self.noise, dataset, self.force_noise),
+        )
         posterior = fit_with_progress(
             terminal,
             model,
