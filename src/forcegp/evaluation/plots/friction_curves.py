@@ -133,7 +133,7 @@ def friction_curves_figure(
     truth = {} if dataset is None else _truth(posterior, dataset, chosen)
     for number, (axes, panel) in enumerate(zip(grid, chosen, strict=False)):
         feature, unit = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
-        what = {"Nm": "torque in Nm", "": "force / normal force"}.get(unit, f"force in {unit}")
+        what = {"Nm": "torque [Nm]", "": "force / normal force"}.get(unit, f"force [{unit}]")
         what = f"resisting {what}" if panel.resisting < 0 else what
         style.quiet(axes, title=titles[number], x=_label(feature), y=what)
     for axes in grid[len(chosen) :]:
@@ -167,10 +167,9 @@ def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> lis
 
 
 def _label(feature: str) -> str:
-    """`velocity of lbr_iiwa_joint_1 [rad/s]` -> `velocity in rad/s`: the title names the joint."""
+    """`velocity of lbr_iiwa_joint_1 [rad/s]` -> `velocity [rad/s]`: the title names the joint."""
     what, _, unit = feature.partition(" [")
-    what = what.split(" of ")[0]
-    return f"{what} in {unit.removesuffix(']')}" if unit else what
+    return " [".join(filter(None, (what.split(" of ")[0], unit)))
 
 
 def _draw_curve(

@@ -124,12 +124,12 @@ def check_figure(report: CheckReport) -> Figure:
     shown = shown.rows(slice(None, None, max(1, len(shown) // MOST_ROWS)))
     for joint, (panel, lowest) in enumerate(panels):
         unit = _draw_joint(panel, report, shown, joint)
-        style.quiet(panel, title=_title(names[joint], report, joint), y=unit, x="time in s" if lowest else "")
+        style.quiet(panel, title=_title(names[joint], report, joint), y=unit, x="time [s]" if lowest else "")
     style.legend_above(halves[0], _heading(report), *(panel for panel, _ in panels), markerscale=4)
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]
     _draw_spectra(left, report, names)
     _draw_time_steps(right, inputs.log)
-    style.quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
+    style.quiet(right, title="Time steps as logged", x="recorded time [s]", y="ms")
     return figure
 
 

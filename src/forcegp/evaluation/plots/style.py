@@ -8,9 +8,11 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from PIL import Image
 
 from forcegp.atomic_files import atomic_file
@@ -20,10 +22,12 @@ from forcegp.errors import InvalidInput
 # Okabe & Ito (2008): distinguishable with every kind of colour vision.
 PREDICTION = "#0072B2"
 KNOWN_PHYSICS = "#D55E00"
+IDENTIFIED = "#009E73"
+BLACK_BOX = "#CC79A7"
 TRUTH = "#111111"
 MEASUREMENT = "#9A9A9A"
 QUIET = "#5F6670"
-SERIES = (PREDICTION, KNOWN_PHYSICS, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", TRUTH)
+SERIES = (PREDICTION, KNOWN_PHYSICS, IDENTIFIED, BLACK_BOX, "#E69F00", "#56B4E9", TRUTH)
 
 DASHED = (0, (4, 1.5))
 SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
@@ -77,7 +81,7 @@ def joint_panels(figure: FigureBase, count: int, columns: int) -> list[tuple[Axe
     return [(axes, place + columns >= count) for place, axes in enumerate(grid[:count])]
 
 
-def heading(figure: Figure, text: str, *, size: float = LARGE) -> None:
+def heading(figure: FigureBase, text: str, *, size: float = LARGE) -> None:
     """A bold title above all panels, at the left."""
     figure.suptitle(text, fontsize=size, fontweight="bold", x=0.01, ha="left")
 
@@ -104,6 +108,22 @@ def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, si
     handles, labels = legend_entries(*axes)
     columns = columns or max(1, len(labels))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=size, frameon=False, **more)
+
+
+def legend_right(figure: FigureBase, axes: Axes) -> None:
+    """The entries of these axes in one column on the right of all panels."""
+    figure.legend(loc="outside right upper", fontsize=SMALL, frameon=False, handles=legend_entries(axes)[0])
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers such as 0.02 and 50 at 1, 2 and 5 times powers of ten of a logarithmic axis, at powers where it is long.
+
+    Call it when everything is drawn.
+    """
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
