@@ -52,10 +52,10 @@ from forcegp.evaluation.plots.style import (
     MEASUREMENT,
     NORMAL,
     PREDICTION,
-    SERIES,
     TRUTH,
     new_figure,
     quiet,
+    speed_colors,
     window,
 )
 from forcegp.priors.contact_friction import ExpectedFriction
@@ -146,7 +146,7 @@ def tool_forces() -> Any:
     quiet(
         right,
         title="tool-forces across a rough strip, 300 points",
-        x="place x [m]",
+        x="position x [m]",
         y="force at 1 m/s [N]",
     )
     return finish(figure, left, right)
@@ -238,10 +238,10 @@ def payload() -> Any:
     for number, (mean, std) in enumerate(found[:4]):
         at = np.arange(3) + 0.14 * (number - 1.5)
         label = f"{counts[number]} points"
-        color = SERIES[1:][number]
+        color = speed_colors()(number / 3)
         right.errorbar(at, 100.0 * mean[1:], 100.0 * BAND * std[1:], fmt="o", color=color, label=label, **style)
     right.set_xticks(range(3), ["x", "y", "z"])
-    quiet(right, title="its centre of mass in the axes of link 7", x="axis", y="place [cm]")
+    quiet(right, title="its centre of mass in the axes of link 7", x="axis", y="position [cm]")
     return finish(figure, left, right)
 
 
@@ -302,7 +302,7 @@ def friction_map() -> Any:
         curve = posterior.curve("sliding", place @ tangents)
         draw_curve(axes, _Line(x, curve.mean, curve.std), roughness, visited_x)
         axes.set_ylim(0.0, 6.0)
-        quiet(axes, title=f"{kernel}, 100 points", x="place x [m]", y="coefficient [N/(m/s)]")
+        quiet(axes, title=f"{kernel}, 100 points", x="position x [m]", y="coefficient [N/(m/s)]")
     return finish(figure, *grid)
 
 

@@ -50,9 +50,9 @@ def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fig
             for row, (name, model) in enumerate(models.items()):
                 value = model[f"{score}_per_joint"][joint]
                 if value is not None:
-                    dot = {"color": looks[name]["color"], "markerfacecolor": looks[name]["markerfacecolor"]}
-                    axes.plot([value["min"], value["max"]], [row, row], color=dot["color"], linewidth=4.0, alpha=0.35)
-                    axes.plot(value["median"], row, "o", markersize=5.5, **dot)
+                    color, inside = (looks[name][part] for part in ("color", "markerfacecolor"))
+                    axes.plot([value["min"], value["max"]], [row, row], color=color, linewidth=4.0, alpha=0.35)
+                    axes.plot(value["median"], row, "o", markersize=5.5, color=color, markerfacecolor=inside)
             style.quiet(axes, title=joints[joint])
             axes.set_xscale("log")
             axes.margins(x=0.12)
@@ -102,18 +102,18 @@ def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fi
 
 
 def _looks(models: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """How every model is drawn: colours of its kind in the order of the models."""
-    plain: dict[str, list[str]] = {}
+    """How every model is drawn: colours of its kind; earlier ones wider, so that curves which coincide are seen."""
+    kinds = {name.removesuffix(MOTIONS): model["kind"] for name, model in models.items()}
+    named = sorted(kinds, key=lambda base: not base.startswith("joint-friction"))  # which has one colour everywhere
     looks = {}
-    for name, model in models.items():
-        kind, base = model["kind"], name.removesuffix(MOTIONS)
-        known = plain.setdefault(kind, [])
-        if base not in known:
-            known.append(base)
-        turn, place = divmod(known.index(base), len(COLORS[kind]))
-        color, refined = COLORS[kind][place], name != base
-        looks[name] = {"color": color, "linestyle": "--" if refined else DASHES[turn % len(DASHES)], "linewidth": 1.4}
-        looks[name] |= {"marker": "o", "markersize": 4.0, "markerfacecolor": "white" if refined else color}
+    for below, name in enumerate(models, start=1 - len(models)):
+        base = name.removesuffix(MOTIONS)
+        alike = [other for other in named if kinds[other] == kinds[base]]
+        turn, place = divmod(alike.index(base), len(COLORS[kinds[base]]))
+        color, refined = COLORS[kinds[base]][place], name != base
+        looks[name] = {"color": color, "linestyle": "--" if refined else DASHES[turn % len(DASHES)]}
+        looks[name] |= {"linewidth": 1.2 - 0.35 * below, "marker": "o", "markersize": 3.0 - 0.5 * below}
+        looks[name] |= {"markerfacecolor": "white" if refined else color}
     return looks
 
 
