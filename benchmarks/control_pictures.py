@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 
 import forcegp
@@ -110,14 +110,18 @@ PALETTE, PIXELS = 64, 100
 def film(robot: Robot, model: StructuredPosterior, done: dict[str, dict[str, np.ndarray]]) -> list[Image.Image]:
     """The arm under two controllers, the reference in grey; learned friction as arrows, and as curves with bands."""
     figure = new_figure(7.6, 4.5)
-    arms, below = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
+    arms, below = halves
     every = slice(None, None, RATE // FRAMES_PER_SECOND)
     moving: list[Callable[[int], None]] = []
+    axes: Any = None
     for place, name in enumerate(SHOWN):
         axes = arms.add_subplot(1, 2, place + 1, projection="3d")
         moving += draw_arm(axes, robot, done[name], name, every)
     learned = done["learned"]
-    force = model.predict(*(torch.tensor(learned[x][every]) for x in "qvu")).unknown_force.mean.numpy()
+    friction = model.predict(*(torch.tensor(learned[x][every]) for x in "qvu")).unknown_force
+    assert friction is not None, "models of joint friction predict it"
+    force = friction.mean.numpy()
     moving += draw_arrows(axes, robot, learned["q"][every], force)
     for axes, joint in zip(below.subplots(1, len(CURVES)), CURVES, strict=True):
         moving.append(draw_friction(axes, robot, model, joint, learned["v"][every, joint]))
@@ -126,8 +130,9 @@ def film(robot: Robot, model: StructuredPosterior, done: dict[str, dict[str, np.
     for frame in range(len(force)):
         for move in moving:
             move(frame)
-        figure.canvas.draw()
-        shown = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+        canvas: Any = figure.canvas
+        canvas.draw()
+        shown = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
         width, height = (round(size * PIXELS) for size in figure.get_size_inches())
         frames.append(shown.resize((width, height), Image.Resampling.LANCZOS))
     palette = frames[len(frames) // 2].quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=3)
@@ -135,7 +140,7 @@ def film(robot: Robot, model: StructuredPosterior, done: dict[str, dict[str, np.
 
 
 def draw_arm(
-    axes: Axes3D, robot: Robot, motion: dict[str, np.ndarray], name: str, every: slice
+    axes: Any, robot: Robot, motion: dict[str, np.ndarray], name: str, every: slice
 ) -> list[Callable[[int], None]]:
     """The arm above its reference, each with the trace of its tool; returns what moves them."""
     arm, wanted = (links(robot, q[every]) for q in (motion["q"], motion["q"] + motion["e"]))
@@ -160,7 +165,7 @@ def draw_arm(
     return [move]
 
 
-def draw_arrows(axes: Axes3D, robot: Robot, q: np.ndarray, force: np.ndarray) -> list[Callable[[int], None]]:
+def draw_arrows(axes: Any, robot: Robot, q: np.ndarray, force: np.ndarray) -> list[Callable[[int], None]]:
     """The learned torque of every joint as a line along its axis, from the place of the joint."""
     kinematics = robot.kinematics(torch.tensor(q))
     moving = []

@@ -15,7 +15,9 @@ from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 
 EVERY = pytest.mark.parametrize("command", COMMANDS)
 MOST_WORDS = 30
-TRANSLATED = re.compile(r"\b(gone on with|goes on from|nobody|so many|so long|teach\w*|surest|shall|says?|knows?|tells?)\b")
+TRANSLATED = re.compile(
+    r"\b(gone on with|goes on from|nobody|so many|so long|teach\w*|surest|shall|says?|knows?|tells?)\b"
+)
 
 
 @pytest.mark.parametrize("columns", [60, 100, 200])

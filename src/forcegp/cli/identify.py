@@ -36,9 +36,7 @@ class IdentifyOptions(FitOptions):
     coefficients, or at FORCE=START. The models least-squares and consistent estimate all of these instead."""
     model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
     """structured: Gaussian processes model the unknown forces. analytical: no unknown forces, noise alone.
-    least-squares: regression of joint forces on every inertia. consistent: the same, with physically consistent
-    inertias.
-    """
+    least-squares: regression of joint forces on every inertia. consistent: the same, physically consistent."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset, direction (viscous
     friction that depends on the direction); none for no friction."""

@@ -10,6 +10,7 @@ from matplotlib.ticker import NullLocator
 
 from forcegp.evaluation.plots.style import (
     LARGE,
+    QUANTILE,
     QUIET,
     SERIES,
     TRUTH,
@@ -105,7 +106,6 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
 
 
 SHOWN_JOINTS = (0, 3, 6)
-INTERVAL = 1.96
 
 
 def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
@@ -114,7 +114,7 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
     panels = figure.subplots(len(SHOWN_JOINTS), len(arrays), sharex=True, sharey="row", squeeze=False)
     for column, (model, stored) in enumerate(arrays.items()):
         for row, joint in enumerate(SHOWN_JOINTS):
-            axes, time, half = panels[row, column], stored["time"], INTERVAL * stored["std"][:, joint]
+            axes, time, half = panels[row, column], stored["time"], QUANTILE * stored["std"][:, joint]
             draw_band(axes, time, np.zeros_like(half), half, color=COLORS[model], alpha=0.35, label="95 % interval")
             error = stored["mean"][:, joint] - stored["truth"][:, joint]
             axes.plot(time, error, color=TRUTH, linewidth=0.9, label="prediction − truth")
@@ -122,7 +122,7 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
             quiet(axes, title=title, x="time [s]" if row == len(SHOWN_JOINTS) - 1 else "", y=label)
     for row, joint in enumerate(SHOWN_JOINTS):  # a few rows at the jumps of the reference would hide all others
         errors = [np.abs(each["mean"] - each["truth"])[:, joint] for each in arrays.values()]
-        halves = [INTERVAL * each["std"][:, joint] for each in arrays.values()]
+        halves = [QUANTILE * each["std"][:, joint] for each in arrays.values()]
         limit = 1.2 * float(np.quantile([errors, halves], 0.98))
         panels[row, 0].set_ylim(-limit, limit)
     legend_below(figure, panels[0, -1])

@@ -16,8 +16,6 @@ COLORS = {
     "force prior": (style.PREDICTION, style.SERIES[5], "#17375E"),
 }
 """By the kind of a model, as in all other figures; what is refined on motions is its model with dashes."""
-DASHES = ("-", "-.", ":")
-"""For models beyond the colours of their kind."""
 
 
 def figures_of(document: Mapping[str, Any]) -> dict[str, Figure]:
@@ -43,7 +41,8 @@ def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fig
         "force_rms": f"Force: RMS of M (predicted − measured acceleration) [{_unit(document, 'u')}]",
     }
     figure = style.new_figure(2.4 + max(4.2, 1.35 * len(joints)), 1.4 + 0.44 * len(models))
-    for part, (score, title) in zip(figure.subfigures(2, 1), scores.items(), strict=True):
+    halves: Any = figure.subfigures(2, 1)
+    for part, (score, title) in zip(halves, scores.items(), strict=True):
         panels = part.subplots(1, len(joints), sharey=True, squeeze=False)[0]
         style.heading(part, title, size=style.NORMAL)
         for joint, axes in enumerate(panels):
@@ -76,7 +75,7 @@ def calibration_figure(models: Mapping[str, Any]) -> Figure:
     corner = {"fontsize": style.NORMAL, "color": style.QUIET}
     axes.text(0.98, 0.02, "intervals too narrow", ha="right", **corner)
     axes.text(0.0, 0.97, "too wide", **corner)
-    style.legend_right(figure, axes)
+    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
     return figure
 
 
@@ -97,7 +96,7 @@ def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fi
     style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{label}]")
     axes.set_yscale("log")
     style.plain_ticks(axes.yaxis)
-    style.legend_right(figure, axes)
+    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
     return figure
 
 
@@ -111,7 +110,7 @@ def _looks(models: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         alike = [other for other in named if kinds[other] == kinds[base]]
         turn, place = divmod(alike.index(base), len(COLORS[kinds[base]]))
         color, refined = COLORS[kinds[base]][place], name != base
-        looks[name] = {"color": color, "linestyle": "--" if refined else DASHES[turn % len(DASHES)]}
+        looks[name] = {"color": color, "linestyle": "--" if refined else ("-", "-.", ":")[turn % 3]}
         looks[name] |= {"linewidth": 1.2 - 0.35 * below, "marker": "o", "markersize": 3.0 - 0.5 * below}
         looks[name] |= {"markerfacecolor": "white" if refined else color}
     return looks

@@ -78,7 +78,11 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
         for index, place in enumerate(range(which.start, which.stop)):
             along = _velocity_along(term, term.latent_names(robot)[index], index) if widths[place] > 1 else None
             if widths[place] == 1:
-                joint = robot.joint_names.index(term.latent_names(robot)[index]) if _of_joints(term) else None
+                joint = (
+                    robot.joint_names.index(term.latent_names(robot)[index])
+                    if isinstance(term, JointFriction)
+                    else None
+                )
                 panels.append(CurvePanel(names[place], component, term, index, 0, 1.0, joint))
             elif along is not None:
                 panels.append(CurvePanel(names[place], component, term, index, along, -1.0))
@@ -86,11 +90,6 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
         return panels
     with_law = [joint for joint in range(robot.nv) if law_forces(posterior.system, joint, np.ones(1)).any()]
     return [CurvePanel(robot.joint_names[joint], LAWS, NoForces(), joint, 0, 1.0, joint) for joint in with_law]
-
-
-def _of_joints(term: ForcePrior) -> bool:
-    """Whether the processes of a term are friction of single joints over their velocity."""
-    return isinstance(term, JointFriction)
 
 
 def law_forces(system: MechanicalSystem, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -86,40 +86,31 @@ def heading(figure: FigureBase, text: str, *, size: float = LARGE) -> None:
     figure.suptitle(text, fontsize=size, fontweight="bold", x=0.01, ha="left")
 
 
-def legend_entries(*axes: Axes) -> tuple[list[Artist], list[str]]:
-    """Handles and labels of several axes, each label once."""
+def legend_entries(*axes: Axes) -> list[Artist]:
+    """What several axes show, each label once."""
     entries: dict[str, Artist] = {}
     for source in axes:
         for handle, label in zip(*source.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    return list(entries.values()), list(entries)
+    return list(entries.values())
 
 
 def legend_above(figure: FigureBase, title: str, *axes: Axes, **more: Any) -> None:
     """The entries of these axes in one row above all panels, under a bold title."""
-    handles, labels = legend_entries(*axes)
-    more |= {"title": title, "title_fontproperties": {"size": LARGE, "weight": "bold"}, "alignment": "left"}
-    columns = max(1, len(labels))
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns, fontsize=NORMAL, frameon=False, **more)
+    handles = legend_entries(*axes)
+    more |= {"handles": handles, "ncols": max(1, len(handles)), "title": title, "alignment": "left"}
+    more |= {"title_fontproperties": {"size": LARGE, "weight": "bold"}}
+    figure.legend(loc="outside upper left", fontsize=NORMAL, frameon=False, **more)
 
 
 def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, size: float = SMALL, **more: Any) -> None:
     """The entries of these axes below all panels, by default in one row."""
-    handles, labels = legend_entries(*axes)
-    columns = columns or max(1, len(labels))
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=size, frameon=False, **more)
-
-
-def legend_right(figure: FigureBase, axes: Axes) -> None:
-    """The entries of these axes in one column on the right of all panels."""
-    figure.legend(loc="outside right upper", fontsize=SMALL, frameon=False, handles=legend_entries(axes)[0])
+    more |= {"handles": (handles := legend_entries(*axes)), "ncols": columns or max(1, len(handles))}
+    figure.legend(loc="outside lower center", fontsize=size, frameon=False, **more)
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Numbers such as 0.02 and 50 at 1, 2 and 5 times powers of ten of a logarithmic axis, at powers where it is long.
-
-    Call it when everything is drawn.
-    """
+    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)))
     axis.set_minor_locator(NullLocator())
