@@ -22,6 +22,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def figures(posterior, test_data):
+    sys.modules.pop("matplotlib.pyplot", None)  # examples that ran before in this process may have imported it
     return {
         "prediction": prediction_figure(posterior, test_data),
         "tool_path": tool_path_figure(posterior, test_data),
