@@ -7,6 +7,7 @@ from pathlib import Path
 
 from benchmarks.force_pictures import PICTURES
 from tests.examples import run_example
+from tests.prose import sentences, words
 
 from forcegp import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.cli.main import parse_arguments
@@ -39,6 +40,7 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
 def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Path):
     readme = (repository / "README.md").read_text(encoding="utf-8")
     assert len(readme.split()) <= 700
+    assert max(len(words(sentence)) for sentence in sentences(readme)) <= 30
     answer = (repository / "docs" / "how-to" / "auto" / "answer.txt").read_text(encoding="utf-8")
     assert f"```text\n{answer}```" in readme
     assert f"```text\n{answer}```" in (repository / "docs" / "how-to" / "auto.md").read_text(encoding="utf-8")
