@@ -228,6 +228,6 @@ def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable,
         _, told = process.communicate(timeout=600)  # a guard against a hang
     assert process.returncode == 130
     last = told.decode().splitlines()[-1]
-    assert last == "forcegp: interrupted; finished pieces are kept, and the same command goes on from there."
+    assert last == "forcegp: interrupted; finished pieces are kept, and the same command resumes."
     assert b"Traceback" not in told
     assert list((tmp_path / "out" / "jobs").glob(finished))

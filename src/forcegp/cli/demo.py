@@ -39,7 +39,7 @@ PUBLISHED_MAE = dict(zip(MODELS, (published.FIG2B_MAE["s-gp"], published.FIG2B_M
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Command):
-    """A robot arm slides its tool on a surface, and a model learns the friction that nobody modelled.
+    """A robot arm slides its tool on a surface, and a model learns the friction of the tool.
 
     Simulates a training and a test trajectory, and fits the model of the paper (Rath, Geist, Trimpe 2021) without and
     with its analytical mean. Scores both on the other trajectory, draws pictures, and keeps everything in one folder.

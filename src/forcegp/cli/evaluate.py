@@ -50,13 +50,13 @@ class Evaluate(Command):
     system: SystemChoice = "model"
     """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
     contact: Annotated[tuple[str, ...], listed(CONTACTS, "those of --system", goes_on=NUMBERS)] = ()
-    """Predict under these contacts instead, for example a joint that stuck; written as for forcegp fit."""
+    """Predict under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
     report: Annotated[Path | None, unless_given("FILE.html", "no report")] = None
-    """Also write one page to send around: the robot in motion with its forces, pictures and errors."""
+    """Also write a report in one file: the robot in motion with its forces, figures and errors."""
     shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
-    """What the links look like in the report: a URDF with visual elements, its meshes beside it."""
+    """A URDF with visual elements for the links in the report, its meshes beside it."""
     overwrite: bool = False
     """Replace the folder of plots and the report if forcegp wrote them."""
 

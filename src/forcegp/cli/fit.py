@@ -167,7 +167,7 @@ def motion_report(posterior: Any) -> list[Any]:
         f"{found['windows']} windows of {found['seconds']:g} s, whose initial states are estimated, too; rms of q by "
         f"joint: {error}."
     )
-    weak = f"Not told by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
+    weak = f"Not identified by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
     table = columns("refined on motions", ["", "value", "std. error"], rows)
     return [*([table] if rows else []), summary, *([weak] if weak else [])]
 

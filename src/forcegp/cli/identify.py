@@ -34,17 +34,16 @@ class IdentifyOptions(FitOptions):
     learn: Annotated[tuple[str, ...], listed("LINK:PARTS|FORCE,...", goes_on=PARTS)] = ()
     """What to estimate. LINK:PARTS: out of mass, com (centre of mass) and inertia. FORCE or FORCE:JOINT,JOINT:
     viscous-joint-friction, coulomb-joint-friction or armature, of all joints or of these. They begin at the URDF's
-    coefficients, or at FORCE=START. The models least-squares and consistent estimate all of it instead."""
+    coefficients, or at FORCE=START. The models least-squares and consistent estimate all of these instead."""
     model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
-    """structured: Gaussian processes model the unknown forces. analytical: there are none but noise.
-    least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
-    """
+    """structured: Gaussian processes model the unknown forces. analytical: no unknown forces, noise alone.
+    least-squares: regression of joint forces on every inertia. consistent: the same, physically consistent."""
     prior: Annotated[tuple[str, ...], listed(PRIORS, "joint", goes_on=FIELDS)] = ()
     """With structured: what the unknown forces may be, as in forcegp fit, for instance joint-friction or
     payload:frame=LINK."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset, direction (viscous
-    friction that differs by it); none for no friction."""
+    friction that depends on the direction); none for no friction."""
     rotors: Literal["armature", "rotor", "none"] = "armature"
     """With the last two models: armature: one rotor inertia per joint. rotor: those of the system's coupled rotors."""
     likelihood: Literal["torque", "acceleration"] = "torque"
@@ -55,7 +54,7 @@ class IdentifyOptions(FitOptions):
     test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none", Path)] = None
     """With the last two models: score on this recording, too."""
     motions: Annotated[float | None, unless_given("S", "none", float)] = None
-    """With consistent: refine all of it in the end on the recorded positions, over windows so long. See
+    """With consistent: finally refine all parameters on the recorded positions, over windows of S seconds. See
     docs/how-to/motions.md."""
     prior_strength: Annotated[float | None, unless_given("W", "0; 1 for the last two models", float)] = None
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
@@ -213,7 +212,7 @@ COEFFICIENT_NAMES = (
 class Identify(IdentifyOptions):
     """Estimate physical parameters of the robot along with the unknown forces, and report their standard errors.
 
-    The estimates start from the URDF and always belong to a body that can exist (but those of least-squares). The
+    The estimates start from the URDF. Except for least-squares, they are physically consistent. The
     folder holds identified.urdf, identification.json, and the model as `forcegp fit` writes it, or system.json for
     --identified.
 

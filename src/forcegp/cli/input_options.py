@@ -31,8 +31,8 @@ class RobotOptions(Command):
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
     """Use this robot instead of the dataset's."""
     inertias: Literal["strict", "nearest"] = "strict"
-    """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
-    inertia that a body can have, and warn how far it is."""
+    """What to do about a physically impossible inertia. strict: refuse the URDF. nearest: use the nearest possible
+    one, and warn how far it is."""
     lock: Annotated[tuple[str, ...], listed("JOINT=RAD,...", "as recorded")] = ()
     """Hold joints of the URDF at these positions (rad or m), for instance a finger that was not recorded."""
     armature: Annotated[tuple[str, ...], listed("JOINT=VALUE,...", "as recorded, or 0")] = ()
@@ -189,8 +189,8 @@ class CutoffOptions(Command):
     """What every command asks that filters a log."""
 
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
-    """Low-pass filter q and u without delay, and compute v and a anew. auto: near where the spectrum shows
-    the end of the motion, as held-out torques decide."""
+    """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
+    torques."""
     differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
 
@@ -209,14 +209,14 @@ class PreparationOptions(CutoffOptions):
     """What every command asks that makes rows to learn from out of a raw log."""
 
     delay: Annotated[str, arg(metavar="S|auto|each")] = "0"
-    """How much later than it acts u was logged, in s: one number, or one per joint with commas. auto: estimated for all
-    joints together, each: for each, which need the robot."""
+    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together.
+    each: estimated per joint. Both need the robot."""
     lag: Annotated[str, arg(metavar="S|auto|each")] = "0"
     """Time constant in s with which actuators of first order follow u: as for --delay."""
     every: Annotated[int | None, unless_given("N", "1", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0
-    """Drop so many seconds at both ends of each episode, after the filter."""
+    """Drop S seconds at both ends of each episode, after the filter."""
 
     @override
     def _preparation(self) -> forcegp.Preparation:

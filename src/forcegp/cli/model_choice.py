@@ -78,7 +78,7 @@ class ModelOptions(FitOptions):
     window: Annotated[float | None, unless_given("S", f"{WINDOW}", float)] = None
     """Length of the windows of weak-form."""
     motions: Annotated[float | None, unless_given("S", "none", float)] = None
-    """After the fit, refine friction, inertias and the unknown forces on the recorded positions, over windows so long.
+    """After the fit, refine friction, inertias and unknown forces on the recorded positions, over windows of S seconds.
     See docs/how-to/motions.md."""
     iterations: Annotated[int | None, unless_given("N", ITERATIONS_HINT, int)] = None
     """Most L-BFGS iterations of each start, or training steps of a network."""

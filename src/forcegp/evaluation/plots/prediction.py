@@ -35,7 +35,7 @@ def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 
         style.quiet(axes[joint, 1], y=units[joint])
     for column, title in enumerate(("Acceleration", "Error: prediction minus measurement (dots) or truth (line)")):
         axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
-        axes[-1, column].set_xlabel("time in s", fontsize=style.NORMAL)
+        axes[-1, column].set_xlabel("time [s]", fontsize=style.NORMAL)
     figure.align_ylabels(axes[:, 0])
     figure.align_ylabels(axes[:, 1])
     title = f"Prediction after {len(posterior.training)} training points"
@@ -128,7 +128,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         name = f"{type(contact.surface).__name__.lower()} at {contact.frame}"
         title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
         _draw_force(grid[index, 0], rows, forces, index, known)
-        style.quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
+        style.quiet(grid[index, 0], title=title, x="time [s]", y="normal force [N]")
         if every is not None:
             title = _draw_errors(grid[index, 1], every, index)
             style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")

@@ -75,14 +75,14 @@ def _draw_tool_path(
     rows[0] = float(np.clip(wanted, *heights))
     grid.set_height_ratios(rows)
     figure.set_figheight(inch * sum(rows))
-    quiet(axes, x="x in m", y="y in m")
+    quiet(axes, x="x [m]", y="y [m]")
     surface = posterior.system.contacts[0].surface
     level = isinstance(surface, Plane) and bool(np.hypot(*surface.normal[:2]) < 1e-6)
     side = "seen from above" if level else "projected on x, y"
     title = f"Tool on the surface, {side}{_excerpt(dataset, whole, before=': ')}"
     axes.set_title(title, fontsize=NORMAL, loc="left", color=TRUTH, pad=20.0)  # a row of its own above the legend
     bar = figure.colorbar(lines, ax=axes, pad=0.01, aspect=12)
-    bar.set_label("speed in m/s", fontsize=SMALL, color=QUIET)
+    bar.set_label("speed [m/s]", fontsize=SMALL, color=QUIET)
     bar.ax.tick_params(labelsize=SMALL, labelcolor=QUIET)
     bar.outline.set_visible(False)  # type: ignore[operator]  # the stubs call it a spine with another signature
     close = {"bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1, "borderpad": 0.2}
@@ -133,7 +133,7 @@ def _draw_height(axes: Axes, system: MechanicalSystem, dataset: Dataset) -> None
         order = np.argsort(dataset.time[rows], kind="stable")
         axes.plot(dataset.time[rows][order], factor * distance[rows][order], color=QUIET, linewidth=0.8)
     axes.margins(x=0)
-    quiet(axes, title="Distance of the tool from the surface", x="time in s", y=f"distance in {unit}")
+    quiet(axes, title="Distance of the tool from the surface", x="time [s]", y=f"distance [{unit}]")
 
 
 def summary_figure(
@@ -165,15 +165,13 @@ def summary_figure(
         below = figure.add_subplot(grid[2, column], sharex=above)
         _draw_acceleration(above, rows, predicted, joint)
         _draw_force(below, rows, predicted, joint)
-        style.quiet(above, title=names[joint], y="" if column else f"acceleration in {units['a'][joint]}")
-        style.quiet(below, x="time in s", y="" if column else f"unknown force in {units['u'][joint]}")
+        style.quiet(above, title=names[joint], y="" if column else f"acceleration [{units['a'][joint]}]")
+        style.quiet(below, x="time [s]", y="" if column else f"unknown force [{units['u'][joint]}]")
         above.tick_params(labelbottom=False)
     figure.align_ylabels()
     style.legend_below(figure, *figure.axes[-2:], size=style.NORMAL, markerscale=4)
     shown = _excerpt(rows, dataset, before=" (time panels: ", after=")")
-    learned = f"the {posterior.description} all it has learned"
-    learned = "the force that nobody modelled" if posterior.predicts_forces else learned
-    style.heading(figure, f"{len(posterior.training)} points teach {learned}{shown}", size=style.LARGE + 1)
+    style.heading(figure, f"Prediction after {len(posterior.training)} training points{shown}", size=style.LARGE + 1)
     return figure
 
 
