@@ -1,6 +1,7 @@
 """A whole comparison: one file per piece of work, resumed, extended, refused, and with a model that fails."""
 
 import json
+import shutil
 
 import pytest
 from tests.validation.moving_arm import given_system, moving_arm
