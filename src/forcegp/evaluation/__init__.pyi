@@ -18,7 +18,6 @@ from .plots.motion_bands import motion_bands_figure as motion_bands_figure
 from .plots.contacts import contacts_figure as contacts_figure
 from .plots.rollout import rollout_figure as rollout_figure
 from .plots.style import save_figure as save_figure
-from .plots.tool_path import summary_figure as summary_figure, tool_path_figure as tool_path_figure
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows
 from .prior_comparison import (
     PriorComparison as PriorComparison, PriorScore as PriorScore, compare_priors as compare_priors,
