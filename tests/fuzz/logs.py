@@ -112,7 +112,6 @@ MORE = st.lists(
                 "--sign",
                 "--scale",
                 "--offset",
-                "--max-rows",
                 "--resample",
                 "--step",
                 "--episode",

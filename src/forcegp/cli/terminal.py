@@ -26,7 +26,6 @@ OTHERWISE = {
     "contacts": "contact",
     "folder": "out",
     "locked": "lock",
-    "most_rows": "max_rows",
     "observe": "learn_from",
     "system": "robot",
 }
