@@ -8,7 +8,6 @@ from matplotlib.image import imread
 
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import (
-    likelihood_figure,
     prediction_figure,
     save_figure,
 )
@@ -21,17 +20,10 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def figures(posterior, test_data):
     return {
         "prediction": prediction_figure(posterior, test_data),
-        "likelihood": likelihood_figure({"one": posterior.result.history, "two": [3.0, 2.0]}),
     }
 
 
-@pytest.mark.parametrize(
-    ("name", "panels"),
-    [
-        ("prediction", 2 * 3),
-        ("likelihood", 1),
-    ],
-)
+@pytest.mark.parametrize(("name", "panels"), [("prediction", 2 * 3)])
 def test_every_panel_is_there_and_the_file_is_a_picture(figures, name, panels, tmp_path):
     assert len(figures[name].axes) == panels
     path = tmp_path / f"{name}.png"
@@ -47,7 +39,6 @@ def test_panels_say_what_they_show_and_in_which_unit(figures):
     prediction = [axes.get_ylabel() for axes in figures["prediction"].axes]
     assert prediction[0] == "pan\nrad/s²"
     assert figures["prediction"].axes[-1].get_xlabel() == "time in s"
-    assert {text.get_text() for text in figures["likelihood"].axes[0].get_legend().get_texts()} == {"one", "two"}
 
 
 def test_no_global_state_of_pyplot_is_touched(figures):
@@ -77,11 +68,6 @@ def test_a_window_holds_the_rows_of_one_episode_in_order_of_time(test_data):
     np.testing.assert_allclose(rows.time, test_data.time[(test_data.time >= 0.1) & (test_data.time <= 0.3)])
     with pytest.raises(InvalidInput, match=r"no rows from 5\.0 s on"):
         window(test_data, 5.0, 1.0)
-
-
-def test_no_history_is_no_plot():
-    with pytest.raises(InvalidInput, match="no history"):
-        likelihood_figure({})
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from tests.data import samples
 from tests.models.arm import arm_data
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import evaluate, likelihood_figure, prediction_figure
+from forcegp.evaluation import evaluate, prediction_figure
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import load_posterior, save_posterior
 from forcegp.models.protocol import Model, Posterior
@@ -147,8 +147,6 @@ class ModelConformance:
         bare = dataclasses.replace(test, truth={}, noise_std=None, system=None)
         assert evaluate(fitted, bare).mae == evaluation.mae
         assert len(prediction_figure(fitted, test).axes) == 6
-        (axes,) = likelihood_figure({fitted.description: fitted.result.history}, objective=fitted.objective).axes
-        assert f"{axes.get_title(loc='left')} [{axes.get_ylabel()}]".endswith(fitted.objective)
 
     def test_training_rows_among_the_test_rows_are_noticed(self, fitted, data):
         assert any("training rows" in warning for warning in evaluate(fitted, data).warnings)

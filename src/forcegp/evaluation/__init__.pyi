@@ -11,7 +11,7 @@ from .plots.excitation import excitation_figure as excitation_figure
 from .plots.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
 from .plots.log import check_figure as check_figure, preparation_figure as preparation_figure
 from .plots.prediction import (
-    likelihood_figure as likelihood_figure, normal_force_figure as normal_force_figure, prediction_figure as
+    normal_force_figure as normal_force_figure, prediction_figure as
     prediction_figure,
 )
 from .plots.motion_bands import motion_bands_figure as motion_bands_figure
