@@ -401,7 +401,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ImportOptions": (
         forcegp.ImportOptions,
-        lambda: {"gap": None, "resample": "auto", "rate": None, "start": None, "end": None},
+        lambda: {"gap": None, "resample": "auto", "rate": None, "start": None, "end": None, "most_rows": 10},
     ),
     "KukaSurfaceConfig": (
         forcegp.KukaSurfaceConfig,

@@ -112,6 +112,7 @@ MORE = st.lists(
                 "--sign",
                 "--scale",
                 "--offset",
+                "--max-rows",
                 "--resample",
                 "--step",
                 "--episode",

@@ -191,7 +191,7 @@ WRONG = {
     "ColumnMapping": {"step": "x"},
     "ColumnMapping ": {"unit": 5},
     "ImportOptions": {"gap": "x"},
-    "ImportOptions ": {"rate": "x"},
+    "ImportOptions ": {"most_rows": None},
     "KukaSurfaceConfig": {"null_space_joints": None},
     "WeakForm": {"signal": np.ones(3)},
     "Coefficients": {"joints": 5},

@@ -157,7 +157,7 @@ class Auto(Resuming, Import):
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
         same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
-        options = forcegp.ImportOptions(**{name: getattr(self, name) for name in same})
+        options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
         mistakes: list[forcegp.checks.Finding] = []
         for _ in range(MOST_CORRECTIONS):
             try:

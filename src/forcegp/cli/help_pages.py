@@ -20,7 +20,7 @@ from tyro.conf import Positional
 from forcegp.cli.command import Command
 
 GROUPS: Mapping[str, str] = {
-    "Input": "baseline test task free free_seconds mapping episodes headerless delimiter side_by_side",
+    "Input": "baseline test task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
     "Columns": "time q v u a step joints unit sign scale offset episode unwrap",
     "Timing": "start end gap resample rate",
     "Preparation": "cutoff differentiate delay lag every trim",

@@ -11,12 +11,16 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
+import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
 from forcegp.cli.command import LOG, MAPPING, URDF, require_free_file, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError, InvalidInput
+
+COPIES = 10
+"""Times the size of its file that a dataset is taken to need while it is prepared: numbers hardly shrink in it."""
 
 Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
@@ -96,6 +100,8 @@ class Import(PreparationOptions, RobotOptions):
     """Continue angles that jump by a turn."""
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
+    max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
+    """Refuse a log with more rows."""
     overwrite: bool = False
     """Replace the files if they exist."""
 
@@ -108,16 +114,14 @@ class Import(PreparationOptions, RobotOptions):
             require_free_file(self.write_mapping, overwrite=self.overwrite, own=_is_mapping, what="a mapping")
         mapping = self._mapping(terminal)
         same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
-        options = forcegp.ImportOptions(**{name: getattr(self, name) for name in same})
+        options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
         system, preparation = self._system(), self._preparation()
         with atomic_file(self.out, overwrite=self.overwrite) as temporary, terminal.progress("importing") as report:
             done = forcegp.import_recordings(
                 self.logs, temporary, mapping, system=system, options=options, report=report
             )
             if not preparation.changes_nothing:
-                prepared = preparation.apply(forcegp.Dataset.load(temporary))
-                prepared.dataset.save(temporary)
-                done |= {"rows": len(prepared.dataset), "preparation": prepared.report}
+                done |= _prepared(temporary, preparation, done["rows"])
             if self.write_mapping is not None:  # a mapping that fails leaves no dataset behind
                 write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
         _report(terminal, self.out, done)
@@ -165,6 +169,18 @@ class Import(PreparationOptions, RobotOptions):
             if text is not None:
                 given[name] = forcegp.recordings.factors_of(name, text)
         return forcegp.recordings.mapping_of(given)
+
+
+def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[str, Any]:
+    """Prepare the dataset in a file, in its place. Raises NotEnoughMemory where it does not fit into memory whole."""
+    import torch  # 2 s that only a preparation costs
+
+    required = COPIES * path.stat().st_size
+    remedy = "import without --cutoff, --delay, --lag, --every and --trim, or fewer logs at once."
+    forcegp.inference.require_memory(required, f"preparing {rows} rows", remedy, torch.device("cpu"))
+    prepared = preparation.apply(forcegp.Dataset.load(path))
+    prepared.dataset.save(path)
+    return {"rows": len(prepared.dataset), "preparation": prepared.report}
 
 
 def _is_mapping(path: Path) -> bool:

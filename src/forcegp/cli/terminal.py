@@ -26,6 +26,7 @@ OTHERWISE = {
     "contacts": "contact",
     "folder": "out",
     "locked": "lock",
+    "most_rows": "max_rows",
     "observe": "learn_from",
     "system": "robot",
 }

@@ -3,12 +3,12 @@
 Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
 """
 
+import io
 import json
 import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
     """Write the fields of a Dataset, as `atomic_file` writes and raises."""
     arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
-    with atomic_file(path) as temporary, new_file(temporary) as file:
+    with atomic_file(path) as temporary, NewFile(temporary) as file:
         for name, values in arrays.items():
             if len(values) > ROWS_PER_CHUNK:
                 _write_chunks(file, name, values)
@@ -44,7 +44,7 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
         _describe(fields, file)
 
 
-def _write_chunks(file: h5py.File, name: str, values: np.ndarray) -> None:
+def _write_chunks(file: "NewFile", name: str, values: np.ndarray) -> None:
     """Chunks that are compressed on several threads: HDF5's own filters run on one, and take longer than all else."""
     chunks = (ROWS_PER_CHUNK, *values.shape[1:])
     stored = file.create_dataset(name, values.shape, values.dtype, chunks=chunks, **COMPRESSION)
@@ -53,6 +53,7 @@ def _write_chunks(file: h5py.File, name: str, values: np.ndarray) -> None:
         compressed = pool.map(_compressed, (values[start : start + ROWS_PER_CHUNK] for start in starts))
         for start, data in zip(starts, compressed, strict=True):
             stored.id.write_direct_chunk((start, *[0] * (values.ndim - 1)), data)
+            file.require_written()
 
 
 def _compressed(chunk: np.ndarray) -> bytes:
@@ -72,19 +73,79 @@ def is_dataset(path: Path) -> bool:
         return False
 
 
-@contextmanager
-def new_file(path: Path) -> Iterator[h5py.File]:
-    """An empty HDF5 file to write to; it appears when the context ends. Raises OSError where the disk is full.
+class NewFile(h5py.File):
+    """An empty HDF5 file to write to, whose context raises OSError where the disk is full.
 
-    It is made in memory: HDF5 that cannot write to a disk cannot close its file either, and crashes the process at its
-    end (2.0.0, segmentation fault).
+    HDF5 that cannot write cannot close its file either, and crashes the process at its end (2.0.0, segmentation fault).
+    So it writes through `_Sink`, which keeps the error to itself until the file is closed.
     """
-    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
-        yield file
-        file.flush()
-        image = file.id.get_file_image()
-    with path.open("xb") as out:
-        out.write(image)
+
+    def __init__(self, path: Path) -> None:
+        self._sink = _Sink(path, "x+b")
+        super().__init__(self._sink, "w")
+
+    def close(self) -> None:
+        """Write what is left. Raises OSError where something was not written."""
+        super().close()
+        self._sink.close()
+        self.require_written()
+
+    def require_written(self) -> None:
+        """Raise what kept data from being written so far."""
+        error = self._sink.error
+        if error is not None:
+            raise OSError(error.errno, error.strerror, str(self._sink.name))
+
+
+class _Sink(io.FileIO):
+    """A file that takes whatever it is given: what the disk does not take, and all that follows, stays in memory.
+
+    So HDF5 reads what it has written, which it needs in order to close the file.
+    """
+
+    error: OSError | None = None
+
+    def __init__(self, path: Path, mode: str) -> None:
+        super().__init__(path, mode)
+        self._lost: list[tuple[int, bytes]] = []
+
+    def write(self, data: Any, /) -> int:
+        view, begin = memoryview(data).cast("B"), self.tell()
+        done = 0
+        try:
+            while done < len(view) and self.error is None:
+                done += super().write(view[done:])
+        except OSError as error:
+            self.error = error
+        if done < len(view):
+            self._lost.append((begin + done, bytes(view[done:])))
+            self.seek(begin + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any, /) -> int:
+        view, begin = memoryview(buffer).cast("B"), self.tell()
+        count = super().readinto(view)
+        if not self._lost:
+            return count
+        for start, data in self._lost:
+            first, last = max(start, begin), min(start + len(data), begin + len(view))
+            if first < last:
+                view[first - begin : last - begin] = data[first - start : last - start]
+        self.seek(begin + len(view))
+        return len(view)
+
+    def seek(self, place: int, whence: int = 0, /) -> int:
+        if whence == io.SEEK_END and self._lost:
+            end = max(super().seek(0, io.SEEK_END), *(start + len(data) for start, data in self._lost))
+            return super().seek(end + place)
+        return super().seek(place, whence)
+
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
 
 
 def read_fields(path: Path) -> dict[str, Any]:

@@ -43,6 +43,7 @@ class ImportOptions:
     start, end: seconds from the first row of each episode that are kept.
     unwrap: continue positions of turning joints that jump by a turn.
     beyond_limits: accept positions beyond the limits of the URDF.
+    most_rows: of one recording.
 
     Raises InvalidInput for numbers that make no sense.
     """
@@ -56,6 +57,7 @@ class ImportOptions:
     end: float | None = None
     unwrap: bool = False
     beyond_limits: bool = False
+    most_rows: int = 100_000_000
 
     @usable_arguments("ImportOptions")
     def __post_init__(self) -> None:
@@ -67,6 +69,8 @@ class ImportOptions:
             raise InvalidInput("a rate asks for resampling; leave out `rate` or `resample` no.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
+        if self.most_rows < 1:
+            raise InvalidInput(f"max-rows is {self.most_rows}; it must be at least 1.")
 
 
 def import_recordings(
@@ -105,7 +109,7 @@ def import_recordings(
     recordings: list[RawRecording] = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         report(index, steps, f"reading {label}")
-        found = read_recording(source, own, label, unwrap=options.unwrap)
+        found = read_recording(source, own, label, unwrap=options.unwrap, most_rows=options.most_rows)
         if not options.beyond_limits:
             require_plausible_positions(found, own, robot, stated="q" in mapping.unit)
         warn_of_implausible_forces(found, own, robot)

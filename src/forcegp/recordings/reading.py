@@ -39,12 +39,14 @@ class RawRecording:
     jumps: Int[np.ndarray, "n 2"]
 
 
-def read_recording(source: Source, plan: SignalPlan, label: str, *, unwrap: bool) -> RawRecording:
+def read_recording(source: Source, plan: SignalPlan, label: str, *, unwrap: bool, most_rows: int) -> RawRecording:
     """Read a table. Raises FileFormatError and DatasetError naming the file, the row, the time and the column."""
     columns = source.read(plan.columns) if plan.columns else {}
     rows = len(next(iter(columns.values()), ()))
     if rows == 0:
         raise FileFormatError(f"{label} has no rows; give a log with rows.")
+    if rows > most_rows:
+        raise FileFormatError(f"{label} has more than {most_rows} rows; allow more with `most_rows`.")
     time, begin = _seconds(columns, plan, source, rows)
     table = np.empty((rows, len(plan.signals)))
     for index, item in enumerate(plan.signals):

@@ -192,8 +192,8 @@ class KukaSurfaceConfig:
 
     @usable_arguments("KukaSurfaceConfig")
     def __post_init__(self) -> None:
-        for name in _NUMBERS:
-            value, allowed = getattr(self, name), _RANGES.get(name, NOT_NEGATIVE)
+        for name, allowed in _RANGES.items():
+            value = getattr(self, name)
             if value is not None or name not in ("press", "lift_share"):
                 object.__setattr__(self, name, checked_numbers(name, value, allowed, _LENGTHS.get(name)))
         for name in ("waypoint_x", "waypoint_y", "segment_seconds", "patch_x"):
@@ -274,6 +274,18 @@ _POSITIVE = (
     *("tool_mass", "tool_inertia", "clearance", "stribeck_velocity", "friction_smoothing", "joint_stribeck_velocity"),
     *("joint_presliding", "joint_smoothing", "torque_limits", "controller_omega", "least_acceleration"),
 )
+_NOT_NEGATIVE = (
+    *("noise", "joint_damping", "viscous_coefficient", "coulomb_coefficient", "static_coefficient", "patch_factor"),
+    *("press", "lift_height", "joint_coulomb", "joint_static", "joint_viscous", "baumgarte_omega", "baumgarte_zeta"),
+    *(
+        "joint_asymmetry",
+        "joint_load",
+        "controller_zeta",
+        "null_space_stiffness",
+        "null_space_damping",
+        "waypoint_depth",
+    ),
+)
 _FINITE = (
     *("gravity", "base_height", "tool_center_of_mass", "tool_point", "surface_height", "tilt_axis", "patch_x"),
     *("start_degrees", "waypoint_x", "waypoint_y"),
@@ -288,9 +300,9 @@ _RANGES: dict[str, Range] = {
     "joint_drift": ("> 0", 1e-12, 1e9),
     "segment_seconds": ("from 0.05 to 100 s", 0.05, 100.0),
     **dict.fromkeys(_POSITIVE, POSITIVE),
+    **dict.fromkeys(_NOT_NEGATIVE, NOT_NEGATIVE),
     **dict.fromkeys(_FINITE, FINITE),
 }
-_NUMBERS = [item.name for item in fields(KukaSurfaceConfig) if "float" in str(item.type)]
 _LENGTHS = {item.name: len(item.default) for item in fields(KukaSurfaceConfig) if isinstance(item.default, tuple)}
 _CHOICES = {"friction": Friction, "joint_friction": JointFriction, "surface": Surface, "contact": ContactKind}
 
