@@ -1,4 +1,4 @@
-"""From files to a Dataset: the same in every format, and what stamps become."""
+"""From files to a Dataset: the same in every format, in pieces as at once, and what stamps become."""
 
 import dataclasses
 
@@ -20,12 +20,13 @@ from tests.recordings.log_files import (
     write_text,
 )
 
+import forcegp.recordings.reading as reading
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
-from forcegp.recordings.episode_rows import Stretch, episode_rows
+from forcegp.recordings.episode_rows import EpisodeRows, Stretch
 from forcegp.recordings.formats import open_source
-from forcegp.recordings.reading import RawRecording
+from forcegp.recordings.reading import Spool
 
 NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{joints}",), joints=JOINTS)
 ARRAYS = ColumnMapping(time="time", q=("q",), v=("v",), u=("u",), joints=JOINTS)
@@ -98,14 +99,30 @@ def uneven(rows=1000, seed=3):
     return {"time": time, **smooth}
 
 
+def test_reading_in_small_pieces_changes_nothing(tmp_path, monkeypatch):
+    path = write_text(tmp_path / "log.csv", table(uneven()))
+    whole = imported(path, tmp_path / "whole.h5", NAMES)
+    monkeypatch.setattr(reading, "ROWS_AT_A_TIME", 37)
+    pieces = imported(path, tmp_path / "pieces.h5", NAMES)
+    for name in SIGNALS:
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
+
+
 @pytest.mark.parametrize("logged", [("q", "u"), ("q", "v", "u")])
-def test_an_episode_follows_splines_and_central_differences(tmp_path, logged):
+@pytest.mark.parametrize("rows", [50, 333, 499, 997, 998])
+def test_pieces_of_an_episode_are_those_of_the_whole(tmp_path, rows, logged):
     data = uneven()
     signals = np.hstack([data[name] for name in logged])
     source = open_source(write_text(tmp_path / "log.csv", table(data)))
-    none = np.zeros((0, 2), np.int64)
-    recording = RawRecording("log", source, signals, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), none)
-    joined = episode_rows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), logged, 2, STEP)
+    recording = reading.RawRecording(
+        "log", source, 0, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), np.zeros(4), np.zeros(4), ()
+    )
+    episode = EpisodeRows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), logged, 2, STEP)
+    with Spool(tmp_path, signals.shape[1]) as spool:
+        spool.append(signals[:400])
+        spool.append(signals[400:])
+        found = list(episode.pieces(spool, rows))
+    joined = {name: np.concatenate([piece[name] for piece in found]) for name in found[0]}
     # the oracle is another implementation of splines, fitted to everything at once
     time = STEP * np.arange(len(joined["time"]))
     expected = dict(zip(logged, np.split(CubicSpline(recording.time, signals)(time), len(logged), axis=1), strict=True))

@@ -5,10 +5,7 @@ Nothing in the file is executed: numbers, texts and JSON only, no pickles, no li
 
 import io
 import json
-import os
-import zlib
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +21,7 @@ FORMAT = "forcegp-dataset"
 VERSION = 1
 COLUMNS = ("q", "v", "u", "a", "time", "episode")
 
-COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
-ROWS_PER_CHUNK = 8192
-THREADS = min(4, os.cpu_count() or 1)
+COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _TEXT = h5py.string_dtype("utf-8")
 _LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that claims more holds no such data
 
@@ -37,31 +32,8 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
     with atomic_file(path) as temporary, NewFile(temporary) as file:
         for name, values in arrays.items():
-            if len(values) > ROWS_PER_CHUNK:
-                _write_chunks(file, name, values)
-            else:
-                file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
-        _describe(fields, file)
-
-
-def _write_chunks(file: "NewFile", name: str, values: np.ndarray) -> None:
-    """Chunks that are compressed on several threads: HDF5's own filters run on one, and take longer than all else."""
-    chunks = (ROWS_PER_CHUNK, *values.shape[1:])
-    stored = file.create_dataset(name, values.shape, values.dtype, chunks=chunks, **COMPRESSION)
-    starts = range(0, len(values), ROWS_PER_CHUNK)
-    with ThreadPoolExecutor(THREADS) as pool:
-        compressed = pool.map(_compressed, (values[start : start + ROWS_PER_CHUNK] for start in starts))
-        for start, data in zip(starts, compressed, strict=True):
-            stored.id.write_direct_chunk((start, *[0] * (values.ndim - 1)), data)
-            file.require_written()
-
-
-def _compressed(chunk: np.ndarray) -> bytes:
-    """A chunk as HDF5's filters shuffle and deflate store it; one that is not full is filled with zeros."""
-    full = np.zeros((ROWS_PER_CHUNK, *chunk.shape[1:]), chunk.dtype)
-    full[: len(chunk)] = chunk
-    shuffled = np.ascontiguousarray(full.reshape(-1, 1).view(np.uint8).T)
-    return zlib.compress(shuffled.data, COMPRESSION["compression_opts"])
+            file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
+        describe(fields, file)
 
 
 def is_dataset(path: Path) -> bool:
@@ -163,7 +135,7 @@ def read_fields(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path} {kind}: {error}. Write it again, or convert the log to a Dataset.") from error
 
 
-def _describe(fields: Mapping[str, Any], file: h5py.File) -> None:
+def describe(fields: Mapping[str, Any], file: h5py.File) -> None:
     """Write what is no array of numbers; those whose units are stated must be in the file."""
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = VERSION

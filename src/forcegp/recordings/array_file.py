@@ -5,7 +5,7 @@ import math
 import re
 import zipfile
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -32,7 +32,7 @@ class ArrayFile(Source):
 
     With `within`, only what is under that name counts, and names begin after it: a file with one array or one group per
     episode is read as one table per episode. An array by itself is then `[0] ... [k-1]`.
-    Subclasses list the arrays (`shapes`) and read them (`array`).
+    Subclasses list the arrays (`shapes`) and give them in pieces (`blocks`).
     """
 
     def __init__(self, path: Path, *, within: str | None = None) -> None:
@@ -44,8 +44,8 @@ class ArrayFile(Source):
         """Every array of numbers by its full name; raises FileFormatError for a file that cannot be read."""
 
     @abstractmethod
-    def array(self, name: str) -> np.ndarray:
-        """The array of that full name."""
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        """The array of that full name in pieces of exactly `rows` rows, but for the last."""
 
     def episodes(self, pattern: str) -> list[str]:
         """Names that a pattern such as `data/demo_*` matches, in the order of numbers. Raises InvalidInput for none."""
@@ -88,7 +88,7 @@ class ArrayFile(Source):
         return tuple(self._places)
 
     @override
-    def read(self, names: Sequence[str]) -> Columns:
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
         arrays = list(dict.fromkeys(self._places[name][0] for name in names))
         shapes = self.shapes()
@@ -98,8 +98,9 @@ class ArrayFile(Source):
             raise FileFormatError(
                 f"{self.path}: its arrays have different numbers of rows ({listed}); map those of one."
             )
-        tables = {array: self.array(array) for array in arrays}
-        return columns_of(tables, {name: self._places[name] for name in names})
+        for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
+            tables = dict(zip(arrays, pieces, strict=True))
+            yield columns_of(tables, {name: self._places[name] for name in names})
 
 
 def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
@@ -110,6 +111,11 @@ def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
             "save it as an array of numbers."
         )
     return dtype.kind in "fiu"
+
+
+def pieces_of(values: np.ndarray, rows: int) -> Iterator[np.ndarray]:
+    """An array that is in memory, as `ArrayFile.blocks` gives it."""
+    return (values[start : start + rows] for start in range(0, len(values), rows))
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
@@ -130,7 +136,8 @@ class NumpyArchive(ArrayFile):
     """The arrays of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     @cached_property
-    def _arrays(self) -> dict[str, tuple[int, ...]]:
+    def _arrays(self) -> dict[str, tuple[str, tuple[int, ...], bool, np.dtype]]:
+        """Name -> (member, shape, column-major, type)."""
         found = {}
         with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive:
             members = archive.infolist()
@@ -142,7 +149,7 @@ class NumpyArchive(ArrayFile):
                     continue
                 name = member.filename.removesuffix(".npy")
                 with archive.open(member) as stream:
-                    shape, _, dtype = _header(stream)
+                    shape, column_major, dtype = _header(stream)
                 if not require_numbers(self.path, name, dtype):
                     continue
                 if math.prod(shape) * dtype.itemsize > member.file_size:
@@ -151,17 +158,32 @@ class NumpyArchive(ArrayFile):
                     )
                 if name in found:
                     raise FileFormatError(f"{self.path}: {name!r} is in the archive twice; write it again.")
-                found[name] = shape
+                found[name] = (member.filename, shape, column_major, dtype)
         return found
 
     @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        return self._arrays
+        return {name: shape for name, (_, shape, _, _) in self._arrays.items()}
 
     @override
-    def array(self, name: str) -> np.ndarray:
-        with reading(self.path, WHAT, *_ERRORS), np.load(self.path, allow_pickle=False) as archive:
-            return archive[name]
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        member, shape, column_major, dtype = self._arrays[name]
+        with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive, archive.open(member) as stream:
+            _header(stream)
+            if column_major and len(shape) > 1:  # its first row ends where the array ends: there are no pieces
+                table = np.frombuffer(stream.read(), dtype, count=math.prod(shape)).reshape(shape, order="F")
+                yield from pieces_of(table, rows)
+                return
+            row_bytes = dtype.itemsize * math.prod(shape[1:])
+            length = self.shapes()[name][0]
+            for start in range(0, length, rows):
+                count = min(rows, length - start)
+                data = stream.read(count * row_bytes)
+                if len(data) < count * row_bytes:
+                    raise EOFError(f"{name!r} ends before its last row")
+                yield np.frombuffer(data, dtype).reshape(count, *shape[1:])
+            if stream.read(1):  # to the end, where the checksum is compared
+                raise EOFError(f"{name!r} goes on after its last row")
 
 
 def _header(stream) -> tuple[tuple[int, ...], bool, np.dtype]:

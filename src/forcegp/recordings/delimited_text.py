@@ -1,9 +1,9 @@
-"""CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow."""
+"""CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow in pieces."""
 
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.recordings.source import Columns, Source, arrow_numbers, gunzipped, reading, require_distinct
+from forcegp.recordings.source import Columns, Source, Wrapper, arrow_numbers, gzip_stream, reading, require_distinct
 
-FIRST_BYTES = 2**20
+FIRST_BYTES = 2**16
 """What is looked at to detect the header, the delimiter and whether there are comments."""
 
 COMMENT = b"#"
@@ -24,21 +24,19 @@ _BLANKS = re.compile(rb"[ \t]+")
 _OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
 
 
-def _first_bytes(path: Path) -> bytes:
-    """The beginning of a text file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
-    if _is_compressed(path):
-        first = gunzipped(path, FIRST_BYTES)
-    else:
-        with path.open("rb") as file:
-            first = file.read(FIRST_BYTES)
-    if not first.strip():
-        raise FileFormatError(f"{path} is empty; give a log with rows.")
-    _require_text(path, first)
-    return first
-
-
-def _is_compressed(path: Path) -> bool:
-    return path.suffix.lower() == ".gz"
+def opened(path: Path) -> io.BufferedReader:
+    """The bytes of a text file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
+    raw: Any = gzip_stream(path) if path.suffix.lower() == ".gz" else io.FileIO(path)
+    stream = io.BufferedReader(raw, 2**20)
+    try:
+        first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
+        if not first.strip():
+            raise FileFormatError(f"{path} is empty; give a log with rows.")
+        _require_text(path, first)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
 
 
 def _require_text(path: Path, first: bytes) -> None:
@@ -54,13 +52,34 @@ def _require_text(path: Path, first: bytes) -> None:
         ) from error
 
 
-def _clean(raw: bytes, *, blanks: bool) -> bytes:
-    """The lines without comments and, if `blanks`, with one tab between the words of a line."""
-    if COMMENT in raw:
-        raw = _COMMENT_LINE.sub(b"", raw)
-    if blanks:
-        raw = _BLANKS.sub(b"\t", _OUTER_BLANKS.sub(b"", raw.replace(b"\r\n", b"\n")))
-    return raw
+class CleanLines(Wrapper):
+    """A stream without comment lines and, if `blanks`, with one tab between the words of a line."""
+
+    def __init__(self, stream: io.BufferedReader, *, blanks: bool) -> None:
+        self.stream = stream
+        self.blanks = blanks
+        self._ready = b""
+
+    @override
+    def readinto(self, buffer) -> int:
+        while not self._ready:
+            raw = self.stream.read(2**20)
+            if not raw:
+                return 0
+            if not raw.endswith(b"\n"):
+                raw += self.stream.readline(2**24)
+            self._ready = self._clean(raw)
+        count = min(len(buffer), len(self._ready))
+        buffer[:count] = self._ready[:count]
+        self._ready = self._ready[count:]
+        return count
+
+    def _clean(self, raw: bytes) -> bytes:
+        if COMMENT in raw:
+            raw = _COMMENT_LINE.sub(b"", raw)
+        if self.blanks:
+            raw = _BLANKS.sub(b"\t", _OUTER_BLANKS.sub(b"", raw.replace(b"\r\n", b"\n")))
+        return raw
 
 
 BLOCK = 2**22
@@ -94,16 +113,17 @@ class DelimitedText(Source):
         super().__init__(path)
         if headerless is not None and headerless < 1:
             raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
-        with reading(path, "text"):
-            self._look(_first_bytes(path), headerless, delimiter)
+        with reading(path, "text"), opened(path) as stream:
+            self._look(stream, headerless, delimiter)
         self._long_integers = {
             name for name, text in zip(self._columns, self._first, strict=False) if _LONG_INTEGER.fullmatch(text)
         }
 
-    def _look(self, first: bytes, headerless: int | None, delimiter: str | None) -> None:
-        """Find header, delimiter, lines and bytes before the first row, and whether there are comments."""
-        lines, comments, skipped, begin, header = [], [], 0, 0, 0
-        for raw in first.splitlines(keepends=True):
+    def _look(self, stream, headerless: int | None, delimiter: str | None) -> None:
+        """Find header, delimiter, number of lines before the first row, and whether there are comments."""
+        lines, comments, skipped = [], [], 0
+        first = stream.peek(1)
+        for raw in stream.peek(len(first)).splitlines(keepends=True):
             text = raw.decode("utf-8", "replace").lstrip("\ufeff").strip("\r\n")
             if text.lstrip().startswith("#"):
                 comments.append(text.lstrip()[1:].strip())
@@ -111,16 +131,13 @@ class DelimitedText(Source):
                 lines.append(text)
             if not lines:
                 skipped += 1
-                begin += len(raw)
-            elif not header:
-                header = len(raw)
             if len(lines) == 2:
                 break
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
         self._delimiter = delimiter or _detected_delimiter(lines, self.path)
-        self._lines_before, self._begin = skipped, begin
+        self._lines_before = skipped
         fields = self._fields(lines[0])
         self._lines_per_row = 1
         if headerless is not None:
@@ -137,7 +154,6 @@ class DelimitedText(Source):
             self._columns = [name or f"column{index + 1}" for index, name in enumerate(fields)]
             self._first = self._fields(lines[1]) if len(lines) > 1 else []
             self._lines_before += 1
-            self._begin += header
             if not self._first:
                 raise FileFormatError(f"{self.path} has a header but no rows.")
         require_distinct(self.path, self._columns)
@@ -172,49 +188,53 @@ class DelimitedText(Source):
         return f"row {row} (line {self._lines_before + row * self._lines_per_row + 1})"
 
     @override
-    def read(self, names: Sequence[str]) -> Columns:
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
         try:
-            return self._read(names, threads=True)
+            yield from self._read(names, rows, threads=True)
         except FileFormatError as error:
             if isinstance(error.__cause__, ValueError):  # pyarrow counts rows on one thread only
-                self._read(names, threads=False)
+                for _ in self._read(names, rows, threads=False):
+                    pass
             raise
 
-    def _read(self, names: Sequence[str], *, threads: bool) -> Columns:
-        stacked, blanks = self._lines_per_row > 1, self._delimiter == BLANKS
+    def _read(self, names: Sequence[str], rows: int, *, threads: bool) -> Iterator[Columns]:
+        stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns
         kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}
         wanted = stored if stacked else list(names)
-        with reading(self.path, "text"), self.path.open("rb") as file:
-            source: Any = file
-            if _is_compressed(self.path):
-                source = io.BytesIO(gunzipped(self.path))
-            source.seek(self._begin)
-            if blanks or self._comments:
-                source = io.BytesIO(_clean(source.read(), blanks=blanks))
+        stream = opened(self.path)
+        with stream, reading(self.path, "text"):
+            for _ in range(self._lines_before):
+                stream.readline()
+            blanks = self._delimiter == BLANKS
+            source = CleanLines(stream, blanks=blanks) if blanks or self._comments else stream
             try:
-                table = arrow_csv.read_csv(
+                batches = arrow_csv.open_csv(
                     source,
                     read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
                     parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
                     convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
                 )
+                columns = ({name: arrow_numbers(batch.column(name)) for name in wanted} for batch in batches)
+                yield from _pieces(self._stacked(columns, names) if stacked else columns, rows)
             except pa.ArrowInvalid as error:
                 raise self._told_by_pyarrow(error) from error
-        columns = {name: arrow_numbers(table.column(name)) for name in wanted}
-        return self._stacked(columns["c1"], names) if stacked else columns
 
-    def _stacked(self, values: np.ndarray, names: Sequence[str]) -> Columns:
+    def _stacked(self, batches: Iterator[Columns], names: Sequence[str]) -> Iterator[Columns]:
         """Rows from a file with one number per line."""
-        width = self._lines_per_row
-        if len(values) % width:
+        width, rest, count = self._lines_per_row, np.empty(0), 0
+        for batch in batches:
+            values = np.concatenate([rest, batch["c1"]])
+            count += len(batch["c1"])
+            whole = len(values) - len(values) % width
+            table, rest = values[:whole].reshape(-1, width), values[whole:]
+            yield {name: np.ascontiguousarray(table[:, self._columns.index(name)]) for name in names}
+        if rest.size:
             raise FileFormatError(
-                f"{self.path} has {len(values)} numbers, which is no multiple of {width}; another `headerless` may be "
-                "right, or the file is truncated."
+                f"{self.path} has {count} numbers, which is no multiple of {width}; another `headerless` may be right, "
+                "or the file is truncated."
             )
-        table = values.reshape(-1, width)
-        return {name: np.ascontiguousarray(table[:, self._columns.index(name)]) for name in names}
 
     def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
         text = str(error)
@@ -246,6 +266,13 @@ def _remedy(value: str) -> str:
     if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", value):
         return "Write the time as a number of seconds, or give `step`."
     return "Repair or remove that row."
+
+
+def _pieces(batches: Iterator[Columns], rows: int) -> Iterator[Columns]:
+    for batch in batches:
+        length = len(next(iter(batch.values())))
+        for start in range(0, length, rows):
+            yield {name: values[start : start + rows] for name, values in batch.items()}
 
 
 def _detected_delimiter(lines: Sequence[str], path: Path) -> str:

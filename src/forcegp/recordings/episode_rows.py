@@ -1,6 +1,6 @@
 """The stamps of a recording, the stretches between its gaps, and their rows as a Dataset has them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 from forcegp.data import differentiate
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError, MistakenUnit
-from forcegp.recordings.reading import RawRecording
+from forcegp.recordings.reading import RawRecording, Spool
 
 REPEATED = 0.05
 """Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
@@ -164,24 +164,55 @@ def _first_of_each(time: np.ndarray, begins: np.ndarray, least: float) -> np.nda
     return kept
 
 
-def episode_rows(
-    stretch: Stretch, kept: np.ndarray, logged: Sequence[str], nv: int, step: float | None
-) -> dict[str, np.ndarray]:
-    """Time and the signals q, v, u, a of a stretch; what was not `logged` is differentiated.
+ROWS_AT_A_TIME = 16384
 
-    Parameters: `kept` as in `Stamps`; `logged` signals in the order of the table's columns, `nv` of each; `step` [s]
-    between even times, at which signals are those of a cubic spline, or None for the times of the log.
+SPLINE_HALO = 64
+"""Rows on either side that a piece of a spline is fitted with: the rest moves it by less than 0.27^64 of itself."""
+
+DIFFERENCE_HALO = 3
+"""Rows on either side that two differences reach: 2 where both are central, 3 where one is one-sided at an end."""
+
+
+@dataclass(frozen=True)
+class EpisodeRows:
+    """The rows of a stretch in pieces, equal to those of the whole stretch at once up to rounding.
+
+    Parameters: `kept` as in `Stamps`; `logged` signals in the order of the spool's columns, `nv` of each; `step` [s]
+    between even times, or None for the times of the log.
     """
-    recording, first = stretch.recording, stretch.start
-    used = first + np.flatnonzero(kept[first : stretch.end])
-    stamps = time = recording.time[used]
-    signals = {name: recording.table[used, nv * i : nv * (i + 1)] for i, name in enumerate(logged)}
-    if step is not None:
-        count = int(np.floor((stamps[-1] - stamps[0]) / step * (1 + 1e-12))) + 1
-        time = np.minimum(stamps[0] + step * np.arange(count), stamps[-1])
-        for name, values in signals.items():  # one by one, for splines take several times the memory of their values
-            signals[name] = make_interp_spline(stamps, values, k=3)(time)
-    for name, source in (("v", "q"), ("a", "v")):
-        if name not in signals:
-            signals[name] = differentiate(signals[source], time)
-    return {"time": time} | signals
+
+    stretch: Stretch
+    kept: np.ndarray
+    logged: tuple[str, ...]
+    nv: int
+    step: float | None
+
+    def pieces(self, spool: Spool, rows: int = ROWS_AT_A_TIME) -> Iterator[dict[str, np.ndarray]]:
+        """Time and the signals q, v, u, a, `rows` at a time."""
+        recording, first = self.stretch.recording, self.stretch.start
+        numbers = first + np.flatnonzero(self.kept[first : self.stretch.end])  # rows of the recording that are used
+        time = stamps = recording.time[numbers]
+        if self.step is not None:
+            count = int(np.floor((stamps[-1] - stamps[0]) / self.step * (1 + 1e-12))) + 1
+            time = np.minimum(stamps[0] + self.step * np.arange(count), stamps[-1])
+
+        def logged(start: int, end: int) -> np.ndarray:
+            used = numbers[start:end]
+            table = spool.read(recording.first + int(used[0]), recording.first + int(used[-1]) + 1)
+            return table if len(table) == len(used) else table[used - used[0]]
+
+        def interpolated(at: np.ndarray) -> np.ndarray:
+            low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
+            high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
+            return make_interp_spline(stamps[low:high], logged(low, high), k=3)(at)
+
+        for start in range(0, len(time), rows):
+            end = min(start + rows, len(time))
+            low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
+            table = logged(low, high) if self.step is None else interpolated(time[low:high])
+            signals = {name: table[:, self.nv * i : self.nv * (i + 1)] for i, name in enumerate(self.logged)}
+            for name, source in (("v", "q"), ("a", "v")):
+                if name not in signals:
+                    signals[name] = differentiate(signals[source], time[low:high])
+            own = slice(start - low, end - low)
+            yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}

@@ -1,10 +1,12 @@
 """Which reader reads which file: `open_source`; and several files that make up one recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 
 import h5py
+import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
@@ -58,17 +60,38 @@ class SideBySide(Source):
         return tuple(note for source in self.sources.values() for note in source.notes())
 
     @override
-    def read(self, names: Sequence[str]) -> Columns:
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
-        own: dict[Source, list[str]] = {}
-        for source, column in (self._owners[name] for name in names):
-            own.setdefault(source, []).append(column)
-        found = {source: source.read(list(dict.fromkeys(columns))) for source, columns in own.items()}
-        counts = {source: len(next(iter(columns.values()))) for source, columns in found.items()}
-        if len(set(counts.values())) > 1:
-            listed = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
-            raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
-        return {name: found[source][column] for name, (source, column) in ((n, self._owners[n]) for n in names)}
+        used = list(dict.fromkeys(self._owners[name][0] for name in names))
+        own = {source: [self._owners[name][1] for name in names if self._owners[name][0] is source] for source in used}
+        streams = [_exact(source.chunks(list(dict.fromkeys(own[source])), rows), rows) for source in used]
+        counts = dict.fromkeys(used, 0)
+        for pieces in zip_longest(*streams):
+            lengths = [len(next(iter(piece.values()))) if piece else 0 for piece in pieces]
+            for source, length in zip(used, lengths, strict=True):
+                counts[source] += length
+            if len(set(lengths)) > 1:
+                for source, stream in zip(used, streams, strict=True):
+                    counts[source] += sum(len(next(iter(piece.values()))) for piece in stream)
+                listed = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
+                raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
+            found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
+            yield {name: found[self._owners[name][0]][self._owners[name][1]] for name in names}
+
+
+def _exact(pieces: Iterator[Columns], rows: int) -> Iterator[Columns]:
+    """The same rows in pieces of exactly `rows`, but for the last."""
+    waiting: list[Columns] = []
+    count = 0
+    for piece in pieces:
+        waiting.append(piece)
+        count += len(next(iter(piece.values())))
+        while count >= rows:
+            joined = {name: np.concatenate([part[name] for part in waiting]) for name in piece}
+            yield {name: values[:rows] for name, values in joined.items()}
+            waiting, count = [{name: values[rows:] for name, values in joined.items()}], count - rows
+    if count:
+        yield {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")

@@ -1,6 +1,7 @@
 """HDF5 files of any layout, MATLAB files of version 7.3 (which are HDF5), and those of versions 5 to 7 by scipy."""
 
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,7 +11,7 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError
-from forcegp.recordings.array_file import ArrayFile
+from forcegp.recordings.array_file import ArrayFile, pieces_of
 from forcegp.recordings.source import reading, require_plausible_size
 
 HDF5 = "an HDF5 file"
@@ -67,10 +68,13 @@ class HDF5Arrays(ArrayFile):
         return self._arrays
 
     @override
-    def array(self, name: str) -> np.ndarray:
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
         with reading(self.path, HDF5), h5py.File(self.path, "r") as file:
-            stored: Any = file[name]
-            return (stored[()].T if self.transposed else stored[()]).reshape(self._arrays[name])
+            stored = file[name]
+            assert isinstance(stored, h5py.Dataset)
+            for start in range(0, self._arrays[name][0], rows):
+                piece = stored[..., start : start + rows].T if self.transposed else stored[start : start + rows]
+                yield piece
 
 
 WHAT = "a MATLAB file"
@@ -91,6 +95,13 @@ class MatlabHDF5(HDF5Arrays):
         if cells and not arrays:
             raise _cell(self.path, cells[0])
         return {name: (shape[1], 1) if _is_row(shape) else shape for name, shape in arrays.items()}
+
+    @override
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
+            stored: Any = file[name]
+            row = stored[()].reshape(-1, 1) if _is_row(stored.shape[::-1]) else None
+        return super().blocks(name, rows) if row is None else pieces_of(row, rows)
 
 
 class MatlabFile(ArrayFile):
@@ -132,8 +143,8 @@ class MatlabFile(ArrayFile):
         return {name: values.shape for name, values in self._arrays.items()}
 
     @override
-    def array(self, name: str) -> np.ndarray:
-        return self._arrays[name]
+    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+        return pieces_of(self._arrays[name], rows)
 
 
 def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:

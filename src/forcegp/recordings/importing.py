@@ -1,8 +1,8 @@
-"""`import_recordings`: from log files to one dataset file, whatever their format."""
+"""`import_recordings`: from log files to one dataset file, whatever their format and size."""
 
 import hashlib
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -10,14 +10,15 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 import forcegp.mechanics
-from forcegp.data import Dataset
+from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import Stamps, Stretch, episode_rows, read_stamps
+from forcegp.recordings.episode_rows import EpisodeRows, Stamps, Stretch, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.reading import (
     RawRecording,
+    Spool,
     read_recording,
     require_plausible_positions,
     warn_of_implausible_forces,
@@ -84,8 +85,8 @@ def import_recordings(
 ) -> dict[str, Any]:
     """Write the dataset that these logs hold and return what was done, which is also `metadata["import"]`.
 
-    Each log is at least one episode; gaps and the episode numbers of a log make more. The signals must fit into memory,
-    as those of a Dataset do.
+    Each log is at least one episode; gaps and the episode numbers of a log make more. A log is read once, piece by
+    piece, and set aside in a temporary file beside `out` as float64, so that memory holds the time stamps only.
 
     Raises FileFormatError, DatasetError and InvalidInput naming file, column, row, time and remedy; then nothing is
     written. Warns (DataWarning) of what can be used but looks mistaken.
@@ -106,25 +107,37 @@ def import_recordings(
                 f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
             )
     steps = 2 * len(sources)
-    recordings: list[RawRecording] = []
-    for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
-        report(index, steps, f"reading {label}")
-        found = read_recording(source, own, label, unwrap=options.unwrap, most_rows=options.most_rows)
-        if not options.beyond_limits:
-            require_plausible_positions(found, own, robot, stated="q" in mapping.unit)
-        warn_of_implausible_forces(found, own, robot)
-        recordings.append(found)
-    stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
-    step = _even_step(stamps, options)
-    done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
-    report(len(sources), steps, "writing")
-    episodes = [*_episodes(stamps, plan, step, done)]
-    numbers = np.repeat(np.arange(len(episodes)), [each["rows"] for each in done["episodes"]])
-    done["rows"] = len(numbers)
-    del recordings, stamps  # as large as the dataset
-    signals: dict[str, Any] = {name: np.concatenate([part.pop(name) for part in episodes]) for name in [*episodes[0]]}
-    description = {"joint_names": plan.joints, "units": plan.units, "system": system, "metadata": {"import": done}}
-    Dataset(**signals, episode=numbers, **description).save(out)
+    with Spool(out.parent, len(plan.signals)) as spool:
+        recordings = []
+        for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
+            report(index, steps, f"reading {label}")
+            found = read_recording(source, own, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
+            if not options.beyond_limits:
+                require_plausible_positions(found, own, robot, stated="q" in mapping.unit)
+            warn_of_implausible_forces(found, own, robot)
+            recordings.append(found)
+        stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
+        step = _even_step(stamps, options)
+        episodes = [
+            EpisodeRows(stretch, own.kept, plan.logged, len(plan.joints), step)
+            for own in stamps
+            for stretch in own.stretches
+        ]
+        for stretch in (rows.stretch for rows in episodes):
+            _require_no_jumps(stretch)
+        done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
+        with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
+            for number, rows in enumerate(episodes):
+                report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
+                before = writer.rows
+                for piece in rows.pieces(spool):
+                    writer.append(**piece, episode=number)
+                recording, begin = rows.stretch.recording, rows.stretch.start
+                stamp = recording.begin + float(recording.time[begin])
+                own = {"recording": recording.label, "number": rows.stretch.number, "row": begin, "begin": stamp}
+                done["episodes"].append({**own, "rows": writer.rows - before})
+            done["rows"] = writer.rows
+            writer.finish({"import": done})
     return done
 
 
@@ -173,31 +186,16 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
 
 
-def _episodes(
-    stamps: Sequence[Stamps], plan: SignalPlan, step: float | None, done: dict[str, Any]
-) -> Iterator[dict[str, np.ndarray]]:
-    """Time and signals of every stretch; `done` gets what is said about it."""
-    for own in stamps:
-        for stretch in own.stretches:
-            _require_no_jumps(stretch, plan)
-            rows = episode_rows(stretch, own.kept, plan.logged, len(plan.joints), step)
-            recording, begin = stretch.recording, stretch.start
-            stamp = recording.begin + float(recording.time[begin])
-            said = {"recording": recording.label, "number": stretch.number, "row": begin, "begin": stamp}
-            done["episodes"].append({**said, "rows": len(rows["time"])})
-            yield rows
-
-
-def _require_no_jumps(stretch: Stretch, plan: SignalPlan) -> None:
+def _require_no_jumps(stretch: Stretch) -> None:
     """Refuse positions that jump by a turn inside an episode: derivatives would take it for motion."""
     recording = stretch.recording
-    inside = (recording.jumps[:, 0] > stretch.start) & (recording.jumps[:, 0] < stretch.end)
-    for row, column in recording.jumps[inside][:1].tolist():
-        raise DatasetError(
-            f"{recording.label}: q of joint {plan.signals[column].joint!r} jumps by more than half a turn at "
-            f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
-            "is in degrees. Add `unwrap`, or `unit` q=deg."
-        )
+    for row, item in recording.jumps:
+        if stretch.start < row < stretch.end:
+            raise DatasetError(
+                f"{recording.label}: q of joint {item.joint!r} jumps by more than half a turn at "
+                f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
+                "is in degrees. Add `unwrap`, or `unit` q=deg."
+            )
 
 
 def _what_was_done(

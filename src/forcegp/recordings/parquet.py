@@ -1,7 +1,7 @@
 """Parquet files, and folders of them as LeRobot writes."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -71,18 +71,22 @@ class ParquetFile(Source):
         return {name: tuple(column for column, stored in elements if stored == name) for name in self._widths}
 
     @override
-    def read(self, names: Sequence[str]) -> Columns:
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
         stored = list(dict.fromkeys(self._places[name][0] for name in names))
+        row = 0
         with (
             reading(self.path, "a Parquet file", pa.ArrowException),
             parquet.ParquetFile(self.path, pre_buffer=False) as file,
         ):
-            table = file.read(columns=stored).combine_chunks()
-            tables = {name: self._table(table.column(name).combine_chunks(), name) for name in stored}
-            return columns_of(tables, {name: self._places[name] for name in names})
+            for batch in file.iter_batches(rows, columns=stored):
+                if not len(batch):
+                    continue
+                tables = {name: self._table(batch.column(name), name, row) for name in stored}
+                row += len(batch)
+                yield columns_of(tables, {name: self._places[name] for name in names})
 
-    def _table(self, column: pa.Array, name: str) -> np.ndarray:
+    def _table(self, column: pa.Array, name: str, row: int) -> np.ndarray:
         if name not in self._widths:
             return arrow_numbers(column)
         width = self._widths[name]
@@ -90,7 +94,7 @@ class ParquetFile(Source):
         wrong = np.flatnonzero(lengths != width)
         if wrong.size:
             raise FileFormatError(
-                f"{self.path}: column {name!r} has {lengths[wrong[0]]} elements at {self.place(int(wrong[0]))}, "
+                f"{self.path}: column {name!r} has {lengths[wrong[0]]} elements at {self.place(row + int(wrong[0]))}, "
                 f"{width} before. Lists must be of one length."
             )
         return arrow_numbers(column.flatten()).reshape(len(column), width)
@@ -185,10 +189,10 @@ class LeRobotFolder(Source):
         return (self.path / INFO, *self.data_files)
 
     @override
-    def read(self, names: Sequence[str]) -> Columns:
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
-        parts = [part.read(names) for part in self._parts]
-        return {name: np.concatenate([part[name] for part in parts]) for name in names}
+        for part in self._parts:
+            yield from part.chunks(names, rows)
 
 
 def _element_names(feature: Any) -> list[str]:

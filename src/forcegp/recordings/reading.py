@@ -1,9 +1,11 @@
-"""One recording from a log: columns evaluated, and checked for values that make no sense."""
+"""One recording from a log into the spool: columns evaluated, checked for values that make no sense, and set aside."""
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,7 +15,42 @@ from forcegp.errors import DatasetError, DataWarning, FileFormatError, MistakenU
 from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
 
+
+class Spool:
+    """A table of float64 in a file without a name, which is gone with the process whatever ends it.
+
+    Rows are appended in blocks and read back by number; memory holds only what is read. Rates and gaps are known only
+    after the last row, and reading most formats costs more than everything after it, so a log is read once; the result
+    then depends neither on its format nor on the size of the pieces that a reader gives.
+    """
+
+    def __init__(self, folder: Path, width: int) -> None:
+        self.width = width
+        self.rows = 0
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # closed by __exit__
+
+    def __enter__(self) -> Spool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def append(self, table: Float[np.ndarray, "rows width"]) -> None:
+        """Put rows at the end."""
+        self._file.write(np.ascontiguousarray(table, dtype=np.float64).data)
+        self.rows += len(table)
+
+    def read(self, start: int, end: int) -> Float[np.ndarray, "rows width"]:
+        """Rows start to end, the latter excluded, as an array of its own."""
+        self._file.seek(start * self.width * 8)
+        data = self._file.read((end - start) * self.width * 8)
+        return np.frombuffer(data, np.float64).reshape(-1, self.width)
+
+
+ROWS_AT_A_TIME = 16384
 TURN = 2.0 * np.pi
+MOST_JUMPS = 1000
+"""That are remembered of one piece: the first one that matters is reported."""
 
 
 @dataclass(frozen=True)
@@ -23,76 +60,119 @@ class RawRecording:
     Fields
     ------
     label: what people call it, a file or an array in it.
-    table: (rows, signals), the signals of the plan in SI.
+    first: its first row in the spool.
     time: (rows,) [s] from its first row on.
     begin: the stamp of the log at the first row, in s.
     episodes: (n, 2) episode number of the log and row at which it begins; one row if the log numbers none.
-    jumps: (n, 2) rows before which a turning joint moves by more than half a turn, and the column of the table.
+    lowest, highest: (signals,) of each signal of the plan, in SI.
+    jumps: rows before which a turning joint moves by more than half a turn, with the signal.
     """
 
     label: str
     source: Source
-    table: Float[np.ndarray, "rows signals"]
+    first: int
     time: Float[np.ndarray, " rows"]
     begin: float
     episodes: Int[np.ndarray, "n 2"]
-    jumps: Int[np.ndarray, "n 2"]
+    lowest: Float[np.ndarray, " signals"]
+    highest: Float[np.ndarray, " signals"]
+    jumps: tuple[tuple[int, JointSignal], ...]
 
 
-def read_recording(source: Source, plan: SignalPlan, label: str, *, unwrap: bool, most_rows: int) -> RawRecording:
-    """Read a table. Raises FileFormatError and DatasetError naming the file, the row, the time and the column."""
-    columns = source.read(plan.columns) if plan.columns else {}
-    rows = len(next(iter(columns.values()), ()))
+def read_recording(
+    source: Source, plan: SignalPlan, spool: Spool, label: str, *, unwrap: bool, most_rows: int
+) -> RawRecording:
+    """Read a table once. Raises FileFormatError and DatasetError naming the file, the row, the time and the column."""
+    first = spool.rows
+    clock = _Clock(plan, source)
+    turns = _Turns(plan, unwrap)
+    times: list[np.ndarray] = []
+    episodes: list[tuple[int, int]] = []
+    lowest = np.full(len(plan.signals), np.inf)
+    highest = -lowest
+    rows = 0
+    for columns in source.chunks(plan.columns, ROWS_AT_A_TIME) if plan.columns else ():
+        count = len(next(iter(columns.values())))
+        if rows + count > most_rows:
+            raise FileFormatError(f"{label} has more than {most_rows} rows; allow more with `most_rows`.")
+        times.append(clock.seconds(columns, rows, count))
+        table = np.empty((count, len(plan.signals)))
+        for index, item in enumerate(plan.signals):
+            table[:, index] = item.value(columns, count)
+        _require_finite(table, columns, plan, source, rows, times[-1])
+        if plan.episode is not None:
+            _note_episodes(columns[plan.episode], episodes, source, rows)
+        turns.follow(table, rows, restarts=[row - rows for _, row in episodes if row >= rows])
+        lowest, highest = np.minimum(lowest, table.min(axis=0)), np.maximum(highest, table.max(axis=0))
+        spool.append(table)
+        rows += count
     if rows == 0:
         raise FileFormatError(f"{label} has no rows; give a log with rows.")
-    if rows > most_rows:
-        raise FileFormatError(f"{label} has more than {most_rows} rows; allow more with `most_rows`.")
-    time, begin = _seconds(columns, plan, source, rows)
-    table = np.empty((rows, len(plan.signals)))
-    for index, item in enumerate(plan.signals):
-        table[:, index] = item.value(columns, rows)
-    _require_finite(table, columns, plan, source, time)
-    episodes = np.zeros((1, 2), np.int64) if plan.episode is None else _episodes(columns[plan.episode], source)
-    jumps = _jumps(table, plan, episodes[:, 1], unwrap)
-    return RawRecording(label, source, table, time, begin, episodes, jumps)
+    begins = np.asarray(episodes or [(0, 0)], dtype=np.int64)
+    return RawRecording(
+        label, source, first, np.concatenate(times), clock.begin, begins, lowest, highest, tuple(turns.jumps)
+    )
 
 
-def _seconds(columns: Columns, plan: SignalPlan, source: Source, rows: int) -> tuple[np.ndarray, float]:
-    """Seconds since the first row, and the stamp there.
+class _Clock:
+    """Seconds since the first row. Whole numbers are subtracted as such: a float64 has no epochs in ns to 1 ns."""
 
-    Whole numbers are subtracted as such: a float64 has no epochs in ns to 1 ns.
-    """
-    if plan.time is None:
-        assert plan.step is not None
-        return np.arange(rows) * plan.step, 0.0
-    name = next(iter(plan.time.weights))
-    whole = plan.time.is_column and columns[name].dtype == np.int64
-    raw = columns[name] if whole else plan.time.value(columns, rows)
-    if not whole and not np.isfinite(raw).all():
-        row = int(np.argmin(np.isfinite(raw)))
-        raise DatasetError(
-            f"{source.path}: column {name!r}, the time, is {_shown(raw[row])} at {source.place(row)}. Repair or remove "
-            "that row."
-        )
-    begin = float(plan.time_unit.in_si(raw[:1].astype(np.float64))[0])
-    return plan.time_unit.in_si((raw - raw[0]).astype(np.float64)), begin
+    def __init__(self, plan: SignalPlan, source: Source) -> None:
+        self.plan, self.source = plan, source
+        self.origin: int | float | None = None
+        self.begin = 0.0
 
-
-def _jumps(table: np.ndarray, plan: SignalPlan, begins: np.ndarray, unwrap: bool) -> Int[np.ndarray, "n 2"]:
-    """Where positions of turning joints step by more than half a turn, which with `unwrap` are continued instead."""
-    columns = [i for i, item in enumerate(plan.signals) if item.signal == "q" and item.unit.si == "rad"]
-    q = table[:, columns]
-    steps = np.diff(q, axis=0, prepend=q[:1])
-    steps[begins] = 0.0
-    jumps = np.abs(steps) > np.pi
-    if not unwrap:
-        rows, found = np.nonzero(jumps)
-        return np.stack([rows, np.array(columns, np.int64)[found]], axis=1)
-    table[:, columns] = q + TURN * np.cumsum(-np.round(steps / TURN) * jumps, axis=0)
-    return np.zeros((0, 2), np.int64)
+    def seconds(self, columns: Columns, rows: int, count: int) -> np.ndarray:
+        plan = self.plan
+        if plan.time is None:
+            assert plan.step is not None
+            return np.arange(rows, rows + count) * plan.step
+        name = next(iter(plan.time.weights))
+        whole = plan.time.is_column and columns[name].dtype == np.int64
+        raw = columns[name] if whole else plan.time.value(columns, count)
+        if not whole and not np.isfinite(raw).all():
+            row = int(np.argmin(np.isfinite(raw)))
+            raise DatasetError(
+                f"{self.source.path}: column {name!r}, the time, is {_shown(raw[row])} at "
+                f"{self.source.place(rows + row)}. Repair or remove that row."
+            )
+        if self.origin is None:
+            self.origin = raw[0]
+            self.begin = float(plan.time_unit.in_si(np.asarray([raw[0]], dtype=np.float64))[0])
+        return plan.time_unit.in_si((raw - self.origin).astype(np.float64))
 
 
-def _require_finite(table: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, times: np.ndarray) -> None:
+class _Turns:
+    """Positions of turning joints: where they step by more than half a turn, continued beyond it if asked for."""
+
+    def __init__(self, plan: SignalPlan, unwrap: bool) -> None:
+        self.plan = plan
+        self.unwrap = unwrap
+        self.columns = [i for i, item in enumerate(plan.signals) if item.signal == "q" and item.unit.si == "rad"]
+        self.last: np.ndarray | None = None
+        self.added = np.zeros(len(self.columns))
+        self.jumps: list[tuple[int, JointSignal]] = []
+
+    def follow(self, table: np.ndarray, rows: int, restarts: list[int]) -> None:
+        """Note jumps, or add whole turns to the positions in place; rows in `restarts` begin another episode."""
+        q = table[:, self.columns]
+        before = q[:1] if self.last is None else self.last[None, :]
+        steps = np.diff(np.concatenate([before, q]), axis=0)
+        steps[restarts] = 0.0
+        self.last = q[-1].copy()
+        jumps = np.abs(steps) > np.pi
+        if not self.unwrap:
+            found = np.argwhere(jumps)[:MOST_JUMPS]
+            self.jumps += [(rows + int(row), self.plan.signals[self.columns[index]]) for row, index in found]
+        elif jumps.any() or self.added.any():
+            added = np.cumsum(-np.round(steps / TURN) * jumps, axis=0) + self.added
+            self.added = added[-1].copy()
+            table[:, self.columns] = q + TURN * added
+
+
+def _require_finite(
+    table: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, rows: int, times: np.ndarray
+) -> None:
     if np.isfinite(table).all():
         return
     row, index = (int(position) for position in np.argwhere(~np.isfinite(table))[0])
@@ -101,8 +181,8 @@ def _require_finite(table: np.ndarray, columns: Columns, plan: SignalPlan, sourc
     name = wrong[0] if wrong else next(iter(item.expression.weights), "")
     raise DatasetError(
         f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(columns[name][row])} at "
-        f"{source.place(row)}, {times[row]:.6g} s from the start; {int((~np.isfinite(table)).sum())} such "
-        "values in all. Repair or remove these rows, or map another column."
+        f"{source.place(rows + row)}, {times[row]:.6g} s from the start; {int((~np.isfinite(table)).sum())} such "
+        "values in this part. Repair or remove these rows, or map another column."
     )
 
 
@@ -110,22 +190,27 @@ def _shown(value: float) -> str:
     return "missing (empty or NaN)" if np.isnan(value) else f"{value}"
 
 
-def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
-    """Number and first row of every episode."""
+def _note_episodes(column: np.ndarray, episodes: list[tuple[int, int]], source: Source, rows: int) -> None:
+    """Append (number, row) for every row at which another episode begins."""
     numbers = np.asarray(column, dtype=np.float64)
     if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
         row = int(np.argmax(~np.isfinite(numbers) | (numbers != np.round(numbers))))
-        raise DatasetError(f"{source.path}: the episode is {numbers[row]} at {source.place(row)}, not a whole number.")
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(numbers)) + 1])
-    begun = numbers[starts].astype(np.int64)
-    first = np.unique(begun, return_index=True)[1]
-    if len(first) < len(begun):
-        again = int(np.setdiff1d(np.arange(len(begun)), first)[0])
         raise DatasetError(
-            f"{source.path}: episode {begun[again]} begins again at {source.place(int(starts[again]))}; rows of an "
-            "episode must lie together. Sort the log by episode and time."
+            f"{source.path}: the episode is {numbers[row]} at {source.place(rows + row)}, not a whole number."
         )
-    return np.stack([begun, starts], axis=1)
+    starts = np.flatnonzero(np.diff(numbers)) + 1
+    if not episodes or episodes[-1][0] != int(numbers[0]):
+        starts = np.concatenate([[0], starts])
+    seen = {number for number, _ in episodes}
+    for start in starts:
+        number = int(numbers[start])
+        if number in seen:
+            raise DatasetError(
+                f"{source.path}: episode {number} begins again at {source.place(rows + int(start))}; rows of an "
+                "episode must lie together. Sort the log by episode and time."
+            )
+        seen.add(number)
+        episodes.append((number, rows + int(start)))
 
 
 BEYOND = 0.1
@@ -150,7 +235,7 @@ def require_plausible_positions(
     for index, item in enumerate(plan.signals):
         if item.signal != "q":
             continue
-        low, high = recording.table[:, index].min(), recording.table[:, index].max()
+        low, high = recording.lowest[index], recording.highest[index]
         lower, upper = limits.get(item.joint, (-np.inf, np.inf))
         margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
         beyond = low < lower - margin or high > upper + margin
@@ -172,7 +257,7 @@ def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot:
     limits = {} if robot is None else {joint.name: joint.effort_limit for joint in robot.joints}
     for index, item in enumerate(plan.signals):
         limit = limits.get(item.joint, np.inf)
-        most = float(np.abs(recording.table[:, index]).max())
+        most = float(max(-recording.lowest[index], recording.highest[index]))
         if item.signal == "u" and 0.0 < limit < np.inf and most > STRONGER * limit:
             warnings.warn(
                 f"{recording.label}: u of joint {item.joint!r} reaches {most:.4g} {item.unit.si}; the URDF allows "

@@ -18,9 +18,6 @@ STAMP = "header.stamp"
 LOOKED_AT = 100
 """Messages of each topic that decide which columns there are: publishers may share a topic."""
 
-AT_ONCE = 10_000
-"""Messages whose numbers are held as objects of Python, which are large."""
-
 JOINT_STATE = "sensor_msgs/msg/JointState"
 OF_JOINTS = ("position", "velocity", "effort")
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
@@ -118,7 +115,7 @@ class RosBag(Source):
         return next(topic for topic, names in self._topics.items() if name in names)
 
     @override
-    def read(self, names: Sequence[str]) -> Columns:
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
         topics = sorted({self._topic_of(name) for name in names})
         if len(topics) != 1:
@@ -127,7 +124,7 @@ class RosBag(Source):
                 "their own; map columns of one topic, or record them in one message."
             )
         wanted = [name[len(topics[0]) + 1 :] for name in names]
-        parts, self._left_out = [], 0
+        self._left_out = 0
         with self._open() as reader:
             connections = [item for item in reader.connections if item.topic == topics[0]]
             kinds = sorted({item.msgtype for item in connections})
@@ -135,14 +132,13 @@ class RosBag(Source):
                 raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
             messages = reader.messages(connections)
             fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
-            while batch := list(islice(messages, AT_ONCE)):
+            while batch := list(islice(messages, rows)):
                 found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
                 table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
                 self._left_out += len(batch) - len(table)
                 if table:
-                    parts.append([as_column(np.array(column)) for column in zip(*table, strict=True)])
-        columns = map(np.concatenate, zip(*parts, strict=True)) if parts else (np.empty(0) for _ in names)
-        return dict(zip(names, columns, strict=True))
+                    columns = zip(*table, strict=True)
+                    yield {name: as_column(np.array(column)) for name, column in zip(names, columns, strict=True)}
 
 
 def _require_plausible_chunks(path: Path, reader: Any) -> None:

@@ -1,7 +1,7 @@
-"""`Source`: a log file as a table of named columns of numbers; how much a compressed one may hold."""
+"""`Source`: a log file as a table of named columns of numbers, read in pieces; how much a compressed one may hold."""
 
 import gzip
-import math
+import io
 import re
 import zlib
 from abc import ABC, abstractmethod
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from typing_extensions import override
 
 from forcegp.errors import FileFormatError, ForceGPError, require_known
 
@@ -27,7 +28,7 @@ class Source(ABC):
     """One log: a table whose rows come one after the other in time.
 
     A subclass reads one format. `columns` names every column of numbers; an array of `k` numbers per row is `k` columns
-    `name[0] ... name[k-1]`. `read` gives chosen columns; what else is in the file need not fit into memory.
+    `name[0] ... name[k-1]`. `chunks` gives chosen columns in pieces, so that a file may be larger than the memory.
     Nothing in a file is executed and no link to another file is followed.
 
     Raises FileFormatError, with the path and what to do, from the constructor or from any method.
@@ -48,10 +49,10 @@ class Source(ABC):
         """The names of all columns, in the order of the file; not empty, no name twice."""
 
     @abstractmethod
-    def read(self, names: Sequence[str]) -> Columns:
-        """The named columns, in the order asked for; a value that is missing is NaN.
+    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
+        """The named columns in pieces of at most `rows` rows, in the order of the file; no piece is empty.
 
-        Raises FileFormatError for a value that is no number.
+        A value that is missing is NaN. Raises FileFormatError for a value that is no number.
         """
 
     @property
@@ -73,7 +74,7 @@ class Source(ABC):
         return (self.path,)
 
     def notes(self) -> tuple[str, ...]:
-        """Remarks on how the file was read; complete after `read`."""
+        """Remarks on how the file was read; complete after the last piece."""
         return ()
 
     def place(self, row: int) -> str:
@@ -159,8 +160,41 @@ def require_plausible_size(path: Path, what: str, declared: int, stored: int) ->
         )
 
 
-def gunzipped(path: Path, most: float = math.inf) -> bytes:
-    """The content of a .gz file, or its first megabytes. The size that it declares is checked, and what comes out."""
+class Wrapper(io.RawIOBase):
+    """A stream that is read from another, and closes it."""
+
+    stream: io.BufferedIOBase
+
+    @override
+    def readable(self) -> bool:
+        return True
+
+    @override
+    def close(self) -> None:
+        self.stream.close()
+        super().close()
+
+
+class CountedStream(Wrapper):
+    """What is read from a decompressor, refused as soon as it is implausibly more than the compressed file."""
+
+    def __init__(self, path: Path, stream: io.BufferedIOBase) -> None:
+        self.path = path
+        self.stream = stream
+        self.stored = path.stat().st_size
+        self.expanded = 0
+
+    @override
+    def readinto(self, buffer) -> int:
+        data = self.stream.read(len(buffer))
+        buffer[: len(data)] = data
+        self.expanded += len(data)
+        require_plausible_size(self.path, "what is compressed", self.expanded, self.stored)
+        return len(data)
+
+
+def gzip_stream(path: Path) -> CountedStream:
+    """The content of a .gz file. The size that it declares is checked first, what comes out is counted."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(2) != b"\x1f\x8b":
@@ -168,10 +202,4 @@ def gunzipped(path: Path, most: float = math.inf) -> bytes:
         file.seek(max(size - 4, 0))
         declared = int.from_bytes(file.read(4), "little")  # RFC 1952: ISIZE, modulo 2^32
     require_plausible_size(path, "what is compressed", declared, size)
-    parts, expanded = [], 0
-    with gzip.open(path) as stream:
-        while expanded < most and (part := stream.read(2**20)):
-            expanded += len(part)
-            require_plausible_size(path, "what is compressed", expanded, size)
-            parts.append(part)
-    return b"".join(parts)
+    return CountedStream(path, gzip.open(path, "rb"))
