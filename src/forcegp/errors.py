@@ -132,7 +132,7 @@ class CompilerError(ForceGPError):
 
 
 class BackendError(ForceGPError):
-    """Workers that cannot be had, have other versions, or died again and again."""
+    """A worker died: it was killed, or out of memory."""
 
 
 class MissingExtra(ForceGPError, ImportError):
@@ -141,10 +141,6 @@ class MissingExtra(ForceGPError, ImportError):
 
 class NumericalWarning(UserWarning):
     """Something was repaired (jitter added, say) and the result is still usable."""
-
-
-class WorkerWarning(UserWarning):
-    """A process at work died and its task began anew; the outcome is the same."""
 
 
 class OutdatedWarning(UserWarning):

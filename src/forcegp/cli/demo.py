@@ -76,8 +76,6 @@ class Demo(Command):
                 models[name], fits[name] = self._fitted(terminal, folder / place, train, name, mean)
                 evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
             pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-            histories = {name: posterior.result.history for name, posterior in models.items()}
-            forcegp.evaluation.save_figure(forcegp.evaluation.likelihood_figure(histories), folder / "likelihood.png")
             terminal.note(f"drew {', '.join(pictures)}")
             wall_seconds = time.monotonic() - start
             results = {

@@ -142,17 +142,9 @@ def evaluate_with_progress(
 
 def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
-    figures = {
-        "prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset),
-        "likelihood.png": lambda: forcegp.evaluation.likelihood_figure(
-            {posterior.description: posterior.result.history}, objective=posterior.objective
-        ),
-    }
-    if posterior.system.contacts:
-        figures["tool_path.png"] = lambda: forcegp.evaluation.tool_path_figure(posterior, dataset)
-        figures["summary.png"] = lambda: forcegp.evaluation.summary_figure(posterior, dataset)
-        if posterior.predicts_forces:
-            figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
+    figures = {"prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset)}
+    if posterior.system.contacts and posterior.predicts_forces:
+        figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
     if forcegp.evaluation.curve_panels(posterior):
         figures["forces.png"] = lambda: forcegp.evaluation.friction_curves_figure(posterior, dataset)
     with terminal.progress("drawing") as report:

@@ -31,8 +31,7 @@ GROUPS: Mapping[str, str] = {
     "Noise": "noise force_noise measured_torque",
     "Model": "model models prior priors mean hyperprior learn friction rotors likelihood "
     "robust prior_strength identification",
-    "Fit": "points learning_points rows learn_from window motions engine restarts iterations adam_steps checks "
-    "correct accept",
+    "Fit": "points learning_points rows learn_from window motions engine restarts iterations checks correct accept",
     "Score": "split guard seeds seed_list horizon margin block_seconds strict",
     "Program": "to steps covariance jacobian unchecked",
     "Compute": "preset seed jobs backend device port",

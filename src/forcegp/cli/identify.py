@@ -262,7 +262,7 @@ class Identify(IdentifyOptions):
             seed=self.seed,
             backend=self._backend(),
             hyperprior=self.hyperprior,
-            options=forcegp.inference.OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
+            options=forcegp.inference.OptimizerOptions(iterations=self.iterations),
             learn=learn,
             prior_strength=self.prior_strength or 0.0,
             learning_points=self.learning_points,

@@ -104,7 +104,6 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "learn_from": ("structured", "unconstrained", "analytical"),
     "motions": ("structured", "analytical"),
     "backend": SEARCHED,
-    "adam_steps": (*SEARCHED, "analytical"),
     "hyperprior": (*SEARCHED, "analytical"),
 }
 """Options that mean nothing to some models -> those to which they do."""
@@ -189,7 +188,7 @@ def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,
-        "options": replace(options, iterations=command.iterations, adam_steps=command.adam_steps),
+        "options": replace(options, iterations=command.iterations),
     }
 
 

@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from PIL import Image
@@ -40,11 +38,6 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), dpi=RESOLUTION, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def speed_colors() -> ListedColormap:
-    """Viridis (even for every kind of colour vision) without its yellow end, which vanishes on white."""
-    return ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)), name="speed")
 
 
 def quiet(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
