@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.arguments import Inertials, checked_tensor
+from forcegp.robots.base import BaseChoice
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
 from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
@@ -47,7 +48,7 @@ class LinkInertia:
 
 @dataclass(frozen=True)
 class Link:
-    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world)."""
+    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world), or mimics one."""
 
     name: str
     joint: str | None
@@ -73,6 +74,8 @@ class RobotStructure(Summary):
     urdf_text: str
     _locked: tuple[tuple[str, float], ...]
     _frames: dict[str, tuple[int, Tensor]]
+    base: BaseChoice = "fixed"
+    """How the root link is held."""
 
     @property
     def name(self) -> str:
@@ -86,12 +89,12 @@ class RobotStructure(Summary):
 
     @property
     def nv(self) -> int:
-        """Number of movable joints."""
+        """Number of coordinates: of the movable joints that mimic none."""
         return len(self.layout.joints)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """Movable joints in the order of q."""
+        """Movable joints in the order of q, without those that mimic one."""
         names = [field.name for field in fields(Joint)]
         return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
 
@@ -134,7 +137,7 @@ class RobotStructure(Summary):
         """One link by name."""
         require_known("link", name, self.name, self.layout.links, UnknownLink)
         body = self.layout.links[name].body
-        joint = None if body == WORLD else self.joint_names[body]
+        joint = None if body == WORLD else self.layout.bodies[body].name
         inertial = self.description.links[name] or MASSLESS
         rows = tuple(tuple(row) for row in inertial.inertia.tolist())
         return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
@@ -174,8 +177,8 @@ class RobotStructure(Summary):
         """``value`` in float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv) on the robot's device."""
         return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
 
-    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
-        """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
+    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "bodies 4 4 *batch"]:
+        """Merged pseudo-inertias (bodies, ...) of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
         return merged_inertias(self.tree, self.layout, self.checked_inertials(inertials))
 
     def checked_inertials(self, inertials: Inertials) -> dict[str, Tensor]:

@@ -1,0 +1,105 @@
+"""All problems of one robot file in one report, with the arguments that mend them together."""
+
+import contextlib
+import shlex
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from forcegp.errors import InvalidNumber, RobotFileWarning, RobotModelError
+
+LISTED = 12
+"""Problems of one kind that a message lists; the error has all of them."""
+
+
+class Problems:
+    """What is wrong with a file, and what was repaired.
+
+    Parameters: ``source``, which every message begins with; ``given``, arguments of ``Robot.from_urdf`` that the
+    remedy keeps; ``strict``, whether what could be ignored is an error.
+    """
+
+    def __init__(self, source: str, given: Mapping[str, Any] | None = None, *, strict: bool = False) -> None:
+        self.source, self.given, self.strict = source, dict(given or {}), strict
+        self.errors: list[RobotModelError] = []
+        self.broken: set[str] = set()
+        """Links of which something is reported, so that nothing else need be."""
+        self.notes: dict[str, list[str]] = {}
+
+    @contextlib.contextmanager
+    def collected(self, link: str | None = None) -> Iterator[None]:
+        """Keep an error of the file, of a ``link`` for example, for the report, and go on."""
+        try:
+            yield
+        except RobotModelError as error:
+            self.errors.append(error)
+            if link is not None:
+                self.broken.add(link)
+
+    def ignore(self, what: str, where: str, seen: str) -> None:
+        """Note ``what`` is ignored of the element ``where``. With `strict` this is an error: what was ``seen``."""
+        if self.strict:
+            advice = f"; correct it, or leave strict out: {what}."
+            self.errors.append(InvalidNumber(f"{self.source}: {where} has {seen}", advice))
+        else:
+            self.note(what, where)
+
+    def note(self, what: str, where: str) -> None:
+        """Note what was ignored or repaired, and of which element."""
+        self.notes.setdefault(what, []).append(where)
+
+    def warn(self, stacklevel: int) -> None:
+        """One RobotFileWarning about all that was noted."""
+        if self.notes:
+            text = "; ".join(f"{what} ({', '.join(where)})" for what, where in self.notes.items())
+            warnings.warn(f"{self.source}: {text}.", RobotFileWarning, stacklevel=stacklevel)
+
+    def raise_all(self) -> None:
+        """Raise what was collected as one error.
+
+        Its class is theirs where they are alike, else RobotModelError.
+        """
+        if not self.errors:
+            return
+        remedy: dict[str, Any] = {}
+        for error in self.errors:
+            for name, value in error.remedy.items():
+                remedy[name] = {**remedy.get(name, {}), **value} if isinstance(value, Mapping) else value
+        by_hand = [error for error in self.errors if not error.remedy]
+        alike = len({type(error) for error in self.errors}) == 1
+        kind = type(self.errors[0]) if alike else RobotModelError
+        texts = self._texts()
+        head = f"{self.source}: {len(self.errors)} problems: " if len(self.errors) > 1 else f"{self.source}: "
+        text = head + " ".join(texts)
+        if by_hand and remedy:
+            text += " Where no argument helps, correct the file first."
+        if remedy:
+            for name, value in self.given.items():
+                remedy[name] = {**value, **remedy.get(name, {})} if isinstance(value, Mapping) else remedy.get(name, value)
+            text += f" The remedy for {'it' if len(self.errors) == 1 else 'the others' if by_hand else 'all'}: "
+            text += remedy_text(remedy)
+        found = kind(text, "", {} if by_hand else remedy)
+        found.problems = tuple(str(error) for error in self.errors)
+        raise found from None
+
+    def _texts(self) -> list[str]:
+        """What was seen, with what to do once for all that are alike."""
+        groups: dict[str, list[str]] = {}
+        for error in self.errors:
+            groups.setdefault(error.advice, []).append(error.seen.removeprefix(f"{self.source}: "))
+        texts = []
+        for advice, seen in groups.items():
+            more = f"; and {len(seen) - LISTED} more like these" if len(seen) > LISTED else ""
+            texts.append("; ".join(seen[:LISTED]) + more + advice)
+        return texts
+
+
+def remedy_text(remedy: Mapping[str, Any]) -> str:
+    """The arguments in Python and on the command line: `inertias='nearest', or --inertias nearest.`"""
+    python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
+    words = []
+    for name, value in remedy.items():
+        flag = "--lock" if name == "locked" else f"--{name}"
+        listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
+        words.append(f"{flag} {shlex.quote(listed)}")
+    return f"Robot.from_urdf(path, {python}), or {' '.join(words)}."
