@@ -211,14 +211,17 @@ def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
     return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
 
 
-def check_bodies(description: RobotDescription, layout: Layout, tree: "Tree", problems: Problems) -> None:
+def check_bodies(
+    description: RobotDescription, layout: Layout, tree: "Tree", problems: Problems
+) -> list[NonPhysicalInertia]:
     """Every body must resist its joint, by itself or by its armature.
 
     A body resists a prismatic joint by its mass and any other joint by its inertia about the axis. Where all bodies do,
     the mass matrix is positive definite at every position: the moving joint nearest to the base moves its body by
-    itself alone. Links fixed in the world need no inertia.
+    itself alone. ``problems`` collects bodies without mass; those with none about their axis are returned, since what
+    they carry may resist. Links fixed in the world need no inertia.
     """
-    pseudo = tree.inertias[..., 0].numpy()
+    pseudo, found = tree.inertias[..., 0].numpy(), []
     carried: list[list[str]] = [[] for _ in layout.bodies]
     for name, placement in layout.links.items():
         if placement.body != WORLD and name != layout.bodies[placement.body].child:
@@ -226,28 +229,22 @@ def check_bodies(description: RobotDescription, layout: Layout, tree: "Tree", pr
     for body, joint in enumerate(layout.bodies):
         if not problems.broken.isdisjoint((joint.child, *carried[body])):
             continue
-        own = layout.drives[body]
-        armature = float(tree.armature[own.joint]) if joint.name == layout.joints[own.joint].name else 0.0
         others = f" and the links fixed to it ({', '.join(map(repr, carried[body]))})" if carried[body] else ""
-        if pseudo[body, 3, 3] == 0.0 and armature == 0.0:
-            problems.errors.append(
-                MissingInertia(
-                    f"{description.source}: link {joint.child!r}{others} moves with joint {joint.name!r} but has no "
-                    "mass",
-                    "; add an <inertial> element, make the joint fixed, lock it, or give it armature.",
-                    {"locked": {joint.name: 0.0}},
-                )
-            )
+        link, remedy = f"{description.source}: link {joint.child!r}{others}", {"locked": {joint.name: 0.0}}
+        own = layout.drives[body].joint
+        armature = float(tree.armature[own]) if layout.joints[own].name == joint.name else 0.0
+        if pseudo[body, 3, 3] == 0.0:
+            seen = f"{link} moves with joint {joint.name!r} but has no mass"
+            advice = "; add an <inertial> element, make the joint fixed, or lock it."
+            problems.errors.append(MissingInertia(seen, advice, remedy))
         elif joint.type != "prismatic" and armature == 0.0 and axis_inertia_vanishes(pseudo[body]):
-            problems.errors.append(
-                NonPhysicalInertia(
-                    f"{description.source}: link {joint.child!r}{others} turns with joint {joint.name!r} but has no "
-                    "rotational inertia about its axis",
-                    ", so any force would accelerate it infinitely; correct its <inertial> element, give the rotor "
-                    f"inertia of the joint with armature={{{joint.name!r}: ...}} in kg m^2, or lock it.",
-                    {"locked": {joint.name: 0.0}},
-                )
+            seen = f"{link} turns with joint {joint.name!r} but has no rotational inertia about its axis"
+            advice = (
+                ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the inertia "
+                "of its rotor (`armature`, in kg m^2), or lock it."
             )
+            found.append(NonPhysicalInertia(seen, advice, remedy))
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 import contextlib
 import shlex
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from forcegp.errors import InvalidNumber, RobotFileWarning, RobotModelError
@@ -47,6 +47,13 @@ class Problems:
     def note(self, what: str, where: str) -> None:
         """Note what was ignored or repaired, and of which element."""
         self.notes.setdefault(what, []).append(where)
+
+    def offer_no_lock_of(self, joints: Collection[str]) -> None:
+        """Take locks out of the remedies where they would hold all of these joints."""
+        held = {name for error in self.errors for name in error.remedy.get("locked", ())}
+        if held.issuperset(joints):
+            for error in self.errors:
+                error.remedy.pop("locked", None)
 
     def warn(self, stacklevel: int) -> None:
         """One RobotFileWarning about all that was noted."""

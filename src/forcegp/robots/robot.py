@@ -21,7 +21,7 @@ from forcegp.robots.arguments import (
 )
 from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.inertia import physical_from_parameters
+from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import check_bodies, compile_tree, lay_out
 from forcegp.robots.problems import Problems
@@ -148,13 +148,28 @@ class Robot(RobotStructure):
             names = tuple(joint.name for joint in layout.joints)
             rotor_inertias = armature_values(armature, names, description.name)
             tree = compile_tree(description, layout, finite_vector("gravity", gravity, 3), rotor_inertias)
-            check_bodies(description, layout, tree, problems)
+            frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
+            robot = cls(description, layout, tree, text, tuple(locked.items()), frames, base or "fixed")
+            without = check_bodies(description, layout, tree, problems)
+            if without and not robot._resists():
+                problems.errors += without
+            elif without:
+                what = "links without inertia about the axis of their joint: where all that they carry lies on it, too, "
+                for error in without:
+                    problems.note(f"{what}forward dynamics is refused", error.seen.partition("link ")[2].split()[0])
+            problems.offer_no_lock_of(names)
             check_base(description, layout.standing, base, problems)
         problems.raise_all()
         if not quiet:
             problems.warn(stacklevel=5)
-        frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
-        return cls(description, layout, tree, text, tuple(locked.items()), frames, base or "fixed")
+        return robot
+
+    def _resists(self) -> bool:
+        """Whether the mass matrix is positive definite at a position without symmetry."""
+        q = torch.linspace(0.3, 1.1, self.nv, dtype=torch.float64).sin()
+        M = self.mass_matrix(q)
+        scale = M.diagonal().clamp(min=1e-300).rsqrt()
+        return bool(torch.linalg.eigvalsh(scale[:, None] * M * scale)[0] > SINGULAR)
 
     def with_inertials(self, inertials: Inertials) -> "Robot":
         """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""

@@ -7,6 +7,7 @@ written back). Problems are collected (:mod:`forcegp.robots.problems`), so that 
 
 import difflib
 import math
+import re
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element, ParseError
 
@@ -190,17 +191,29 @@ def _parse_xml(text: str, source: str) -> Element:
     if not text:
         raise MalformedUrdf(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
     try:
-        return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
+        try:
+            return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
+        except ParseError as error:
+            if "unbound prefix" not in str(error):
+                raise
+        return SafeElementTree.fromstring(
+            _with_prefixes(text), forbid_dtd=True, forbid_entities=True, forbid_external=True
+        )
     except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
         raise UnsafeXml(
             f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
             "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
         ) from None
     except (ParseError, UnicodeError) as error:
-        hint = ""
-        if "unbound prefix" in str(error):
-            hint = " If this is a xacro file, expand it first: xacro robot.urdf.xacro > robot.urdf."
-        raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.{hint}") from None
+        raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.") from None
+
+
+def _with_prefixes(text: str) -> str:
+    """The text with declarations for prefixes such as ``drake:``, which readers of URDF do not ask for."""
+    used = set(re.findall(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]", text)) - {"xml", "xmlns"}
+    missing = sorted(prefix for prefix in used if f"xmlns:{prefix}" not in text)
+    declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in missing)
+    return re.sub(r"<robot(?=[\s>])", f"<robot{declared}", text, count=1)
 
 
 def _refuse_xacro(root: Element, source: str) -> None:
@@ -210,7 +223,7 @@ def _refuse_xacro(root: Element, source: str) -> None:
     expressions = [
         element
         for element in (*owners, *(inner for part in read for inner in part.iter()))
-        if any("${" in value or "$(" in value for value in element.attrib.values())
+        if any(mark in value for value in element.attrib.values() for mark in ("${", "$("))
     ]
     macros = [element for owner in (root, *owners) for element in owner if "xacro}" in element.tag]
     for element in (*macros, *expressions):
@@ -312,7 +325,7 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
         return None
     mass = _number(_attribute(_child(element, "mass", place), "value", place), "<mass> value", place)
     if 0.0 < mass < LIGHTEST:
-        raise InvalidNumber(f"{place}: <mass> value is {mass:g} kg, too small for a body; give 0 for a mere frame.")
+        raise InvalidNumber(f"{place}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
     entries = _child(element, "inertia", place)
     ixx, ixy, ixz, iyy, iyz, izz = (
         _number(_attribute(entries, key, place), f"<inertia> {key}", place)
