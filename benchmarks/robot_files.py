@@ -13,6 +13,7 @@ rad/s^2); joints that mimic others by projecting the full model with the constan
 from __future__ import annotations
 
 import argparse
+import re
 import warnings
 from collections import Counter
 from collections.abc import Mapping
@@ -98,16 +99,17 @@ def difference(robot: Robot) -> float:
         a = G.T @ pin.aba(model, data, positions, G @ v, G @ tau)
     else:
         a = np.linalg.solve(M, tau - bias)
-    state = [torch.from_numpy(x) for x in (q, v, tau)]
-    ours = (robot.mass_matrix(state[0]), robot.bias_forces(*state[:2]), robot.forward_dynamics(*state))
+    x, y, z = (torch.from_numpy(each) for each in (q, v, tau))
+    ours = (robot.mass_matrix(x), robot.bias_forces(x, y), robot.forward_dynamics(x, y, z))
     triples = zip((mine.numpy() for mine in ours), (M, bias, a), (0.0, np.abs(M).max(), 0.0), strict=True)
-    return max(float(np.abs(mine - x).max() / max(np.abs(x).max(), least)) for mine, x, least in triples)
+    return max(float(np.abs(mine - their).max() / max(np.abs(their).max(), least)) for mine, their, least in triples)
 
 
 def mimics(text: str) -> dict[str, tuple[str, float, float]]:
     """Joint, multiplier and offset of every <mimic> of a joint that moves."""
     found = {}
-    for joint in ElementTree.fromstring(text).findall("joint"):
+    plain = re.sub(r"([<\s]/?)(\w+):(?=\w+)", r"\1\2-", text)  # prefixes need not be declared
+    for joint in ElementTree.fromstring(plain).findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None and joint.get("type") != "fixed":
             numbers = (float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0)))
@@ -151,9 +153,8 @@ def report(files: list[File], *, each: bool) -> None:
             asked = "base?" if file.asked else "     "
             print(f"{file.outcome:10} {asked} {file.error:8.1e} {file.path.parent.name}/{file.path.name} {file.remedy}")
     for file in files:
-        if file.outcome not in loaded and (each or file.pinocchio == "robot"):
-            if file.pinocchio != "still":
-                print(f"{file.pinocchio}: {file.message[:300]}")
+        if file.outcome not in loaded and file.pinocchio != "still" and (each or file.pinocchio == "robot"):
+            print(f"{file.pinocchio}: {file.message[:300]}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.robots.robot_models import CHAIN, TREE
+from tests.robots.robot_models import CHAIN
 
 from forcegp import errors
 from forcegp.robots import Robot
@@ -189,7 +189,11 @@ WRONG = {
         for attribute in ("damping", "friction")
         for value in ("-0.1", "inf", "-inf")
     },
-    "digits of another script": (changed('value="2"', 'value="２"'), errors.InvalidNumber, ["link 'arm'", "not a number"]),
+    "digits of another script": (
+        changed('value="2"', 'value="\uff12"'),
+        errors.InvalidNumber,
+        ["link 'arm'", "not a number"],
+    ),
     "mass of the smallest number": (
         changed('value="2"', 'value="5e-324"'),
         errors.InvalidNumber,
@@ -344,7 +348,7 @@ def test_files_that_are_too_large_or_too_deep_are_refused_at_once(tmp_path):
             Robot.from_urdf_text(text)
     assert Robot.from_urdf_text(SMALL.replace("</robot>", "<a>" * 10**5 + "</a>" * 10**5 + "</robot>")).nv == 1
     chain = "".join(
-        f'<link name="{k}"/><joint name="{k}" type="prismatic"><parent link="{k or "arm"}"/><child link="{k + 1}"/></joint>'
+        f'<link name="{k}"/><joint name="{k}" type="prismatic"><parent link="{k}"/><child link="{k + 1}"/></joint>'
         for k in range(1, 1002)
     )
     chain += '<link name="1002"/>' + JOINT.format("last", "arm", "1")

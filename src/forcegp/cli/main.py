@@ -43,6 +43,7 @@ COMMANDS: Mapping[str, str] = {
     "demo": "the whole story in a minute: simulate, learn, evaluate, draw",
     "simulate": "make a dataset with ground truth",
     "import": "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot",
+    "robot": "what a robot file says, what was repaired, and a picture",
     "check": "what would spoil a model of this log, and what to do about it",
     "prepare": "filter and differentiate a raw log, and report what that costs",
     "fit": "learn the unknown forces from a dataset",

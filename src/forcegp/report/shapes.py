@@ -7,12 +7,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import torch
-from defusedxml import ElementTree
 
-from forcegp.errors import InvalidInput, MissingExtra
+from forcegp.errors import InvalidInput, MissingExtra, RobotModelError
 from forcegp.robots import Robot
 from forcegp.robots.inertia import rotation_from_rpy, transform
-from forcegp.robots.urdf_file import read_text
+from forcegp.robots.robot_file import read_robot_file
+from forcegp.robots.urdf import parse_xml
 
 FORMATS = (".stl", ".obj", ".ply", ".off")
 """Meshes that are read; none of them can name another file that would be read with it."""
@@ -54,10 +54,10 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
     Raises MissingExtra without trimesh, and InvalidInput for a file that is no URDF.
     """
     trimesh_module()
-    text = robot.urdf_text if urdf is None else read_text(urdf)
+    text = robot.urdf_text if urdf is None else read_robot_file(urdf)
     try:
-        root = ElementTree.fromstring(text, forbid_dtd=True)
-    except Exception as error:
+        root = parse_xml(text, str(urdf))
+    except RobotModelError as error:
         raise InvalidInput(f"{urdf} is not a URDF ({error}); give the file that describes the robot.") from None
     drawn, doubts = {}, []
     for link in root.findall("link"):

@@ -52,9 +52,7 @@ def check_free(joint: JointDescription, at_root: bool, problems: Problems) -> No
         problems.errors.append(_question(problems.source, f"joint {joint.name!r} is of type {joint.type!r}"))
 
 
-def check_base(
-    description: RobotDescription, standing: Sequence[str], base: str | None, problems: Problems
-) -> None:
+def check_base(description: RobotDescription, standing: Sequence[str], base: str | None, problems: Problems) -> None:
     """Report a robot that nobody said is bolted to the world, unless that was done.
 
     ``standing`` are the links that do not move, the root first.

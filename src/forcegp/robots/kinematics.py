@@ -61,7 +61,7 @@ def of_bodies(tree: Tree, values: Float[Tensor, "nv batch"]) -> Float[Tensor, "n
 
 def of_joints(tree: Tree, values: Float[Tensor, "batch n *rest"]) -> Float[Tensor, "batch nv *rest"]:
     """Forces at the joints of all bodies as forces at those with a coordinate: ``G^T values``."""
-    return torch.tensordot(values, tree.coupling, ([1], [0])).movedim(-1, 1) if tree.coupled else values
+    return (values.movedim(1, -1) @ tree.coupling).movedim(-1, 1) if tree.coupled else values
 
 
 def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Bodies:
@@ -234,8 +234,9 @@ class Kinematics:
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
         """Joint forces per unit of the standard parameters of each body (..., nv, bodies, 10), armature left out.
 
-        A body is what a joint moves as one, in the order of the joints, those included that mimic another: its child link and all that is fixed to it. Parameters are about the
-        origin and in the axes of the child link, in the order of :func:`forcegp.robots.inertia.standard_basis`.
+        A body is what a joint moves as one, also a joint that mimics another: its child link and all that is fixed to
+        it. Parameters are about the origin and in the axes of the child link, in the order of
+        :func:`forcegp.robots.inertia.standard_basis`.
         """
         a = self.robot.checked_input("a", a)
         at = self._expanded("a", a.shape[:-1])

@@ -1,13 +1,13 @@
 """Which body carries which link, in what order the joints come, whether all of it is a physical tree; its constants.
 
 Movable joints are numbered depth first, children in the order in which their joints stand in the file. (Pinocchio
-visits children alphabetically; map by joint name when comparing.) Each of them moves a *body*: its child link and every
-link fixed to it. A body's frame is the child link's frame turned so that its z axis is the joint axis, which makes
+visits children alphabetically; map by joint name when comparing.) Each of them moves a *body*: its child link and all
+links fixed to it. A body's frame is the child link's frame turned so that its z axis is the joint axis, which makes
 every joint a rotation about or a translation along z.
 
 A joint that mimics another one moves a body, too, but has no coordinate of its own (:mod:`forcegp.robots.mimic`). The
-positions of the bodies' joints are ``G q + g`` with q those of the ``nv`` others; without mimic joints G is the identity
-and body i is that of joint i.
+positions of the bodies' joints are ``G q + g`` with q those of the ``nv`` others; without mimic joints G is the
+identity and body i is that of joint i.
 """
 
 from collections.abc import Mapping
@@ -30,6 +30,7 @@ from forcegp.errors import (
     require_known,
 )
 from forcegp.robots.arguments import Inertials, broadcast_batch, usable_device
+from forcegp.robots.base import check_free
 from forcegp.robots.inertia import (
     axis_inertia_vanishes,
     inverse,
@@ -40,7 +41,6 @@ from forcegp.robots.inertia import (
     skew,
     transform,
 )
-from forcegp.robots.base import check_free
 from forcegp.robots.mimic import Drive, followed, with_followers
 from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import FREE, MOVABLE, JointDescription, RobotDescription
@@ -240,8 +240,8 @@ def check_bodies(
         elif joint.type != "prismatic" and armature == 0.0 and axis_inertia_vanishes(pseudo[body]):
             seen = f"{link} turns with joint {joint.name!r} but has no rotational inertia about its axis"
             advice = (
-                ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the inertia "
-                "of its rotor (`armature`, in kg m^2), or lock it."
+                ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "
+                "inertia of its rotor (`armature`, in kg m^2), or lock it."
             )
             found.append(NonPhysicalInertia(seen, advice, remedy))
     return found

@@ -82,7 +82,9 @@ class Problems:
             text += " Where no argument helps, correct the file first."
         if remedy:
             for name, value in self.given.items():
-                remedy[name] = {**value, **remedy.get(name, {})} if isinstance(value, Mapping) else remedy.get(name, value)
+                remedy[name] = (
+                    {**value, **remedy.get(name, {})} if isinstance(value, Mapping) else remedy.get(name, value)
+                )
             text += f" The remedy for {'it' if len(self.errors) == 1 else 'the others' if by_hand else 'all'}: "
             text += remedy_text(remedy)
         found = kind(text, "", {} if by_hand else remedy)

@@ -154,7 +154,9 @@ class Robot(RobotStructure):
             if without and not robot._resists():
                 problems.errors += without
             elif without:
-                what = "links without inertia about the axis of their joint: where all that they carry lies on it, too, "
+                what = (
+                    "links without inertia about the axis of their joint: where all that they carry lies on it, too, "
+                )
                 for error in without:
                     problems.note(f"{what}forward dynamics is refused", error.seen.partition("link ")[2].split()[0])
             problems.offer_no_lock_of(names)

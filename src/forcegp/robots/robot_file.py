@@ -1,4 +1,4 @@
-"""Files of a robot: URDF, or xacro that is expanded to one; and rotor inertias, for which URDF has no element, beside it.
+"""Files of a robot: URDF, or xacro that is expanded to one; and rotor inertias, which URDF has no element for.
 
 Rotor inertias (armature) of `arm.urdf` stand in `arm.armature.json`, one number per joint, in kg m^2 or kg. A comment
 in the URDF tells people of them.
@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
-from forcegp.atomic_files import write_json
+from forcegp.atomic_files import write_bytes
 from forcegp.errors import InvalidNumber, MalformedUrdf, MissingExtra, RobotFileWarning
 from forcegp.robots.urdf_file import read_text, write_text
 
@@ -25,7 +25,7 @@ def read_robot_file(path: str | Path) -> str:
     if Path(path).suffix != ".xacro":
         return text
     try:
-        import xacro
+        import xacro  # pyright: ignore[reportMissingImports]  # an extra
     except ImportError:
         raise MissingExtra(
             f"{path}: xacro files need the package xacro: pip install 'forcegp[xacro]'; or expand it elsewhere."
@@ -33,7 +33,9 @@ def read_robot_file(path: str | Path) -> str:
     try:
         return xacro.process_file(str(path)).toxml()
     except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
-        raise MalformedUrdf(f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it.") from None
+        raise MalformedUrdf(
+            f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it."
+        ) from None
 
 
 def armature_path(path: str | Path) -> Path:
@@ -71,8 +73,13 @@ def with_comment(text: str, armature: Mapping[str, float], *, source: str, stack
     return f"{text[:end]}{ROOM}{listed} -->\n{text[end:]}"
 
 
+def armature_text(armature: Mapping[str, float]) -> str:
+    """What stands in `arm.armature.json`."""
+    return json.dumps(dict(armature), indent=1) + "\n"
+
+
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:
     """Write URDF text, and rotor inertias beside it where there are some or an older file has others."""
     if any(armature.values()) or armature_path(path).exists():
-        write_json(armature_path(path), dict(armature))
+        write_bytes(armature_path(path), armature_text(armature).encode("utf-8"))
     write_text(text, path)

@@ -48,7 +48,7 @@ class LinkInertia:
 
 @dataclass(frozen=True)
 class Link:
-    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world), or mimics one."""
+    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world)."""
 
     name: str
     joint: str | None
@@ -178,7 +178,7 @@ class RobotStructure(Summary):
         return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
 
     def body_inertias(self, inertials: Inertials) -> Float[Tensor, "bodies 4 4 *batch"]:
-        """Merged pseudo-inertias (bodies, ...) of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
+        """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
         return merged_inertias(self.tree, self.layout, self.checked_inertials(inertials))
 
     def checked_inertials(self, inertials: Inertials) -> dict[str, Tensor]:

@@ -166,7 +166,7 @@ class UnrolledKinematics:
         """Joint forces (nv,) that hold the robot still."""
         return self._joint_forces([0.0] * len(self.unrolled.joints), None, inertias)
 
-    def _of_bodies(self, values: Sequence[Any]) -> Sequence[Any]:
+    def _of_bodies(self, values: Sequence[Any] | Scalars) -> Any:
         """Velocities or accelerations of the joints of all bodies."""
         if not self.unrolled.coupled:
             return values

@@ -104,7 +104,7 @@ def parse_urdf(
     ``root`` names a link that is there although the file does not define it.
     """
     collecting = Problems(source) if problems is None else problems
-    element = _parse_xml(text, source)
+    element = parse_xml(text, source)
     if element.tag != "robot":
         raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; give a URDF file.")
     _refuse_xacro(element, source)
@@ -184,7 +184,8 @@ class _Place:
         return f"{self.source}: {self.owner}"
 
 
-def _parse_xml(text: str, source: str) -> Element:
+def parse_xml(text: str, source: str) -> Element:
+    """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
     text = text.lstrip()  # as other readers do: nothing may stand before an XML declaration
     if text.count("<") > MOST_ELEMENTS:
         raise MalformedUrdf(f"{source}: holds more than {MOST_ELEMENTS} tags; give the URDF file of one robot.")

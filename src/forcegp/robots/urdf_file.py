@@ -37,8 +37,8 @@ def read_text(path: str | Path) -> str:
     try:
         if path.is_file() and path.stat().st_size > LARGEST_FILE:
             raise UnreadableRobotFile(
-                f"{path}: holds {path.stat().st_size >> 20} MiB, more than the {LARGEST_FILE >> 20} MiB that a robot file "
-                "may have; give the URDF file of one robot."
+                f"{path}: holds {path.stat().st_size >> 20} MiB, more than the {LARGEST_FILE >> 20} MiB that a robot "
+                "file may have; give the URDF file of one robot."
             )
         data = path.read_bytes()
     except FileNotFoundError:
