@@ -100,6 +100,7 @@ def test_a_negative_mass_is_not_mended():
 
 
 def test_another_choice_is_refused():
-    description, problems = parse_urdf(BROKEN, source="here"), Problems("here")
+    problems = Problems("here")
+    description = parse_urdf(BROKEN, problems)
     with pytest.raises(InvalidInput, match="strict, nearest"):
         with_chosen_inertias("closest", BROKEN, description, lay_out(description, {}, problems), problems)

@@ -90,7 +90,7 @@ WRONG = {
     "mimic of none": (
         changed("<axis", '<mimic joint="other" multiplier="2"/><axis'),
         errors.RobotModelError,  # and nothing moves
-        ["joint 'hinge' mimics 'other'", "does not define", "no movable joint"],
+        ["joint 'hinge' mimics 'other'", "which the file lacks", "no movable joint"],
     ),
     "mimic of nothing": (changed("<axis", "<mimic/><axis"), errors.MissingElement, ["joint 'hinge'", "'joint'"]),
     "NaN multiplier": (

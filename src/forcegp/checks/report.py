@@ -34,7 +34,7 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
     moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
     heavy = [link for link in moving if link.mass > 0.0]
     reach = _reach(robot)
-    children = {joint.child for joint in robot.joints}
+    children = {joint.child for joint in robot.layout.bodies}
     alone = [link.name for link in moving if link.mass == 0.0 and link.name in children]
     if alone:
         yield look(

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from forcegp.errors import KinematicLoop, UnsupportedJoint
+from forcegp.errors import UnsupportedJoint
 from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import FREE, JointDescription, RobotDescription
 
@@ -40,7 +40,7 @@ def followed(
         while at.mimics is not None and at.name not in locked:
             above = by_name.get(at.mimics.joint)
             if above is None or above.name in passed or above.type in FREE:
-                problems.errors.append(_objection(description.source, joint, at, above))
+                problems.errors.append(_objection(description.source, joint, at, above is not None))
                 multiplier, offset = 0.0, 0.0
                 break
             offset += multiplier * at.mimics.offset
@@ -56,18 +56,12 @@ def followed(
     return held, drives
 
 
-def _objection(
-    source: str, joint: JointDescription, at: JointDescription, above: JointDescription | None
-) -> UnsupportedJoint | KinematicLoop:
-    assert at.mimics is not None
-    remedy = {"locked": {joint.name: 0.0}}
-    seen = f"{source}: joint {joint.name!r} mimics {at.mimics.joint!r}"
-    if above is None:
-        advice = ", which the file does not define; correct the name in <mimic>, or lock the joint."
-        return UnsupportedJoint(seen, advice, remedy)
-    if above.type in FREE:
-        return UnsupportedJoint(seen, ", which has several degrees of freedom; lock the joint.", remedy)
-    return KinematicLoop(seen, ", which mimics it in turn; remove one <mimic>, or lock the joint.", remedy)
+def _objection(source: str, joint: JointDescription, at: JointDescription, found: bool) -> UnsupportedJoint:
+    """Why a joint cannot be followed to one with a coordinate: at the last one passed."""
+    assert joint.mimics is not None and at.mimics is not None
+    seen = f"{source}: joint {joint.name!r} mimics {(joint if found else at).mimics.joint!r}"
+    why = ", and so at last itself, or a joint of several degrees of freedom" if found else ", which the file lacks"
+    return UnsupportedJoint(seen, f"{why}; correct its <mimic>, or lock the joint.", {"locked": {joint.name: 0.0}})
 
 
 def with_followers(

@@ -62,53 +62,46 @@ class Problems:
             warnings.warn(f"{self.source}: {text}.", RobotFileWarning, stacklevel=stacklevel)
 
     def raise_all(self) -> None:
-        """Raise what was collected as one error.
-
-        Its class is theirs where they are alike, else RobotModelError.
-        """
+        """Raise what was collected as one error: of their class where they are alike, else a RobotModelError."""
         if not self.errors:
             return
-        remedy: dict[str, Any] = {}
-        for error in self.errors:
-            for name, value in error.remedy.items():
-                remedy[name] = {**remedy.get(name, {}), **value} if isinstance(value, Mapping) else value
-        by_hand = [error for error in self.errors if not error.remedy]
-        alike = len({type(error) for error in self.errors}) == 1
-        kind = type(self.errors[0]) if alike else RobotModelError
-        texts = self._texts()
-        head = f"{self.source}: {len(self.errors)} problems: " if len(self.errors) > 1 else f"{self.source}: "
-        text = head + " ".join(texts)
-        if by_hand and remedy:
-            text += " Where no argument helps, correct the file first."
+        kinds, many = {type(error) for error in self.errors}, len(self.errors) > 1
+        by_hand, remedy = not all(error.remedy for error in self.errors), self._remedy()
+        text = f"{self.source}: {f'{len(self.errors)} problems: ' if many else ''}{' '.join(self._texts())}"
         if remedy:
-            for name, value in self.given.items():
-                remedy[name] = (
-                    {**value, **remedy.get(name, {})} if isinstance(value, Mapping) else remedy.get(name, value)
-                )
-            text += f" The remedy for {'it' if len(self.errors) == 1 else 'the others' if by_hand else 'all'}: "
-            text += remedy_text(remedy)
-        found = kind(text, "", {} if by_hand else remedy)
+            which = "the others, when the file is corrected" if by_hand else "all" if many else "it"
+            text += f" The remedy for {which}: {remedy_text(remedy)}"
+        found = (kinds.pop() if len(kinds) == 1 else RobotModelError)(text, "", {} if by_hand else remedy)
         found.problems = tuple(str(error) for error in self.errors)
         raise found from None
+
+    def _remedy(self) -> dict[str, Any]:
+        """The arguments that mend what has a remedy, with those that were given."""
+        remedy: dict[str, Any] = {}
+        for arguments in (error.remedy for error in self.errors):
+            for name, value in arguments.items():
+                remedy[name] = {**remedy.get(name, {}), **value} if isinstance(value, Mapping) else value
+        for name, value in self.given.items() if remedy else ():
+            remedy[name] = {**value, **remedy.get(name, {})} if isinstance(value, Mapping) else remedy.get(name, value)
+        return remedy
 
     def _texts(self) -> list[str]:
         """What was seen, with what to do once for all that are alike."""
         groups: dict[str, list[str]] = {}
         for error in self.errors:
             groups.setdefault(error.advice, []).append(error.seen.removeprefix(f"{self.source}: "))
-        texts = []
-        for advice, seen in groups.items():
-            more = f"; and {len(seen) - LISTED} more like these" if len(seen) > LISTED else ""
-            texts.append("; ".join(seen[:LISTED]) + more + advice)
-        return texts
+        more = "; and {} more like these".format
+        return [
+            "; ".join(seen[:LISTED]) + (more(len(seen) - LISTED) if len(seen) > LISTED else "") + advice
+            for advice, seen in groups.items()
+        ]
 
 
 def remedy_text(remedy: Mapping[str, Any]) -> str:
     """The arguments in Python and on the command line: `inertias='nearest', or --inertias nearest.`"""
-    python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
     words = []
     for name, value in remedy.items():
-        flag = "--lock" if name == "locked" else f"--{name}"
         listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
-        words.append(f"{flag} {shlex.quote(listed)}")
+        words.append(f"--{'lock' if name == 'locked' else name} {shlex.quote(listed)}")
+    python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
     return f"Robot.from_urdf(path, {python}), or {' '.join(words)}."

@@ -78,9 +78,17 @@ class Robot(RobotStructure):
         that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``). Raises
         :class:`~forcegp.errors.MissingExtra` for a .xacro file without the package xacro.
         """
-        text = read_robot_file(path)
-        armature = read_armature(path) if armature is None else armature
-        return cls._read(text, str(path), gravity, armature, locked, inertias, base, root, strict)
+        return cls.from_urdf_text(
+            read_robot_file(path),
+            source=str(path),
+            gravity=gravity,
+            armature=read_armature(path) if armature is None else armature,
+            locked=locked,
+            inertias=inertias,
+            base=base,
+            root=root,
+            strict=strict,
+        )
 
     @classmethod
     @usable_arguments("Robot.from_urdf_text")
@@ -95,51 +103,18 @@ class Robot(RobotStructure):
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
         root: str | None = None,
-        strict: bool = False,
+        strict: bool | None = False,
     ) -> "Robot":
-        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
-        return cls._read(text, source, gravity, armature, locked, inertias, base, root, strict)
+        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it.
 
-    @classmethod
-    def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
-        """The robot that :meth:`to_stored` gave. What its URDF text was warned of before is not warned of again."""
-        given = (stored["gravity"], stored["armature"], stored["locked"])
-        return cls._read(
-            stored["urdf"], "stored URDF", *given, "strict", stored.get("base", "fixed"), None, strict=False, quiet=True
-        )
-
-    def to_stored(self) -> dict[str, Any]:
-        """The robot as plain JSON values."""
-        return {
-            "urdf": self.urdf_text,
-            "gravity": self.gravity.tolist(),
-            "armature": self.armature.tolist(),
-            "locked": self.locked,
-            "base": self.base,
-        }
-
-    @classmethod
-    def _read(
-        cls,
-        text: str,
-        source: str,
-        gravity: Vector,
-        armature: Vector | Mapping[str, float | int] | None,
-        locked: Mapping[str, float | int] | None,
-        inertias: InertiaChoice,
-        base: BaseChoice | None,
-        root: str | None,
-        strict: bool,
-        *,
-        quiet: bool = False,
-    ) -> "Robot":
+        ``strict`` of None warns of nothing: for text that was warned of before.
+        """
         check_choice(base)
         locked = locked_positions(locked or {})
         given = {"locked": locked, "inertias": inertias if inertias != "strict" else None, "base": base, "root": root}
-        problems = Problems(source, {name: value for name, value in given.items() if value}, strict=strict)
-        text = text.lstrip()
-        description = parse_urdf(text, source=source, problems=problems, root=root)
-        text = text if root is None else with_root(text, root)
+        problems = Problems(source, {name: value for name, value in given.items() if value}, strict=bool(strict))
+        text = text.lstrip() if root is None else with_root(text.lstrip(), root)
+        description = parse_urdf(text, problems)
         if not description.complete:  # nothing can be said of a tree that lacks joints
             problems.raise_all()
         with problems.collected():
@@ -153,18 +128,25 @@ class Robot(RobotStructure):
             without = check_bodies(description, layout, tree, problems)
             if without and not robot._resists():
                 problems.errors += without
-            elif without:
-                what = (
-                    "links without inertia about the axis of their joint: where all that they carry lies on it, too, "
-                )
-                for error in without:
-                    problems.note(f"{what}forward dynamics is refused", error.seen.partition("link ")[2].split()[0])
             problems.offer_no_lock_of(names)
             check_base(description, layout.standing, base, problems)
         problems.raise_all()
-        if not quiet:
-            problems.warn(stacklevel=5)
+        if strict is not None:
+            problems.warn(stacklevel=4)
         return robot
+
+    @classmethod
+    def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
+        """The robot that :meth:`to_stored` gave."""
+        given = {name: stored[name] for name in ("gravity", "armature", "locked")} | {
+            "base": stored.get("base", "fixed")
+        }
+        return cls.from_urdf_text(stored["urdf"], source="stored URDF", strict=None, **given)
+
+    def to_stored(self) -> dict[str, Any]:
+        """The robot as plain JSON values."""
+        numbers = {"gravity": self.gravity.tolist(), "armature": self.armature.tolist(), "locked": self.locked}
+        return {"urdf": self.urdf_text, **numbers, "base": self.base}
 
     def _resists(self) -> bool:
         """Whether the mass matrix is positive definite at a position without symmetry."""
@@ -206,9 +188,8 @@ class Robot(RobotStructure):
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
         armature = self.armature if armature is None else armature
-        robot = Robot._read(
-            text, self.source, self.gravity, armature, self.locked, "strict", self.base, None, strict=False, quiet=True
-        )
+        given = {"gravity": self.gravity, "armature": armature, "locked": self.locked, "base": self.base}
+        robot = Robot.from_urdf_text(text, source=self.source, strict=None, **given)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def to_urdf(self, path: str | Path | None = None) -> str:

@@ -9,11 +9,11 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
-from forcegp.atomic_files import write_bytes
+from forcegp.atomic_files import write_json
 from forcegp.errors import InvalidNumber, MalformedUrdf, MissingExtra, RobotFileWarning
 from forcegp.robots.urdf_file import read_text, write_text
 
-ROOM = "<!-- rotor inertias of forcegp (armature, kg m^2 or kg), which URDF has no element for: "
+COMMENT = "<!-- rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json -->\n"
 
 
 def read_robot_file(path: str | Path) -> str:
@@ -56,30 +56,22 @@ def read_armature(path: str | Path) -> dict[str, float] | None:
 
 
 def with_comment(text: str, armature: Mapping[str, float], *, source: str, stacklevel: int) -> str:
-    """The URDF text with a comment about rotor inertias that are not zero, and a RobotFileWarning that says so."""
+    """The URDF text with a comment where some rotor inertia is not zero, and a RobotFileWarning that says which."""
     present = {joint: value for joint, value in armature.items() if value}
-    before, comment, after = text.partition(ROOM)
-    text = before + after.partition("-->")[2].removeprefix("\n") if comment else text
     if not present:
         return text
     warnings.warn(
-        f"{source}: URDF has no element for rotor inertias ({', '.join(present)}): they stand in a comment, and in a "
-        f"file beside it that Robot.from_urdf reads back. Other programs need them as `armature`.",
+        f"{source}: URDF has no element for rotor inertias ({', '.join(present)}): they go into a file beside it "
+        "(.armature.json), which Robot.from_urdf reads back; tell other programs.",
         RobotFileWarning,
         stacklevel=stacklevel,
     )
     end = text.rindex("</robot")
-    listed = ", ".join(f"{joint} {value!r}" for joint, value in present.items()).replace("--", "- -")
-    return f"{text[:end]}{ROOM}{listed} -->\n{text[end:]}"
-
-
-def armature_text(armature: Mapping[str, float]) -> str:
-    """What stands in `arm.armature.json`."""
-    return json.dumps(dict(armature), indent=1) + "\n"
+    return text if COMMENT in text else f"{text[:end]}{COMMENT}{text[end:]}"
 
 
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:
     """Write URDF text, and rotor inertias beside it where there are some or an older file has others."""
     if any(armature.values()) or armature_path(path).exists():
-        write_bytes(armature_path(path), armature_text(armature).encode("utf-8"))
+        write_json(armature_path(path), dict(armature))
     write_text(text, path)

@@ -18,7 +18,6 @@ from defusedxml import ElementTree as SafeElementTree
 from forcegp.errors import (
     DanglingJoint,
     DuplicateName,
-    InvalidInput,
     InvalidNumber,
     MalformedUrdf,
     MissingElement,
@@ -36,6 +35,7 @@ MOST_ELEMENTS = 500_000
 MOVABLE = ("revolute", "continuous", "prismatic")
 FREE = ("floating", "planar")
 """Joints of several degrees of freedom."""
+ENDS = ("parent", "child")
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
 
@@ -95,81 +95,52 @@ class RobotDescription:
     """Whether every joint of the file could be read."""
 
 
-def parse_urdf(
-    text: str, *, source: str, problems: Problems | None = None, root: str | None = None
-) -> RobotDescription:
-    """Parse URDF text. ``source``, for example a path, is what the error messages call the file.
-
-    ``problems`` collects what is wrong with links and joints, which are then left out; without it they are raised.
-    ``root`` names a link that is there although the file does not define it.
-    """
-    collecting = Problems(source) if problems is None else problems
-    element = parse_xml(text, source)
+def parse_urdf(text: str, problems: Problems) -> RobotDescription:
+    """Parse URDF text. ``problems`` collects what is wrong with links and joints, which are then left out."""
+    source, element = problems.source, parse_xml(text, problems.source)
     if element.tag != "robot":
         raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; give a URDF file.")
     _refuse_xacro(element, source)
-    name = (element.get("name") or "").strip()
-    if not name:
-        name = "robot"
-        collecting.ignore("a <robot> without a name is called 'robot'", "<robot>", "no name")
-    links: dict[str, InertialDescription | None] = {}
-    named, parts = (_named(element, kind, collecting) for kind in ("link", "joint"))
-    collecting.raise_all()  # what hangs on what cannot be said without names
-    for link, part in named:
-        links[link] = None
-        with collecting.collected(link):
-            links[link] = _inertial(part, _Place(f"link {link!r}", source, collecting))
+    name = (element.get("name") or "").strip() or "robot"
+    if "name" not in element.attrib:
+        problems.ignore("a <robot> without a name is called 'robot'", "<robot>", "no name")
+    named, parts = (_named(element, kind, problems) for kind in ("link", "joint"))
+    problems.raise_all()  # nothing can be said of what has no name
+    links: dict[str, InertialDescription | None] = dict.fromkeys(named)
+    for link, part in named.items():
+        with problems.collected(link):
+            links[link] = _inertial(part, _Place(f"link {link!r}", source, problems))
     if not links:
         raise MalformedUrdf(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
-    if root is not None and root in links:
-        raise InvalidInput(f"{source}: the file defines the link {root!r}; leave root out.")
+    root = _undefined_root(element, set(links))
     if root is not None:
         links = {root: None} | links
-    else:
-        links = _undefined_root(parts, links, collecting) | links
+        seen = f"{source}: the link {root!r} is a parent, and the file does not define it"
+        problems.errors.append(DanglingJoint(seen, ". It can be the root, fixed in the world.", {"root": root}))
     joints = []
-    for joint, part in parts:
-        with collecting.collected():
-            joints.append(_joint(part, joint, links, _Place(f"joint {joint!r}", source, collecting)))
-    if problems is None:
-        collecting.raise_all()
+    for joint, part in parts.items():
+        with problems.collected():
+            joints.append(_joint(part, joint, links, _Place(f"joint {joint!r}", source, problems)))
     return RobotDescription(name, source, links, tuple(joints), len(joints) == len(parts))
 
 
-def _named(root: Element, kind: str, problems: Problems) -> list[tuple[str, Element]]:
+def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
     found: dict[str, Element] = {}
     for element in root.findall(kind):
         with problems.collected():
             name = _name(element, kind, problems.source)
             if name in found:
-                raise DuplicateName(
-                    f"{problems.source}: two {kind}s are called {name!r}", f"; {kind} names must be unique, rename one."
-                )
+                seen = f"{problems.source}: two {kind}s are called {name!r}"
+                raise DuplicateName(seen, f"; {kind} names must be unique, rename one.")
             found[name] = element
-    return list(found.items())
+    return found
 
 
-def _undefined_root(
-    joints: list[tuple[str, Element]], links: dict[str, InertialDescription | None], problems: Problems
-) -> dict[str, InertialDescription | None]:
-    """A parent that the file does not define, if everything else hangs on it: a report, and the link as if it did."""
-    ends = [
-        [found.get("link") for found in (part.find("parent"), part.find("child")) if found is not None]
-        for _, part in joints
-    ]
-    parents, children = ({pair[k] for pair in ends if len(pair) == 2} for k in (0, 1))
-    undefined = (parents | children) - set(links)
-    missing = next(iter(undefined), None)
-    if missing is None or len(undefined) > 1 or missing in children or set(links) - children:
-        return {}
-    problems.errors.append(
-        DanglingJoint(
-            f"{problems.source}: the link {missing!r} is a parent, and the file does not define it",
-            ". It can be the root, fixed in the world.",
-            {"root": missing},
-        )
-    )
-    return {missing: None}
+def _undefined_root(element: Element, links: set[str]) -> str | None:
+    """The one parent that the file does not define, if everything hangs on it."""
+    parents, children = ({part.get("link", "") for part in element.iterfind(f"joint/{end}")} for end in ENDS)
+    undefined = (parents | children) - links
+    return None if len(undefined) != 1 or undefined & children or links - children else undefined.pop()
 
 
 @dataclass(frozen=True)
@@ -186,20 +157,13 @@ class _Place:
 
 def parse_xml(text: str, source: str) -> Element:
     """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
-    text = text.lstrip()  # as other readers do: nothing may stand before an XML declaration
+    text = _with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
     if text.count("<") > MOST_ELEMENTS:
         raise MalformedUrdf(f"{source}: holds more than {MOST_ELEMENTS} tags; give the URDF file of one robot.")
     if not text:
         raise MalformedUrdf(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
     try:
-        try:
-            return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
-        except ParseError as error:
-            if "unbound prefix" not in str(error):
-                raise
-        return SafeElementTree.fromstring(
-            _with_prefixes(text), forbid_dtd=True, forbid_entities=True, forbid_external=True
-        )
+        return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
     except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
         raise UnsafeXml(
             f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
@@ -212,22 +176,16 @@ def parse_xml(text: str, source: str) -> Element:
 def _with_prefixes(text: str) -> str:
     """The text with declarations for prefixes such as ``drake:``, which readers of URDF do not ask for."""
     used = set(re.findall(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]", text)) - {"xml", "xmlns"}
-    missing = sorted(prefix for prefix in used if f"xmlns:{prefix}" not in text)
-    declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in missing)
+    declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(used) if f"xmlns:{prefix}" not in text)
     return re.sub(r"<robot(?=[\s>])", f"<robot{declared}", text, count=1)
 
 
 def _refuse_xacro(root: Element, source: str) -> None:
     """Macros, and expressions in what is read; those inside of <gazebo>, <sensor> or <visual> change no dynamics."""
-    read = [part for owner in root if owner.tag in ("link", "joint") for part in owner if part.tag in MECHANICS]
     owners = [owner for owner in root if owner.tag in ("link", "joint")]
-    expressions = [
-        element
-        for element in (*owners, *(inner for part in read for inner in part.iter()))
-        if any(mark in value for value in element.attrib.values() for mark in ("${", "$("))
-    ]
+    read = [*owners, *(inner for owner in owners for part in owner if part.tag in MECHANICS for inner in part.iter())]
     macros = [element for owner in (root, *owners) for element in owner if "xacro}" in element.tag]
-    for element in (*macros, *expressions):
+    for element in (*macros, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
         raise UnexpandedXacro(
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
             "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
@@ -349,7 +307,7 @@ def _joint(
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise UnsupportedJoint(f"{place} has the unknown type {kind!r}; allowed: {', '.join(MOVABLE)}, fixed.{hint}")
     ends = {}
-    for end in ("parent", "child"):
+    for end in ENDS:
         ends[end] = _attribute(_child(element, end, place), "link", place)
         if ends[end] not in links:
             close = difflib.get_close_matches(ends[end], links, n=1)

@@ -250,7 +250,7 @@ def with_chosen_inertias(
             f"link {name!r}: {objection}; changed by {relative:.2g} %",
         )
     if changed:
-        return text, parse_urdf(text, source=source, problems=Problems(source))
+        return text, parse_urdf(text, Problems(source))
     return text, replace(description, links=links)
 
 
