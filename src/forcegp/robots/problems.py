@@ -98,7 +98,7 @@ class Problems:
 
 
 def remedy_text(remedy: Mapping[str, Any]) -> str:
-    """The arguments in Python and on the command line: `inertias='nearest', or --inertias nearest.`"""
+    """The arguments in Python, and the options of the command line that they are."""
     words = []
     for name, value in remedy.items():
         listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
