@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN
 
 from forcegp import errors
+from forcegp.analytical.bodies import thickened
 from forcegp.robots import Robot
 
 SMALL = """<robot name="small">
@@ -368,3 +370,28 @@ def test_a_pipe_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.urdf")
     with pytest.raises(errors.UnreadableRobotFile, match=r"pipe\.urdf: is not a regular file"):
         Robot.from_urdf(tmp_path / "pipe.urdf")
+
+
+def test_massless_links_are_taken_where_what_they_carry_resists():
+    """Three joints in one point, as models of people have them, and a tip that nothing resists."""
+    turn = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/></joint>'
+    ball = SMALL.replace('<parent link="base"/>', '<parent link="y"/>').replace(
+        "</robot>",
+        '<link name="x"/><link name="y"/>'
+        + turn.format("first", "base", "x", "1 0 0")
+        + turn.format("second", "x", "y", "0 1 0")
+        + "</robot>",
+    )
+    robot = Robot.from_urdf_text(ball)
+    oracle = Oracle(ball, robot)
+    q, v, tau = np.random.default_rng(3).normal(size=(3, 3))
+    ours = robot.forward_dynamics(*(torch.tensor(x) for x in (q, v, tau)))
+    np.testing.assert_allclose(ours, oracle.forward_dynamics(q, v, tau), rtol=1e-9)
+    locked = torch.tensor([0.0, np.pi / 2, 0.0], dtype=torch.float64)  # the first and the last axis are one
+    assert torch.linalg.eigvalsh(robot.mass_matrix(locked))[0] < 1e-15
+    tip = ball.replace("</robot>", '<link name="tip"/>' + turn.format("spin", "arm", "tip", "0 0 1") + "</robot>")
+    with pytest.raises(errors.MissingInertia, match="link 'tip' moves with joint 'spin'") as caught:
+        Robot.from_urdf_text(tip)
+    assert caught.value.remedy == {"locked": {"spin": 0.0}}
+    with pytest.raises(errors.InvalidInput, match="link 'x' moves with 'first' and has no mass"):
+        thickened(robot)

@@ -153,7 +153,9 @@ def identify_payload(
 
     links, usual = body_pseudo_inertias(robot).cpu().numpy(), _usual(offset)
     bodies = ConsistentBodies(usual[None] if baseline is None else np.concatenate([links, usual[None]]))
-    stated = (links.reshape(-1, 16) @ np.linalg.pinv(standard_basis().numpy()).T)[: len(links) if baseline is None else 0]
+    stated = (links.reshape(-1, 16) @ np.linalg.pinv(standard_basis().numpy()).T)[
+        : len(links) if baseline is None else 0
+    ]
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,9 @@ from forcegp.cli.command import URDF, require_free_file, unless_given
 from forcegp.cli.input_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import RobotFileWarning
+
+NONE = (math.inf, -math.inf)
+"""Limits that there are not; JSON has no number for them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,28 +77,17 @@ class Robot(RobotFileOptions):
 
 def _content(robot: forcegp.Robot) -> dict[str, Any]:
     links = [robot.link(name) for name in robot.link_names]
-    joints = []
-    for joint, armature in zip(robot.joints, robot.armature.tolist(), strict=True):
-        limits = (joint.lower, joint.upper, joint.velocity_limit, joint.effort_limit)
-        lower, upper, velocity, effort = (value if math.isfinite(value) else None for value in limits)
-        joints.append(
-            {
-                **{name: getattr(joint, name) for name in ("name", "type", "parent", "child")},
-                **{"lower": lower, "upper": upper, "velocity": velocity, "effort": effort},
-                **{"damping": joint.damping, "friction": joint.friction, "armature": armature},
-            }
-        )
-    layout = robot.layout
+    joints = [asdict(joint) | {"armature": x} for joint, x in zip(robot.joints, robot.armature.tolist(), strict=True)]
     mimics = {
-        body.name: {"joint": layout.joints[drive.joint].name, "multiplier": drive.multiplier, "offset": drive.offset}
-        for body, drive in zip(layout.bodies, layout.drives, strict=True)
-        if body.name != layout.joints[drive.joint].name
+        body.name: {**drive._asdict(), "joint": robot.joint_names[drive.joint]}
+        for body, drive in zip(robot.layout.bodies, robot.layout.drives, strict=True)
+        if body.name not in robot.joint_names
     }
     return {
         "name": robot.name,
         "base": robot.base,
         "moving_mass": sum(link.mass for link in links if link.joint is not None),
-        "joints": joints,
+        "joints": [{name: None if value in NONE else value for name, value in joint.items()} for joint in joints],
         "mimics": mimics,
         "locked": robot.locked,
         "links": [{"name": link.name, "mass": link.mass, "joint": link.joint} for link in links],
@@ -107,24 +99,20 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     from rich.text import Text
     from rich.tree import Tree
 
-    def line(name: str, joint: Any) -> Text:
+    def line(name: str, moved: str) -> Text:
         mass = robot.link(name).mass
-        text = Text(name, style="bold" if mass else "")
-        text.append(f" {mass:.4g} kg" if mass else "", style="not bold")
-        if joint is not None:
-            mimic = content["mimics"].get(joint.name)
-            how = "locked" if joint.name in robot.locked else joint.type
-            how += f" = {mimic['multiplier']:g} {mimic['joint']} {mimic['offset']:+g}" if mimic else ""
-            text.append(f"  {joint.name} ({how})", style="dim not bold")
-        return text
+        return Text.assemble((name, "bold" if mass else ""), f" {mass:.4g} kg" if mass else "", (moved, "dim"))
 
-    root = robot.layout.standing[0]
-    tree = Tree(line(root, None))
-    branches, left = {root: tree}, list(robot.description.joints)
-    for name in robot.layout.links:  # parents before children
-        for joint in (each for each in left if each.parent == name):
-            branches[joint.child] = branches[name].add(line(joint.child, joint))
-    header = ["joint", "lower", "upper", "velocity", "effort", "damping", "friction", "armature"]
-    rows = [[each["name"], *(shown(each[name]) for name in header[1:])] for each in content["joints"]]
+    places = {name: place for place, name in enumerate(robot.layout.links)}  # parents before children
+    tree = Tree(line(robot.layout.standing[0], ""))
+    branches = {robot.layout.standing[0]: tree}
+    for joint in sorted(robot.description.joints, key=lambda joint: places[joint.child]):
+        mimic = content["mimics"].get(joint.name)
+        how = "locked" if joint.name in robot.locked else joint.type
+        how += "" if mimic is None else " = {multiplier:g} {joint} {offset:+g}".format(**mimic)
+        branches[joint.child] = branches[joint.parent].add(line(joint.child, f"  {joint.name} ({how})"))
+    header = {"lower": "lower", "upper": "upper", "velocity": "velocity_limit", "effort": "effort_limit"}
+    header |= {name: name for name in ("damping", "friction", "armature")}
+    rows = [[each["name"], *(shown(each[key]) for key in header.values())] for each in content["joints"]]
     title = f"{robot.name}: {robot.nv} joints, {content['moving_mass']:.4g} kg that move; in rad or m, s, Nm or N"
-    return [tree, columns(title, header, rows, long_names=True)]
+    return [tree, columns(title, ["joint", *header], rows, long_names=True)]

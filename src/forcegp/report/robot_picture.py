@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -33,32 +32,21 @@ def robot_figure(scene: RecordedScene) -> Figure:
     """The links of a scene at its first row, and the axes of the joints with their names."""
     figure = Figure(figsize=(7.0, 7.0))
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
-    corners = [np.zeros((1, 3))]
-    for place, shape in enumerate(scene.shapes):
-        pose = scene.poses[0, place]
+    ends = [np.zeros((1, 3))]
+    for shape, pose in zip(scene.shapes, scene.poses[0], strict=True):
         vertices = shape.vertices @ pose[:3, :3].T + pose[:3, 3]
         axes.add_collection3d(Poly3DCollection(vertices[shape.faces], facecolors=LINK, shade=True, alpha=0.7))
-        corners.append(vertices)
-    for name, start, end in joint_axes(scene.robot, torch.from_numpy(scene.q[0]), AXIS * scene.size):
-        axes.plot(*np.stack([start, end], axis=1), color=style.PREDICTION, linewidth=1.5)
-        x, y, z = end
-        axes.text(x, y, z, name, size=style.SMALL, color=style.TRUTH)
-    low, high = (np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0))
+        ends.append(vertices)
+    state = scene.robot.kinematics(torch.from_numpy(scene.q[0]))
+    for joint in scene.robot.joints:
+        pose = state.frame_pose(joint.child).numpy()
+        line = pose[:3, 3] + np.outer((0.0, AXIS * scene.size), pose[:3, :3] @ joint.axis)
+        axes.plot(*line.T, color=style.PREDICTION, linewidth=1.5)
+        x, y, z = line[1]
+        axes.text(x, y, z, joint.name, size=style.SMALL, color=style.TRUTH)
+    low, high = np.concatenate(ends).min(axis=0), np.concatenate(ends).max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
     axes.set(**{f"{x}lim": (m - half, m + half) for x, m in zip("xyz", middle, strict=True)})
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=scene.robot.name)
-    axes.set_box_aspect((1.0, 1.0, 1.0))
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=scene.robot.name, box_aspect=(1.0, 1.0, 1.0))
     style.FigureCanvasAgg(figure)
     return figure
-
-
-def joint_axes(
-    robot: Robot, q: Float[torch.Tensor, "nv"], length: float
-) -> list[tuple[str, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
-    """Name, origin and end of the axis of every joint in the world, in m."""
-    state, found = robot.kinematics(q), []
-    for joint in robot.joints:
-        pose = state.frame_pose(joint.child).numpy()
-        start = pose[:3, 3]
-        found.append((joint.name, start, start + length * pose[:3, :3] @ np.array(joint.axis)))
-    return found

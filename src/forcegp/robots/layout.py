@@ -10,7 +10,7 @@ positions of the bodies' joints are ``G q + g`` with q those of the ``nv`` other
 identity and body i is that of joint i.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -211,39 +211,38 @@ def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
     return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
 
 
-def check_bodies(
-    description: RobotDescription, layout: Layout, tree: "Tree", problems: Problems
-) -> list[NonPhysicalInertia]:
-    """Every body must resist its joint, by itself or by its armature.
+def bodies_without_inertia(
+    description: RobotDescription, layout: Layout, tree: "Tree", broken: Set[str]
+) -> list[tuple[int, RobotModelError]]:
+    """Bodies that resist their joint neither by themselves nor by armature, as coordinate and error.
 
     A body resists a prismatic joint by its mass and any other joint by its inertia about the axis. Where all bodies do,
     the mass matrix is positive definite at every position: the moving joint nearest to the base moves its body by
-    itself alone. ``problems`` collects bodies without mass; those with none about their axis are returned, since what
-    they carry may resist. Links fixed in the world need no inertia.
+    itself alone. Where one does not, what it carries may. Links fixed in the world need no inertia; nothing is said of
+    bodies with ``broken`` links.
     """
     pseudo, found = tree.inertias[..., 0].numpy(), []
     carried: list[list[str]] = [[] for _ in layout.bodies]
     for name, placement in layout.links.items():
         if placement.body != WORLD and name != layout.bodies[placement.body].child:
             carried[placement.body].append(name)
-    for body, joint in enumerate(layout.bodies):
-        if not problems.broken.isdisjoint((joint.child, *carried[body])):
+    for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
+        own = layout.joints[drive.joint].name == joint.name and float(tree.armature[drive.joint]) > 0.0
+        if own or not broken.isdisjoint((joint.child, *carried[body])):
             continue
         others = f" and the links fixed to it ({', '.join(map(repr, carried[body]))})" if carried[body] else ""
         link, remedy = f"{description.source}: link {joint.child!r}{others}", {"locked": {joint.name: 0.0}}
-        own = layout.drives[body].joint
-        armature = float(tree.armature[own]) if layout.joints[own].name == joint.name else 0.0
         if pseudo[body, 3, 3] == 0.0:
-            seen = f"{link} moves with joint {joint.name!r} but has no mass"
+            seen = f"{link} moves with joint {joint.name!r} but has no mass, and nor has what it carries"
             advice = "; add an <inertial> element, make the joint fixed, or lock it."
-            problems.errors.append(MissingInertia(seen, advice, remedy))
-        elif joint.type != "prismatic" and armature == 0.0 and axis_inertia_vanishes(pseudo[body]):
+            found.append((drive.joint, MissingInertia(seen, advice, remedy)))
+        elif joint.type != "prismatic" and axis_inertia_vanishes(pseudo[body]):
             seen = f"{link} turns with joint {joint.name!r} but has no rotational inertia about its axis"
             advice = (
                 ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "
                 "inertia of its rotor (`armature`, in kg m^2), or lock it."
             )
-            found.append(NonPhysicalInertia(seen, advice, remedy))
+            found.append((drive.joint, NonPhysicalInertia(seen, advice, remedy)))
     return found
 
 

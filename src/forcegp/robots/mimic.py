@@ -58,8 +58,8 @@ def followed(
 
 def _objection(source: str, joint: JointDescription, at: JointDescription, found: bool) -> UnsupportedJoint:
     """Why a joint cannot be followed to one with a coordinate: at the last one passed."""
-    assert joint.mimics is not None and at.mimics is not None
-    seen = f"{source}: joint {joint.name!r} mimics {(joint if found else at).mimics.joint!r}"
+    last = (joint if found else at).mimics
+    seen = f"{source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
     why = ", and so at last itself, or a joint of several degrees of freedom" if found else ", which the file lacks"
     return UnsupportedJoint(seen, f"{why}; correct its <mimic>, or lock the joint.", {"locked": {joint.name: 0.0}})
 

@@ -23,7 +23,7 @@ from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import check_bodies, compile_tree, lay_out
+from forcegp.robots.layout import bodies_without_inertia, compile_tree, lay_out
 from forcegp.robots.problems import Problems
 from forcegp.robots.robot_file import read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
@@ -125,9 +125,9 @@ class Robot(RobotStructure):
             tree = compile_tree(description, layout, finite_vector("gravity", gravity, 3), rotor_inertias)
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
             robot = cls(description, layout, tree, text, tuple(locked.items()), frames, base or "fixed")
-            without = check_bodies(description, layout, tree, problems)
-            if without and not robot._resists():
-                problems.errors += without
+            without = bodies_without_inertia(description, layout, tree, problems.broken)
+            limp = robot._limp() if without and not problems.broken else range(robot.nv)
+            problems.errors += [error for coordinate, error in without if coordinate in limp]
             problems.offer_no_lock_of(names)
             check_base(description, layout.standing, base, problems)
         problems.raise_all()
@@ -148,12 +148,12 @@ class Robot(RobotStructure):
         numbers = {"gravity": self.gravity.tolist(), "armature": self.armature.tolist(), "locked": self.locked}
         return {"urdf": self.urdf_text, **numbers, "base": self.base}
 
-    def _resists(self) -> bool:
-        """Whether the mass matrix is positive definite at a position without symmetry."""
-        q = torch.linspace(0.3, 1.1, self.nv, dtype=torch.float64).sin()
-        M = self.mass_matrix(q)
+    def _limp(self) -> set[int]:
+        """Coordinates that nothing resists at a position without symmetry."""
+        M = self.mass_matrix(torch.linspace(0.3, 1.1, self.nv, dtype=torch.float64).sin())
         scale = M.diagonal().clamp(min=1e-300).rsqrt()
-        return bool(torch.linalg.eigvalsh(scale[:, None] * M * scale)[0] > SINGULAR)
+        values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
+        return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
     def with_inertials(self, inertials: Inertials) -> "Robot":
         """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
