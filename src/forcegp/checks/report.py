@@ -64,7 +64,7 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
 
 def _reach(robot: Robot) -> float:
     """Sum of the distances between joints, plus the largest distance of a centre of mass from its joint [m]."""
-    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.joints)
+    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
     centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
     return origins + max(centers, default=0.0) if origins > 0.0 else 0.0
 

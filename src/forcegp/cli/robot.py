@@ -103,10 +103,9 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
         mass = robot.link(name).mass
         return Text.assemble((name, "bold" if mass else ""), f" {mass:.4g} kg" if mass else "", (moved, "dim"))
 
-    places = {name: place for place, name in enumerate(robot.layout.links)}  # parents before children
     tree = Tree(line(robot.layout.standing[0], ""))
     branches = {robot.layout.standing[0]: tree}
-    for joint in sorted(robot.description.joints, key=lambda joint: places[joint.child]):
+    for joint in robot.all_joints:
         mimic = content["mimics"].get(joint.name)
         how = "locked" if joint.name in robot.locked else joint.type
         how += "" if mimic is None else " = {multiplier:g} {joint} {offset:+g}".format(**mimic)

@@ -77,25 +77,12 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
 def reach(robot: Robot) -> float:
     """The length of the robot in m: the farthest that a chain of joints stretches."""
     lengths: dict[str, float] = {}
-    for joint in _joints_from_base(robot):
+    for joint in robot.all_joints:
         step = float(np.linalg.norm(joint.origin[:3, 3]))
         lengths[joint.child] = lengths.get(joint.parent, 0.0) + step
     longest = max(lengths.values(), default=0.0)
     centers = [np.linalg.norm(robot.link(name).center_of_mass) for name in robot.link_names]
     return max(longest, float(max(centers, default=0.0)), 0.1)
-
-
-def _joints_from_base(robot: Robot) -> list[Any]:
-    """The joints of the file, parents before children."""
-    left, known, ordered = list(robot.description.joints), set(), []
-    children = {joint.child for joint in left}
-    known |= {name for name in robot.link_names if name not in children}
-    while left:
-        ready = [joint for joint in left if joint.parent in known]
-        ordered += ready
-        known |= {joint.child for joint in ready}
-        left = [joint for joint in left if joint not in ready]
-    return ordered
 
 
 def _visual(element: Element, urdf: Path | None, doubts: list[str]) -> Any:

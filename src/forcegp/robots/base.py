@@ -22,13 +22,14 @@ BaseChoice = Literal["fixed"]
 """How the root link is held: "fixed" in the world."""
 
 WORLDS = ("world", "map", "odom", "ground", "universe")
-ENDS = ("foot", "feet", "toe", "leg", "wheel", "ankle", "knee", "thigh", "calf", "propeller", "rotor")
-"""How words end that name limbs to walk, drive or fly with; `base_footprint` is none, and rotors are checked apart."""
-WORDS = ("hip", "lhip", "rhip", "shin", "sole")
-FLIES = ("flying", "drone", "uav", "quadrotor", "copter", "quadcopter", "hexacopter", "multicopter")
-LIMBS = 2
-ROTORS = 3
-"""On the links that stand still; motors of arms have some in other places."""
+WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
+"""Words of a name: FL foot, upper Leg, front left wheel."""
+LIMB = r".*(foot|feet|toe|leg|wheel|ankle|knee|thigh|calf)s?|[lr]?hips?|shin|sole"
+"""To walk or drive with; `base_footprint` is none."""
+ROTOR = r".*(rotor|propeller)s?"
+BODY = r"pelvis|flying|drone|uav|quadrotor|.*copter"
+ENOUGH = {LIMB: 2, ROTOR: 3, BODY: 1}
+"""So many tell. Rotors count on the links that stand still: motors of arms have some in other places."""
 
 
 def check_choice(base: str | None) -> None:
@@ -39,42 +40,36 @@ def check_choice(base: str | None) -> None:
 
 def check_free(joint: JointDescription, at_root: bool, problems: Problems) -> None:
     """Report a joint of several degrees of freedom, unless it holds a root that is taken as fixed."""
+    seen = f"joint {joint.name!r} is of type {joint.type!r}"
     if not at_root:
-        problems.errors.append(
-            UnsupportedJoint(
-                f"{problems.source}: joint {joint.name!r} is of type {joint.type!r}",
-                ", which is supported at the root alone; make it a chain of prismatic and revolute joints with massive "
-                "links between them, or lock it.",
-                {"locked": {joint.name: 0.0}},
-            )
-        )
-    elif problems.given.get("base") is None:
-        problems.errors.append(_question(problems.source, f"joint {joint.name!r} is of type {joint.type!r}"))
+        advice = ", which is supported at the root alone; make it a chain of joints with massive links, or lock it."
+        remedy = {"locked": {joint.name: 0.0}}
+        problems.errors.append(UnsupportedJoint(f"{problems.source}: {seen}", advice, remedy))
+    elif "base" not in problems.given:
+        problems.errors.append(_question(problems.source, seen))
 
 
-def check_base(description: RobotDescription, standing: Sequence[str], base: str | None, problems: Problems) -> None:
+def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
     """Report a robot that nobody said is bolted to the world, unless that was done.
 
     ``standing`` are the links that do not move, the root first.
     """
-    if any(isinstance(error, UnstatedBase) for error in problems.errors):
+    root, still = standing[0], set(standing)
+    mass = sum(inertial.mass for name in standing if (inertial := description.links[name]))
+    asked = "base" in problems.given or any(isinstance(error, UnstatedBase) for error in problems.errors)
+    if asked or not mass > 0.0:
         return
-    root = standing[0]
-    masses = [inertial.mass for name in standing if (inertial := description.links[name])]
-    if base is not None or not sum(masses) > 0.0:
+    holding = {joint.type for joint in description.joints if joint.parent == root}
+    if root.lower() in WORLDS and description.links[root] is None and holding == {"fixed"}:
         return
-    holding = [joint for joint in description.joints if joint.parent == root]
-    if root.lower() in WORLDS and description.links[root] is None and all(j.type == "fixed" for j in holding):
-        return
-    moving = [joint for joint in description.joints if joint.type != "fixed"]
-    rotors = [joint.name for joint in moving if joint.parent in standing and _has(joint, ("propeller", "rotor"))]
-    limbs = [name for name in description.links if _speaks(name, ENDS[:-1], WORDS)]
-    bodies = [name for name in (description.name, *description.links) if _speaks(name, (), (*FLIES, "pelvis"))]
-    for seen, enough in ((limbs, LIMBS), (rotors, ROTORS), (bodies, 1)):
-        if len(seen) >= enough:
-            mass = f"its base {root!r} has {sum(masses):.3g} kg"
-            listed = ", ".join(map(repr, seen[:4]))
-            problems.errors.append(_question(problems.source, f"{mass}, and there is {listed}"))
+    names = {LIMB: list(description.links), BODY: [description.name, *description.links]}
+    turning = [joint for joint in description.joints if joint.type != "fixed" and joint.parent in still]
+    names[ROTOR] = [f"{joint.name} {joint.child}" for joint in turning]
+    for kind, enough in ENOUGH.items():
+        found = [name for name in names[kind] if any(re.fullmatch(kind, x.lower()) for x in re.findall(WORD, name))]
+        if len(found) >= enough:
+            seen = f"its base {root!r} has {mass:.3g} kg, and there is {', '.join(map(repr, found[:4]))}"
+            problems.errors.append(_question(problems.source, seen))
             return
 
 
@@ -84,13 +79,3 @@ def _question(source: str, seen: str) -> UnstatedBase:
         ". base='fixed' takes it as bolted; floating bases are not supported yet.",
         {"base": "fixed"},
     )
-
-
-def _has(joint: JointDescription, ends: tuple[str, ...]) -> bool:
-    return _speaks(joint.name, ends, ()) or _speaks(joint.child, ends, ())
-
-
-def _speaks(name: str, ends: tuple[str, ...], words: tuple[str, ...]) -> bool:
-    """Whether a word of a name is one of these, or ends so: `FL_foot`, `upperLeg`, `front_left_wheel_2`."""
-    found = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
-    return any((word := each.lower()) in words or word.removesuffix("s").endswith(ends) for each in found)

@@ -129,7 +129,7 @@ class Robot(RobotStructure):
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
             problems.offer_no_lock_of(names)
-            check_base(description, layout.standing, base, problems)
+            check_base(description, layout.standing, problems)
         problems.raise_all()
         if strict is not None:
             problems.warn(stacklevel=4)

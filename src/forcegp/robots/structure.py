@@ -14,7 +14,7 @@ from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.base import BaseChoice
 from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
-from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
+from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
@@ -97,6 +97,12 @@ class RobotStructure(Summary):
         """Movable joints in the order of q, without those that mimic one."""
         names = [field.name for field in fields(Joint)]
         return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
+
+    @property
+    def all_joints(self) -> tuple[JointDescription, ...]:
+        """Every joint of the file, fixed ones included, parents before children."""
+        places = {name: place for place, name in enumerate(self.layout.links)}
+        return tuple(sorted(self.description.joints, key=lambda joint: places[joint.child]))
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from forcegp.robots.problems import Problems
 
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
-MOST_ELEMENTS = 500_000
+MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
 MOVABLE = ("revolute", "continuous", "prismatic")
 FREE = ("floating", "planar")
@@ -158,8 +158,8 @@ class _Place:
 def parse_xml(text: str, source: str) -> Element:
     """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
     text = _with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
-    if text.count("<") > MOST_ELEMENTS:
-        raise MalformedUrdf(f"{source}: holds more than {MOST_ELEMENTS} tags; give the URDF file of one robot.")
+    if text.count("<") > MOST_TAGS:
+        raise MalformedUrdf(f"{source}: holds more than {MOST_TAGS} tags; give the URDF file of one robot.")
     if not text:
         raise MalformedUrdf(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
     try:
