@@ -23,7 +23,7 @@ from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import Expression, Graph, node_of
 from forcegp.codegen.library import Purpose, RowFunction, VectorUnit, load_library
 from forcegp.codegen.tracing import trace
-from forcegp.robots.layout import merged_inertias
+from forcegp.robots.tree import merged_inertias
 from forcegp.robots.unrolled import (
     Scalars,
     UnrolledKinematics,

@@ -26,8 +26,9 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.arguments import Inertials, JointValues, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
-from forcegp.robots.layout import WORLD, Tree
+from forcegp.robots.layout import WORLD
 from forcegp.robots.structure import RobotStructure
+from forcegp.robots.tree import Tree
 
 Bodies = Float[Tensor, "n 4 4 batch"]
 """A 4x4 matrix of every body: its pose or its pseudo-inertia."""

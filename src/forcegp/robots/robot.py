@@ -23,10 +23,11 @@ from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import bodies_without_inertia, compile_tree, lay_out
+from forcegp.robots.layout import lay_out
 from forcegp.robots.problems import Problems
 from forcegp.robots.robot_file import read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
+from forcegp.robots.tree import bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import InertiaChoice, replace_inertial, with_chosen_inertias, with_root
 
@@ -187,8 +188,8 @@ class Robot(RobotStructure):
 
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
-        armature = self.armature if armature is None else armature
-        given = {"gravity": self.gravity, "armature": armature, "locked": self.locked, "base": self.base}
+        given: dict[str, Any] = {"gravity": self.gravity, "locked": self.locked, "base": self.base}
+        given["armature"] = self.armature if armature is None else armature
         robot = Robot.from_urdf_text(text, source=self.source, strict=None, **given)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 

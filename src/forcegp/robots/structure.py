@@ -13,7 +13,8 @@ from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink
 from forcegp.robots.arguments import Inertials, checked_tensor
 from forcegp.robots.base import BaseChoice
 from forcegp.robots.inertia import log_cholesky_of_link
-from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
+from forcegp.robots.layout import WORLD, Layout
+from forcegp.robots.tree import Tree, merged_inertias
 from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
 from forcegp.summary import Summary, listed
 

@@ -7,13 +7,10 @@ written back). Problems are collected (:mod:`forcegp.robots.problems`), so that 
 
 import difflib
 import math
-import re
 from dataclasses import dataclass
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
 import numpy as np
-from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
-from defusedxml import ElementTree as SafeElementTree
 
 from forcegp.errors import (
     DanglingJoint,
@@ -21,23 +18,18 @@ from forcegp.errors import (
     InvalidNumber,
     MalformedUrdf,
     MissingElement,
-    UnexpandedXacro,
-    UnsafeXml,
     UnsupportedJoint,
 )
 from forcegp.robots.inertia import rotation_from_rpy, transform
 from forcegp.robots.problems import Problems
+from forcegp.robots.xml_text import parse_xml, refuse_xacro
 
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
-MOST_TAGS = 200_000
-"""A robot file of two hundred joints has some ten thousand."""
 MOVABLE = ("revolute", "continuous", "prismatic")
 FREE = ("floating", "planar")
 """Joints of several degrees of freedom."""
 ENDS = ("parent", "child")
-MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
-"""Parts of a link or joint that are read."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +92,7 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     source, element = problems.source, parse_xml(text, problems.source)
     if element.tag != "robot":
         raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; give a URDF file.")
-    _refuse_xacro(element, source)
+    refuse_xacro(element, source)
     name = (element.get("name") or "").strip() or "robot"
     if "name" not in element.attrib:
         problems.ignore("a <robot> without a name is called 'robot'", "<robot>", "no name")
@@ -153,43 +145,6 @@ class _Place:
 
     def __str__(self) -> str:
         return f"{self.source}: {self.owner}"
-
-
-def parse_xml(text: str, source: str) -> Element:
-    """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
-    text = _with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
-    if text.count("<") > MOST_TAGS:
-        raise MalformedUrdf(f"{source}: holds more than {MOST_TAGS} tags; give the URDF file of one robot.")
-    if not text:
-        raise MalformedUrdf(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
-    try:
-        return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
-    except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
-        raise UnsafeXml(
-            f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
-            "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
-        ) from None
-    except (ParseError, UnicodeError) as error:
-        raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.") from None
-
-
-def _with_prefixes(text: str) -> str:
-    """The text with declarations for prefixes such as ``drake:``, which readers of URDF do not ask for."""
-    used = set(re.findall(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]", text)) - {"xml", "xmlns"}
-    declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(used) if f"xmlns:{prefix}" not in text)
-    return re.sub(r"<robot(?=[\s>])", f"<robot{declared}", text, count=1)
-
-
-def _refuse_xacro(root: Element, source: str) -> None:
-    """Macros, and expressions in what is read; those inside of <gazebo>, <sensor> or <visual> change no dynamics."""
-    owners = [owner for owner in root if owner.tag in ("link", "joint")]
-    read = [*owners, *(inner for owner in owners for part in owner if part.tag in MECHANICS for inner in part.iter())]
-    macros = [element for owner in (root, *owners) for element in owner if "xacro}" in element.tag]
-    for element in (*macros, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
-        raise UnexpandedXacro(
-            f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
-            "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
-        )
 
 
 def _name(element: Element, kind: str, source: str) -> str:
