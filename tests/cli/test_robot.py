@@ -83,6 +83,15 @@ def test_every_command_with_a_robot_takes_its_base(tmp_path):
     assert isinstance(again, Robot)
 
 
+@pytest.mark.filterwarnings("ignore::forcegp.errors.RobotFileWarning")
+def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
+    recorded = Robot.from_urdf_text(CHAIN)
+    recorded.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
+    words = ["fit", "log.h5", "--out", "run", "--robot", str(tmp_path / "identified.urdf")]
+    assert parse_arguments(words).chosen_robot(recorded).armature.tolist() == [0.0, 0.3, 0.0, 0.0]
+    assert parse_arguments([*words, "--armature", "tilt=1"]).chosen_robot(recorded).armature.tolist() == [0, 0, 0, 1]
+
+
 def test_an_undefined_root_is_named(tmp_path, forcegp):
     path = tmp_path / "arm.urdf"
     path.write_text(CHAIN.replace('<link name="rail"/>', ""))

@@ -119,6 +119,8 @@ class RobotOptions(RobotFileOptions):
         # robots with other joints are refused by their names: clearer than an armature of the wrong length
         if recorded is None or robot.joint_names != recorded.joint_names:
             return robot
+        if self.robot is not None and not self.armature and bool(robot.armature.any()):
+            return robot  # a file beside the URDF says more than the recording
         kept = dict(zip(recorded.joint_names, recorded.armature.tolist(), strict=True))
         return robot.with_armature(kept | changes.get("armature", {}))
 
