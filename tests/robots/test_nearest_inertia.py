@@ -59,7 +59,7 @@ def test_the_nearest_is_possible_and_no_possible_one_is_nearer(seed):
 
 
 def test_a_broken_urdf_is_refused_and_the_error_names_the_option():
-    with pytest.raises(NonPhysicalInertia, match=r"link 'arm'.*`inertias='nearest'`"):
+    with pytest.raises(NonPhysicalInertia, match=r"link 'arm'.*\(path, inertias='nearest'\)"):
         Robot.from_urdf_text(BROKEN)
 
 

@@ -235,12 +235,16 @@ def with_chosen_inertias(
         mendable = inertial.mass >= 0.0 and np.isfinite([inertial.inertia, inertial.center_of_mass * np.eye(3)]).all()
         if not mendable:
             problems.broken.add(name)
-            problems.errors.append(NonPhysicalInertia(seen, IN_THE_FILE))
+            problems.errors.append(NonPhysicalInertia(seen, f"{IN_THE_FILE}."))
             continue
         nearest = nearest_inertia(inertial.inertia) if inertial.mass > 0.0 else np.zeros((3, 3))
         links[name] = replace(inertial, inertia=nearest)
         if choice == "strict":
-            problems.errors.append(NonPhysicalInertia(seen, f"{IN_THE_FILE[:-1]}{OR_NEAREST}", {"inertias": "nearest"}))
+            problems.errors.append(
+                NonPhysicalInertia(
+                    seen, f"{IN_THE_FILE}, or take the nearest inertia that a body has.", {"inertias": "nearest"}
+                )
+            )
             continue
         changed = True
         relative = 100.0 * np.linalg.norm(nearest - inertial.inertia) / np.linalg.norm(inertial.inertia)
@@ -255,9 +259,8 @@ def with_chosen_inertias(
 
 
 IN_THE_FILE = (
-    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)."
+    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
 )
-OR_NEAREST = ", or take the nearest inertia that a body can have: `inertias='nearest'`."
 
 
 def with_root(text: str, root: str) -> str:
